@@ -1,0 +1,3 @@
+"""Interactive simulation of compression ultrasonography as a ROS 2 node graph."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,49 @@
+"""Errors that reach a person: each carries one sentence saying what, where and what to do."""
+
+__all__ = [
+    "BagError",
+    "MaterialError",
+    "MeshError",
+    "PoseError",
+    "ProbeError",
+    "SceneError",
+    "SolverError",
+    "UsSimError",
+    "VolumeError",
+]
+
+
+class UsSimError(Exception):
+    """Base of every error that this package raises for bad input."""
+
+
+class SceneError(UsSimError):
+    """A scene file, or a value in it, cannot be used."""
+
+
+class PoseError(UsSimError):
+    """A pose is not a rigid transform: not finite, or without an orientation."""
+
+
+class MeshError(UsSimError):
+    """A mesh cannot carry a deformation."""
+
+
+class MaterialError(UsSimError):
+    """A material is not physical, or a label has none."""
+
+
+class SolverError(UsSimError):
+    """A solver refuses its settings, its model or a state to take over."""
+
+
+class VolumeError(UsSimError):
+    """A volume cannot be read or sampled."""
+
+
+class ProbeError(UsSimError):
+    """A probe's geometry cannot form an image or a collider."""
+
+
+class BagError(UsSimError):
+    """A bag cannot be read, or cannot be written where it was asked to."""
