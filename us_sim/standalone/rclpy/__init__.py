@@ -1,0 +1,1 @@
+"""The subset of rclpy that this project's nodes use."""

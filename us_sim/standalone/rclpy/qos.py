@@ -1,0 +1,298 @@
+"""Quality of service: policies, profiles, presets and whether two profiles can meet.
+
+>>> QoSProfile(depth=10).reliability.name
+'RELIABLE'
+>>> compatible, reason = qos_check_compatible(qos_profile_sensor_data, QoSProfile(depth=1))
+>>> compatible.name, reason
+('ERROR', 'ERROR: Best effort publisher and reliable subscription;')
+"""
+
+import warnings
+from enum import Enum, IntEnum
+from typing import Any
+
+from .duration import Duration
+
+__all__ = [
+    "DeadlineBestAvailable",
+    "DurabilityPolicy",
+    "HistoryPolicy",
+    "InvalidQoSProfileException",
+    "LivelinessLeaseDurationeBestAvailable",
+    "LivelinessPolicy",
+    "QoSCompatibility",
+    "QoSDurabilityPolicy",
+    "QoSHistoryPolicy",
+    "QoSLivelinessPolicy",
+    "QoSPolicyEnum",
+    "QoSPolicyKind",
+    "QoSPresetProfiles",
+    "QoSProfile",
+    "QoSReliabilityPolicy",
+    "ReliabilityPolicy",
+    "qos_check_compatible",
+    "qos_policy_name_from_kind",
+    "qos_profile_action_status_default",
+    "qos_profile_best_available",
+    "qos_profile_default",
+    "qos_profile_parameter_events",
+    "qos_profile_parameters",
+    "qos_profile_sensor_data",
+    "qos_profile_services_default",
+    "qos_profile_system_default",
+    "qos_profile_unknown",
+]
+
+
+class QoSPolicyKind(IntEnum):
+    """Which policy an event or an override is about; the bits of rmw."""
+
+    INVALID = 1 << 0
+    DURABILITY = 1 << 1
+    DEADLINE = 1 << 2
+    LIVELINESS = 1 << 3
+    RELIABILITY = 1 << 4
+    HISTORY = 1 << 5
+    LIFESPAN = 1 << 6
+    DEPTH = 1 << 7
+    LIVELINESS_LEASE_DURATION = 1 << 8
+    AVOID_ROS_NAMESPACE_CONVENTIONS = 1 << 9
+
+
+def qos_policy_name_from_kind(policy_kind: QoSPolicyKind | int) -> str:
+    """The name of a policy, for messages to a person."""
+    return QoSPolicyKind(policy_kind).name
+
+
+class InvalidQoSProfileException(Exception):
+    """A QoSProfile was asked for with arguments that contradict each other."""
+
+    def __init__(self, *args: Any):
+        super().__init__("Invalid QoSProfile", *args)
+
+
+class QoSPolicyEnum(IntEnum):
+    """A policy whose values have the short names that parameters and tools use."""
+
+    @classmethod
+    def short_keys(cls) -> list[str]:
+        """Every value's name in lower case."""
+        return [name.lower() for name in cls.__members__]
+
+    @classmethod
+    def get_from_short_key(cls, name: str) -> int:
+        """The value of a short name, in any case; raises KeyError for an unknown one."""
+        return cls[name.upper()].value
+
+    @property
+    def short_key(self) -> str:
+        return self.name.lower()
+
+
+class HistoryPolicy(QoSPolicyEnum):
+    """How many samples are kept."""
+
+    SYSTEM_DEFAULT = 0
+    KEEP_LAST = 1
+    KEEP_ALL = 2
+    UNKNOWN = 3
+
+
+class ReliabilityPolicy(QoSPolicyEnum):
+    """Whether lost samples are sent again."""
+
+    SYSTEM_DEFAULT = 0
+    RELIABLE = 1
+    BEST_EFFORT = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class DurabilityPolicy(QoSPolicyEnum):
+    """Whether late subscriptions receive what was published before."""
+
+    SYSTEM_DEFAULT = 0
+    TRANSIENT_LOCAL = 1
+    VOLATILE = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class LivelinessPolicy(QoSPolicyEnum):
+    """Who says that a publisher is alive."""
+
+    SYSTEM_DEFAULT = 0
+    AUTOMATIC = 1
+    MANUAL_BY_TOPIC = 3
+    UNKNOWN = 4
+    BEST_AVAILABLE = 5
+
+
+QoSHistoryPolicy = HistoryPolicy
+QoSReliabilityPolicy = ReliabilityPolicy
+QoSDurabilityPolicy = DurabilityPolicy
+QoSLivelinessPolicy = LivelinessPolicy
+
+
+def _policy(slot: str, policy: type[QoSPolicyEnum]) -> property:
+    def read(self: Any) -> QoSPolicyEnum:
+        return getattr(self, slot)
+
+    def write(self: Any, value: QoSPolicyEnum | int) -> None:
+        assert isinstance(value, int)
+        setattr(self, slot, policy(value))
+
+    return property(read, write)
+
+
+def _value(slot: str, kind: type) -> property:
+    def read(self: Any) -> Any:
+        return getattr(self, slot)
+
+    def write(self: Any, value: Any) -> None:
+        assert isinstance(value, kind)
+        setattr(self, slot, value)
+
+    return property(read, write)
+
+
+class QoSProfile:
+    """The policies of one endpoint. Either `history` or `depth` has to be given."""
+
+    __slots__ = (
+        "_avoid_ros_namespace_conventions",
+        "_deadline",
+        "_depth",
+        "_durability",
+        "_history",
+        "_lifespan",
+        "_liveliness",
+        "_liveliness_lease_duration",
+        "_reliability",
+    )
+
+    history = _policy("_history", HistoryPolicy)
+    reliability = _policy("_reliability", ReliabilityPolicy)
+    durability = _policy("_durability", DurabilityPolicy)
+    liveliness = _policy("_liveliness", LivelinessPolicy)
+    lifespan = _value("_lifespan", Duration)
+    deadline = _value("_deadline", Duration)
+    liveliness_lease_duration = _value("_liveliness_lease_duration", Duration)
+    avoid_ros_namespace_conventions = _value("_avoid_ros_namespace_conventions", bool)
+
+    def __init__(self, **kwargs: Any):
+        assert all("_" + key in self.__slots__ for key in kwargs), (
+            f"Invalid arguments passed to constructor: {kwargs.keys()!r}"
+        )
+        if "history" not in kwargs and "depth" not in kwargs:
+            raise InvalidQoSProfileException("History and/or depth settings are required.")
+        self.history = kwargs.get("history", HistoryPolicy.KEEP_LAST)
+        if self.history == HistoryPolicy.KEEP_LAST and "depth" not in kwargs:
+            raise InvalidQoSProfileException("History set to KEEP_LAST without a depth setting.")
+        self.depth = kwargs.get("depth", 10)
+        self.reliability = kwargs.get("reliability", ReliabilityPolicy.RELIABLE)
+        self.durability = kwargs.get("durability", DurabilityPolicy.VOLATILE)
+        self.lifespan = kwargs.get("lifespan", Duration())
+        self.deadline = kwargs.get("deadline", Duration())
+        self.liveliness = kwargs.get("liveliness", LivelinessPolicy.SYSTEM_DEFAULT)
+        self.liveliness_lease_duration = kwargs.get("liveliness_lease_duration", Duration())
+        self.avoid_ros_namespace_conventions = kwargs.get("avoid_ros_namespace_conventions", False)
+
+    @property
+    def depth(self) -> int:
+        return self._depth
+
+    @depth.setter
+    def depth(self, value: int) -> None:
+        assert isinstance(value, int)
+        if self.history == HistoryPolicy.KEEP_LAST and value == 0:
+            warnings.warn(
+                "A zero depth with KEEP_LAST doesn't make sense; no data could be stored. "
+                "This will be interpreted as SYSTEM_DEFAULT",
+                stacklevel=2,
+            )
+        self._depth = value
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, QoSProfile):
+            return False
+        return all(getattr(self, slot) == getattr(other, slot) for slot in self.__slots__)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __str__(self) -> str:
+        fields = ", ".join(f"{slot[1:]}={getattr(self, slot)}" for slot in _PRINTED)
+        return f"{type(self).__name__}({fields})"
+
+
+_PRINTED = (
+    "_history",
+    "_depth",
+    "_reliability",
+    "_durability",
+    "_lifespan",
+    "_deadline",
+    "_liveliness",
+    "_liveliness_lease_duration",
+    "_avoid_ros_namespace_conventions",
+)
+
+DeadlineBestAvailable = Duration(nanoseconds=2**63 - 2)
+LivelinessLeaseDurationeBestAvailable = Duration(nanoseconds=2**63 - 2)
+
+qos_profile_unknown = QoSProfile(
+    history=HistoryPolicy.UNKNOWN,
+    depth=0,
+    reliability=ReliabilityPolicy.UNKNOWN,
+    durability=DurabilityPolicy.UNKNOWN,
+    liveliness=LivelinessPolicy.UNKNOWN,
+)
+qos_profile_default = QoSProfile(depth=10)
+qos_profile_system_default = QoSProfile(
+    history=HistoryPolicy.SYSTEM_DEFAULT,
+    depth=0,
+    reliability=ReliabilityPolicy.SYSTEM_DEFAULT,
+    durability=DurabilityPolicy.SYSTEM_DEFAULT,
+)
+qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+qos_profile_services_default = QoSProfile(depth=10)
+qos_profile_parameters = QoSProfile(depth=1000)
+qos_profile_parameter_events = QoSProfile(depth=1000)
+qos_profile_best_available = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.BEST_AVAILABLE,
+    durability=DurabilityPolicy.BEST_AVAILABLE,
+    deadline=DeadlineBestAvailable,
+    liveliness=LivelinessPolicy.BEST_AVAILABLE,
+    liveliness_lease_duration=LivelinessLeaseDurationeBestAvailable,
+)
+qos_profile_action_status_default = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+class QoSPresetProfiles(Enum):
+    """The presets by name; presets that are equal are aliases of each other."""
+
+    UNKNOWN = qos_profile_unknown
+    DEFAULT = qos_profile_default
+    SYSTEM_DEFAULT = qos_profile_system_default
+    SENSOR_DATA = qos_profile_sensor_data
+    SERVICES_DEFAULT = qos_profile_services_default
+    PARAMETERS = qos_profile_parameters
+    PARAMETER_EVENTS = qos_profile_parameter_events
+    ACTION_STATUS_DEFAULT = qos_profile_action_status_default
+    BEST_AVAILABLE = qos_profile_best_available
+
+    @classmethod
+    def short_keys(cls) -> list[str]:
+        """Every preset's name in lower case."""
+        return [name.lower() for name in cls.__members__]
+
+    @classmethod
+    def get_from_short_key(cls, name: str) -> QoSProfile:
+        """The profile of a short name, in any case; raises KeyError for an unknown one."""
+        return cls[name.upper()].value
+
+
+from ._qos_compatibility import QoSCompatibility, qos_check_compatible  # noqa: E402
