@@ -1,0 +1,11 @@
+"""The rclpy nodes. Importing this package provides rclpy where ROS 2 is not installed."""
+
+import os
+
+from us_sim.standalone import install
+
+# Several node processes share few cores, and small dense solves are far slower on many threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+install()

@@ -1,0 +1,87 @@
+"""Package `us_sim` for pip (one command, `us-sim`) and for colcon (one executable a node)."""
+
+import sys
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NODES = [
+    "path_player",
+    "probe_tracker",
+    "session_recorder",
+    "skin_deformer",
+    "slice_interpolator",
+    "tissue_deformer",
+]
+FOLDER = Path(__file__).resolve().parent
+
+
+def console_scripts() -> list[str]:
+    """`us-sim` alone in a wheel; also every node where colcon installs into lib/us_sim.
+
+    colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel, whose scripts all land on PATH.
+    """
+    scripts = ["us-sim = us_sim.cli:main"]
+    if {"install", "develop"} & set(sys.argv):
+        scripts += [f"{node} = us_sim.nodes.{node}:main" for node in NODES]
+    return scripts
+
+
+def shared_files(folder: str) -> list[tuple[str, list[str]]]:
+    """Every file below `folder`, to be installed under share/us_sim with its own subfolders."""
+    files: dict[str, list[str]] = {}
+    for path in sorted((FOLDER / folder).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            relative = path.relative_to(FOLDER)
+            files.setdefault(f"share/us_sim/{relative.parent}", []).append(str(relative))
+    return list(files.items())
+
+
+setup(
+    name="us_sim",
+    version="0.1.0",
+    description="Interactive simulation of compression ultrasonography as a ROS 2 node graph",
+    long_description=(FOLDER / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    author="us_sim developers",
+    packages=find_packages(include=["us_sim", "us_sim.*"]),
+    python_requires=">=3.11",
+    install_requires=[
+        "cyclonedds>=11.0",
+        "matplotlib>=3.6",
+        "mcap>=1.2",
+        "numba>=0.59",
+        "numpy>=1.26",
+        "opencv-python-headless>=4.8",
+        "platformdirs>=4",
+        "PyYAML>=6",
+        "rosbags>=0.10.9",
+        "scipy>=1.11",
+        "SimpleITK>=2.3",
+        "threadpoolctl>=3",
+        "tqdm>=4.65",
+    ],
+    extras_require={
+        "meshes": ["meshio>=5.3"],
+        "test": [
+            "hypothesis>=6.100",
+            "meshio>=5.3",
+            "mypy>=1.10",
+            "pytest>=7.4",
+            "pytest-timeout>=2.2",
+            "ruff>=0.12",
+            "scikit-fem>=10",
+            "types-PyYAML",
+            "types-tqdm",
+        ],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/us_sim"]),
+        ("share/us_sim", ["package.xml"]),
+        *shared_files("config"),
+        *shared_files("bags"),
+    ],
+    entry_points={"console_scripts": console_scripts()},
+    zip_safe=False,
+)

@@ -1,0 +1,200 @@
+"""Messages to arrays and arrays to messages: the only place that knows their layouts.
+
+Bulk data are handed over as ``array.array('B', …)``, which rclpy takes without looking at each
+element.
+"""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image, PointCloud2, PointField
+from shape_msgs.msg import Mesh, MeshTriangle
+from std_msgs.msg import Int32MultiArray, MultiArrayDimension
+from visualization_msgs.msg import Marker
+
+from us_sim.errors import MeshError
+from us_sim.pose import Pose
+
+__all__ = [
+    "cloud_message",
+    "image_message",
+    "mesh_message",
+    "pose_from",
+    "pose_message",
+    "surface_marker",
+    "tetrahedra_from",
+    "tetrahedra_message",
+    "transform_message",
+    "vectors_from",
+    "wrench_message",
+]
+
+
+def pose_from(message: PoseStamped) -> Pose:
+    """The pose in a message.
+
+    Raises:
+        PoseError: it is not finite, or its quaternion is zero.
+    """
+    p, q = message.pose.position, message.pose.orientation
+    return Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+
+
+def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
+    """``pose`` of the probe in ``frame``."""
+    message = PoseStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = map(float, pose.position)
+    q.x, q.y, q.z, q.w = map(float, pose.orientation)
+    return message
+
+
+def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:
+    """The same transform for tf."""
+    message = TransformStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.child_frame_id = child
+    t, q = message.transform.translation, message.transform.rotation
+    t.x, t.y, t.z = map(float, pose.position)
+    q.x, q.y, q.z, q.w = map(float, pose.orientation)
+    return message
+
+
+def wrench_message(
+    force: NDArray[np.float64], torque: NDArray[np.float64], stamp: Time, frame: str
+) -> WrenchStamped:
+    """Force (3,) N and torque (3,) N m about the origin of ``frame``."""
+    message = WrenchStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    f, t = message.wrench.force, message.wrench.torque
+    f.x, f.y, f.z = map(float, force)
+    t.x, t.y, t.z = map(float, torque)
+    return message
+
+
+def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """A ``mono8`` image of (rows, columns) pixels."""
+    message = Image()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.height, message.width = pixels.shape
+    message.encoding = "mono8"
+    message.is_bigendian = 0
+    message.step = pixels.shape[1]
+    message.data = array("B", pixels.tobytes())
+    return message
+
+
+def cloud_message(
+    columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str
+) -> PointCloud2:
+    """A float32 cloud whose fields are the ``columns``, each (N,), in their order."""
+    table = np.column_stack(list(columns.values())).astype("<f4")
+    message = PointCloud2()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.height, message.width = 1, len(table)
+    message.fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate(columns)
+    ]
+    message.point_step = 4 * table.shape[1]
+    message.row_step = message.point_step * len(table)
+    message.data = array("B", table.tobytes())
+    message.is_dense = True
+    return message
+
+
+def vectors_from(message: PointCloud2) -> NDArray[np.float64]:
+    """The x, y, z fields of a cloud, (N, 3).
+
+    Raises:
+        MeshError: a field is missing or not a float, or the data do not fill the stated size.
+    """
+    kinds = {PointField.FLOAT32: "f4", PointField.FLOAT64: "f8"}
+    order = ">" if message.is_bigendian else "<"
+    fields = {field.name: field for field in message.fields}
+    try:
+        chosen = [fields[name] for name in "xyz"]
+        formats = [order + kinds[field.datatype] for field in chosen]
+    except KeyError as error:
+        raise MeshError(
+            f"the point cloud has no float field for {error}; it needs x, y and z"
+        ) from error
+    count = message.width * message.height
+    if len(message.data) < count * message.point_step:
+        raise MeshError(
+            f"the point cloud holds {len(message.data)} bytes, but says it has {count} points "
+            f"of {message.point_step} bytes"
+        )
+    layout = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": formats,
+            "offsets": [field.offset for field in chosen],
+            "itemsize": message.point_step,
+        }
+    )
+    table = np.frombuffer(message.data, dtype=layout, count=count)
+    return np.column_stack([table[name] for name in "xyz"]).astype(np.float64)
+
+
+def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
+    """(M, 4) node indices."""
+    message = Int32MultiArray()
+    count = len(tetrahedra)
+    message.layout.dim = [
+        MultiArrayDimension(label="tetrahedron", size=count, stride=4 * count),
+        MultiArrayDimension(label="node", size=4, stride=4),
+    ]
+    message.data = array("i", np.ascontiguousarray(tetrahedra, dtype=np.int32).tobytes())
+    return message
+
+
+def tetrahedra_from(message: Int32MultiArray) -> NDArray[np.int32]:
+    """(M, 4) node indices.
+
+    Raises:
+        MeshError: the number of indices is not a multiple of four.
+    """
+    indices = np.frombuffer(message.data, dtype=np.int32)
+    if len(indices) % 4:
+        raise MeshError(f"{len(indices)} node indices do not make whole tetrahedra")
+    return indices.reshape(-1, 4)
+
+
+def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> Mesh:
+    """(N, 3) m and (T, 3) as a shape."""
+    return Mesh(
+        vertices=_points(vertices),
+        triangles=[MeshTriangle(vertex_indices=triple.astype(np.uint32)) for triple in triangles],
+    )
+
+
+def surface_marker(
+    vertices: NDArray[np.floating], triangles: NDArray[np.integer], stamp: Time, frame: str
+) -> Marker:
+    """A skin-coloured TRIANGLE_LIST."""
+    marker = Marker()
+    marker.header.stamp = stamp
+    marker.header.frame_id = frame
+    marker.ns = "skin"
+    marker.type = Marker.TRIANGLE_LIST
+    marker.action = Marker.ADD
+    marker.scale.x = marker.scale.y = marker.scale.z = 1.0
+    marker.color.r, marker.color.g, marker.color.b, marker.color.a = 0.85, 0.65, 0.55, 0.9
+    marker.points = _points(vertices[triangles.ravel()])
+    return marker
+
+
+def _points(vertices: NDArray[np.floating]) -> list[Point]:
+    return [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]

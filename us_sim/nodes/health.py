@@ -1,0 +1,92 @@
+"""What a node reports about itself once a second: rate, latency, drops, state."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.time import Time
+
+from us_sim.nodes.qos import STREAM, overridable
+
+__all__ = ["Health"]
+
+
+class Health:
+    """Counts what a node does and publishes it on ``diagnostics`` at 1 Hz.
+
+    Args:
+        node: whose clock, logger and timer are used.
+        hardware_id: the scene's name, or what else the node works on.
+    """
+
+    def __init__(self, node: Node, hardware_id: str) -> None:
+        self._node = node
+        self._hardware_id = hardware_id
+        self._latencies: deque[float] = deque(maxlen=1000)
+        self._published: Counter[str] = Counter()
+        self._problems: Counter[str] = Counter()
+        self._last_problem = ""
+        self._last_total = 0
+        self._last_time = node.get_clock().now().nanoseconds
+        self.state = "starting"
+        self.received = 0
+        self.dropped = 0
+        self.values: dict[str, str] = {}
+        self._publisher = node.create_publisher(
+            DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
+        )
+        node.create_timer(1.0, self._publish)
+
+    def published(self, topic: str, stamp: TimeMessage | None = None) -> None:
+        """One message went out on ``topic``; with a stamp, its age counts as latency."""
+        self._published[topic] += 1
+        if stamp is not None:
+            age = self._node.get_clock().now().nanoseconds - Time.from_msg(stamp).nanoseconds
+            self._latencies.append(age * 1e-6)
+
+    def problem(self, kind: str, sentence: str) -> None:
+        """Count a problem of that kind; it is logged at most every five seconds."""
+        self._problems[kind] += 1
+        self._last_problem = sentence
+        self._node.get_logger().warning(sentence, throttle_duration_sec=5.0)
+
+    def problems(self, kind: str) -> int:
+        """How many of that kind there were."""
+        return self._problems[kind]
+
+    def _publish(self) -> None:
+        now = self._node.get_clock().now()
+        elapsed = max(now.nanoseconds - self._last_time, 1) * 1e-9
+        total = max(self._published.values(), default=0)
+        rate = (total - self._last_total) / elapsed
+        self._last_time, self._last_total = now.nanoseconds, total
+        values = {
+            "state": self.state,
+            "rate_hz": f"{rate:.1f}",
+            "received": str(self.received),
+            "dropped": str(self.dropped),
+            **{f"published {topic}": str(n) for topic, n in self._published.items()},
+            **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
+            **self.values,
+        }
+        if self._latencies:
+            p50, p99 = np.percentile(self._latencies, [50, 99])
+            values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
+        self._publisher.publish(self._message(now.to_msg(), values))
+        self._last_problem = ""
+
+    def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:
+        status = DiagnosticStatus()
+        status.level = DiagnosticStatus.WARN if self._last_problem else DiagnosticStatus.OK
+        status.name = self._node.get_fully_qualified_name()
+        status.message = self._last_problem or self.state
+        status.hardware_id = self._hardware_id
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray()
+        message.header.stamp = stamp
+        message.status = [status]
+        return message

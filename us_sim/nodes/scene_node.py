@@ -1,0 +1,74 @@
+"""What the nodes of a scene share: its parameters, its health, and lockstep or live input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+from us_sim.nodes.health import Health
+from us_sim.nodes.newest import Newest
+from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
+from us_sim.scene import Scene
+from us_sim.scene_file import load_scene
+
+__all__ = ["SceneNode"]
+
+
+class SceneNode(Node):
+    """A node that works on a scene.
+
+    Parameters: ``scene`` (file, or name of an installed scene), ``volume`` (a file that replaces
+    the scene's), ``lockstep`` (work on every message instead of the newest).
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        fixed = {"read_only": True}
+        self.scene: Scene = load_scene(
+            self._declared("scene", "upper_arm", "scene file, or name of an installed one", fixed),
+            volume=self._declared("volume", "", "volume file that replaces the scene's", fixed),
+        )
+        self.lockstep: bool = self._declared(
+            "lockstep", False, "work on every message, in order, instead of the newest", fixed
+        )
+        self.health = Health(self, self.scene.name)
+
+    def _declared(self, name: str, value: Any, description: str, options: dict[str, bool]) -> Any:
+        descriptor = ParameterDescriptor(description=description, **options)
+        return self.declare_parameter(name, value, descriptor).value
+
+    def stream(self, message_type: Any, topic: str) -> Publisher:
+        """A publisher of what changes with every pose."""
+        return self.create_publisher(
+            message_type, topic, STREAM, qos_overriding_options=overridable()
+        )
+
+    def latched(self, message_type: Any, topic: str) -> Publisher:
+        """A publisher of what is sent once and kept for those who come later."""
+        return self.create_publisher(
+            message_type, topic, LATCHED, qos_overriding_options=overridable()
+        )
+
+    def newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
+        """Call ``work`` with the newest message of ``topic`` (with each one in lockstep)."""
+        self.listen(
+            message_type, topic, Newest(self, self.health, work, lockstep=self.lockstep)
+        )
+
+    def listen(
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile | None = None,
+    ) -> None:
+        """Subscribe to every message of ``topic``."""
+        qos = qos or (EVERY if self.lockstep else STREAM)
+        self.create_subscription(
+            message_type, topic, callback, qos, qos_overriding_options=overridable()
+        )

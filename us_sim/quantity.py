@@ -1,0 +1,81 @@
+"""Numbers with units, as a person writes them in a scene: ``0.04``, ``40 mm``, ``12 kPa``.
+
+>>> from us_sim.quantity import Quantity
+>>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
+0.04
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+__all__ = ["Quantity"]
+
+_UNITS: dict[str, dict[str, float]] = {
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
+    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
+    "density": {"kg/m3": 1.0, "kg/m^3": 1.0, "g/cm3": 1e3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "angle": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
+    "stiffness": {"N/m": 1.0, "N/mm": 1e3},
+    "mass per area": {"kg/m2": 1.0, "kg/m^2": 1.0},
+    "number": {},
+}
+_NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A dimension and the range in which a value of it makes sense; SI unless a unit is written."""
+
+    dimension: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    @property
+    def unit(self) -> str:
+        """The SI unit's symbol, or nothing for a plain number."""
+        return next(iter(_UNITS[self.dimension]), "")
+
+    def parse(self, value: object) -> float:
+        """The value in SI units.
+
+        Raises:
+            ValueError: not a number, a unit of another dimension, not finite, or out of range.
+        """
+        number = self._number(value)
+        if not math.isfinite(number):
+            raise ValueError(f"{value!r} is not finite")
+        if not self.minimum <= number <= self.maximum:
+            unit = f" {self.unit}" if self.unit else ""
+            hint = self._hint(number)
+            raise ValueError(
+                f"{number:g}{unit} is outside {self.minimum:g} to {self.maximum:g}{unit}{hint}"
+            )
+        return number
+
+    def _number(self, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise ValueError(f"{value!r} is not a {self.dimension}")
+        if not isinstance(value, str):
+            return float(value)
+        match = _NUMBER.match(value)
+        units = _UNITS[self.dimension]
+        if match is None:
+            raise ValueError(f"{value!r} is not a {self.dimension}")
+        number, unit = float(match[1]), match[2]
+        if not unit:
+            return number
+        if unit not in units:
+            known = ", ".join(units) or "none"
+            raise ValueError(f"{value!r} is not a {self.dimension}: its units are {known}")
+        return number * units[unit]
+
+    def _hint(self, number: float) -> str:
+        """A likely unit slip: millimetres or kilopascals written where SI is meant."""
+        for unit, factor in _UNITS[self.dimension].items():
+            if factor != 1.0 and self.minimum <= number * factor <= self.maximum:
+                return f"; did you mean '{number:g} {unit}'?"
+        return ""

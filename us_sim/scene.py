@@ -1,0 +1,187 @@
+"""What a scene may hold: one frozen dataclass a section, each value with its unit and range.
+
+`scene_file` reads and validates the YAML that fills these; `assembly` makes the objects they name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from us_sim.quantity import Quantity
+
+__all__ = [
+    "ColliderSection",
+    "MaterialSection",
+    "MeshSection",
+    "Part",
+    "PoseSection",
+    "ProbeSection",
+    "Scene",
+    "SkinSection",
+    "SliceSection",
+    "TissueSection",
+    "TrackerSection",
+    "VolumeSection",
+]
+
+_POSITION = Quantity("length", -10.0, 10.0)
+
+
+def _given(
+    quantity: Quantity | None = None, *, choices: tuple[str, ...] = (), **kwargs: Any
+) -> Any:
+    """A dataclass field that the scene may set, with the check its value must pass."""
+    return field(metadata={"quantity": quantity, "choices": choices}, **kwargs)
+
+
+@dataclass(frozen=True)
+class PoseSection:
+    """Where the volume's own frame lies in ``patient``: position m, orientation x, y, z, w."""
+
+    position: tuple[float, float, float] = _given(_POSITION, default=(0.0, 0.0, 0.0))
+    orientation: tuple[float, float, float, float] = _given(
+        Quantity("number", -1.0, 1.0), default=(0.0, 0.0, 0.0, 1.0)
+    )
+
+
+@dataclass(frozen=True)
+class VolumeSection:
+    """The ultrasound volume: a file, or a procedural phantom made from a seed."""
+
+    file: str | None = _given(default=None)
+    phantom: str | None = _given(default=None, choices=("upper_arm",))
+    seed: int = _given(Quantity("number", 0, 2**31), default=1)
+    voxel_size: float = _given(Quantity("length", 1e-4, 5e-3), default=0.3e-3)
+    pose: PoseSection = _given(default=PoseSection())
+
+
+@dataclass(frozen=True)
+class MaterialSection:
+    """An isotropic elastic material."""
+
+    young_modulus: float = _given(Quantity("pressure", 1.0, 1e12))
+    poisson_ratio: float = _given(Quantity("number", 0.0, 0.4999), default=0.45)
+    density: float = _given(Quantity("density", 1.0, 1e5), default=1000.0)
+
+
+@dataclass(frozen=True)
+class MeshSection:
+    """A box of tetrahedra in ``patient``: its corners, and the number of nodes along each axis.
+
+    ``planes`` may give the node coordinates along an axis one by one, to put them where they count.
+    """
+
+    lower: tuple[float, float, float] = _given(_POSITION)
+    upper: tuple[float, float, float] = _given(_POSITION)
+    nodes: tuple[int, int, int] = _given(Quantity("number", 2, 400), default=(20, 10, 10))
+    planes: dict[str, tuple[float, ...]] = _given(_POSITION, default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TissueSection:
+    """The deformable block, its materials by label name, and the solver that deforms it."""
+
+    mesh: MeshSection = _given()
+    materials: dict[str, MaterialSection] = _given()
+    fixed: tuple[str, ...] = _given(default=("bottom",))
+    solver: str = _given(default="fem_cg", choices=("fem_cg", "msds"))
+    settings: dict[str, dict[str, Any]] = _given(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SkinSection:
+    """The skin membrane: a surface file, or a sheet that bends down on both sides of a flat part."""
+
+    file: str | None = _given(default=None)
+    size: tuple[float, float] = _given(Quantity("length", 0.01, 2.0), default=(0.2, 0.2))
+    spacing: float = _given(Quantity("length", 5e-4, 0.05), default=4e-3)
+    flat_width: float = _given(Quantity("length", 0.0, 2.0), default=2.0)
+    radius: float = _given(Quantity("length", 5e-3, 10.0), default=0.05)
+    stiffness: float = _given(Quantity("stiffness", 1e-6, 1e9), default=40.0)
+    anchor_stiffness: float = _given(Quantity("stiffness", 1e-6, 1e9), default=4.0)
+    density: float = _given(Quantity("mass per area", 1e-6, 1e6), default=2.0)
+
+
+@dataclass(frozen=True)
+class ColliderSection:
+    """The probe's shape that pushes tissue and skin."""
+
+    shape: str = _given(choices=("sphere", "capsule", "rounded_box"))
+    radius: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
+    length: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
+    width: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
+    height: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
+    rounding: float | None = _given(Quantity("length", 1e-5, 0.25), default=None)
+
+
+@dataclass(frozen=True)
+class ProbeSection:
+    """The transducer: what it images, and the shape that presses."""
+
+    aperture: float = _given(Quantity("length", 5e-3, 0.2))
+    depth: float = _given(Quantity("length", 5e-3, 0.4))
+    geometry: str = _given(default="linear", choices=("linear",))
+    image: tuple[int, int] = _given(Quantity("number", 1, 4096), default=(512, 512))
+    collider: ColliderSection | None = _given(default=None)
+
+
+@dataclass(frozen=True)
+class SliceSection:
+    """How the image is cut."""
+
+    method: str = _given(default="row_subdivision", choices=("row_subdivision",))
+    regions: int = _given(Quantity("number", 1, 4096), default=32)
+
+
+@dataclass(frozen=True)
+class TrackerSection:
+    """Where probe poses come from."""
+
+    source: str = _given(default="pose", choices=("pose",))
+    frame: str = _given(default="patient")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A node of the graph, whether this scene needs it, and why."""
+
+    node: str
+    needed: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A whole scene. Only ``volume`` and ``probe`` must be there."""
+
+    name: str = _given()
+    volume: VolumeSection = _given()
+    probe: ProbeSection = _given()
+    tissue: TissueSection | None = _given(default=None)
+    skin: SkinSection | None = _given(default=None)
+    slice: SliceSection = _given(default=SliceSection())
+    tracker: TrackerSection = _given(default=TrackerSection())
+    path: str | None = _given(default=None)
+    description: str = _given(default="")
+    origin: str = "scene"
+
+    def parts(self) -> list[Part]:
+        """Every simulation node with the reason why it runs or is left out."""
+        return [
+            Part("probe_tracker", True, f"poses come from `{self.tracker.source}`"),
+            _part("tissue_deformer", self.tissue, "tissue", "the volume is sliced rigidly"),
+            _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
+            Part("slice_interpolator", True, f"images are cut by `{self.slice.method}`"),
+        ]
+
+    @property
+    def volume_name(self) -> str:
+        """The volume's file or phantom, for a person."""
+        return self.volume.file or f"phantom {self.volume.phantom}, seed {self.volume.seed}"
+
+
+def _part(node: str, section: object | None, key: str, consequence: str) -> Part:
+    if section is None:
+        return Part(node, False, f"the scene has no `{key}`: {consequence}")
+    return Part(node, True, f"the scene has `{key}`")

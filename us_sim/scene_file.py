@@ -1,0 +1,215 @@
+"""Reading a scene file: YAML to :class:`us_sim.scene.Scene`, every key and value checked.
+
+>>> from us_sim.scene_file import parse_scene
+>>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
+...                      "probe": {"aperture": "40 mm", "depth": "40 mm"}})
+>>> [part.node for part in scene.parts() if part.needed]
+['probe_tracker', 'slice_interpolator']
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from pathlib import Path
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from us_sim.errors import SceneError
+from us_sim.quantity import Quantity
+from us_sim.scene import Scene, TissueSection, VolumeSection
+from us_sim.share import shared_roots
+
+__all__ = ["find_scene", "load_scene", "parse_scene"]
+
+
+def find_scene(name: str | Path) -> Path:
+    """The scene file of that path, or of that name in ``config/scenes``.
+
+    Raises:
+        SceneError: there is no such file; the sentence lists the installed scenes.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path.resolve()
+    known: dict[str, Path] = {}
+    for root in shared_roots():
+        for file in sorted((root / "config" / "scenes").glob("*.yaml")):
+            known.setdefault(file.stem, file)
+    stem = path.name.removesuffix(".yaml")
+    if str(path) in (stem, f"{stem}.yaml") and stem in known:
+        return known[stem]
+    raise SceneError(f"there is no scene file {name}; installed scenes are {', '.join(known)}")
+
+
+def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
+    """Read and validate a scene file; ``volume`` replaces the file it names.
+
+    Raises:
+        SceneError: the file or a value in it cannot be used; one sentence with file and key.
+    """
+    path = find_scene(name)
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}:" if mark else ""
+        problem = getattr(error, "problem", None) or "unreadable"
+        raise SceneError(f"{path}:{where} is not YAML: {problem}") from error
+    if volume:
+        if not isinstance(document, dict) or not isinstance(document.get("volume"), dict):
+            raise SceneError(f"{path}: volume: must be a mapping of keys")
+        document["volume"] = {
+            key: value for key, value in document["volume"].items() if key != "phantom"
+        } | {"file": str(Path(volume).expanduser().resolve())}
+    return parse_scene(document, origin=str(path), folder=path.parent)
+
+
+def parse_scene(document: object, *, origin: str = "scene", folder: Path | None = None) -> Scene:
+    """Validate an already read document; relative files are looked up beside ``folder``.
+
+    Raises:
+        SceneError: see :func:`load_scene`.
+    """
+    scene: Scene = _build(Scene, document, origin, "")
+    scene = dataclasses.replace(scene, origin=origin)
+    _check_volume(scene.volume, origin)
+    if scene.tissue is not None:
+        _check_tissue(scene, scene.tissue, origin)
+    if scene.skin is not None and scene.probe.collider is None:
+        raise SceneError(
+            f"{origin}: probe.collider: is missing, and the skin needs one to press it"
+        )
+    return _resolve_files(scene, origin, folder or Path.cwd())
+
+
+def _build(cls: type, document: object, origin: str, key: str) -> Any:
+    """An instance of the dataclass ``cls`` from a mapping, every key checked."""
+    at = f"{origin}: {key + ': ' if key else ''}"
+    if not isinstance(document, dict):
+        raise SceneError(f"{at}must be a mapping of keys, not {document!r}")
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.metadata}
+    for name in document:
+        if name not in fields:
+            near = difflib.get_close_matches(str(name), fields, n=1)
+            hint = f"did you mean `{near[0]}`?" if near else f"known keys: {', '.join(fields)}"
+            raise SceneError(f"{at}unknown key `{name}`; {hint}")
+    types = get_type_hints(cls)
+    values = {}
+    for name, entry in fields.items():
+        path = f"{key}.{name}" if key else name
+        if name in document:
+            values[name] = _value(types[name], document[name], entry.metadata, origin, path)
+        elif entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING:
+            raise SceneError(f"{origin}: {path}: is missing")
+    return cls(**values)
+
+
+def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:
+    """``value`` converted to the type ``kind``, checked against its quantity or choices."""
+    at = f"{origin}: {key}: "
+    if get_origin(kind) in (Union, UnionType):
+        if value is None:
+            return None
+        kind = next(option for option in get_args(kind) if option is not type(None))
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return _build(kind, value, origin, key)
+    if get_origin(kind) is tuple:
+        return _sequence(get_args(kind), value, check, origin, key)
+    if get_origin(kind) is dict:
+        if not isinstance(value, dict):
+            raise SceneError(f"{at}must be a mapping of keys, not {value!r}")
+        inner = get_args(kind)[1]
+        return {str(k): _value(inner, v, check, origin, f"{key}.{k}") for k, v in value.items()}
+    if kind in (int, float):
+        quantity: Quantity = check["quantity"] or Quantity("number")
+        try:
+            number = quantity.parse(value)
+        except ValueError as error:
+            raise SceneError(f"{at}{error}") from error
+        if kind is int and number != int(number):
+            raise SceneError(f"{at}{value!r} is not a whole number")
+        return kind(number)
+    if kind is str:
+        if not isinstance(value, str) or not value:
+            raise SceneError(f"{at}must be a text, not {value!r}")
+        if check["choices"] and value not in check["choices"]:
+            raise SceneError(f"{at}{value!r} is not one of {', '.join(check['choices'])}")
+    return value
+
+
+def _sequence(kinds: tuple[Any, ...], value: object, check: Any, origin: str, key: str) -> Any:
+    at = f"{origin}: {key}: "
+    if not isinstance(value, list):
+        raise SceneError(f"{at}must be a list, not {value!r}")
+    if kinds[-1] is Ellipsis:
+        kinds = kinds[:1] * len(value)
+    if len(value) != len(kinds):
+        raise SceneError(f"{at}needs {len(kinds)} values, not {len(value)}")
+    return tuple(
+        _value(kind, item, check, origin, f"{key}[{i}]")
+        for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
+    )
+
+
+def _check_volume(volume: VolumeSection, origin: str) -> None:
+    if volume.file and volume.phantom:
+        raise SceneError(f"{origin}: volume: has both `file` and `phantom`; keep one")
+    if not volume.file and not volume.phantom:
+        raise SceneError(
+            f"{origin}: volume.file: is missing; name a volume file there, or give one with --volume"
+        )
+
+
+def _check_tissue(scene: Scene, tissue: TissueSection, origin: str) -> None:
+    if scene.probe.collider is None:
+        raise SceneError(
+            f"{origin}: probe.collider: is missing, and the tissue needs one to press it"
+        )
+    if not tissue.materials:
+        raise SceneError(f"{origin}: tissue.materials: names no material")
+    mesh = tissue.mesh
+    for axis, name in enumerate("xyz"):
+        if mesh.lower[axis] >= mesh.upper[axis]:
+            raise SceneError(
+                f"{origin}: tissue.mesh.upper[{axis}]: {mesh.upper[axis]:g} m is not above "
+                f"tissue.mesh.lower[{axis}], {mesh.lower[axis]:g} m"
+            )
+        planes = mesh.planes.get(name)
+        if planes is not None and (
+            len(planes) < 2 or any(b <= a for a, b in zip(planes, planes[1:], strict=False))
+        ):
+            raise SceneError(
+                f"{origin}: tissue.mesh.planes.{name}: needs two or more rising coordinates"
+            )
+    for axis_name in mesh.planes:
+        if axis_name not in ("x", "y", "z"):
+            raise SceneError(f"{origin}: tissue.mesh.planes: unknown axis `{axis_name}`")
+
+
+def _resolve_files(scene: Scene, origin: str, folder: Path) -> Scene:
+    """``scene`` with absolute, existing paths."""
+
+    def existing(key: str, name: str) -> str:
+        path = Path(name).expanduser()
+        candidates = [path] if path.is_absolute() else [folder / path, Path.cwd() / path]
+        if key == "path" and not path.is_absolute():
+            candidates += [root / "bags" / path for root in shared_roots()]
+        for candidate in candidates:
+            if candidate.exists():
+                return str(candidate.resolve())
+        raise SceneError(f"{origin}: {key}: there is no file {candidates[0]}")
+
+    if scene.volume.file:
+        volume = dataclasses.replace(scene.volume, file=existing("volume.file", scene.volume.file))
+        scene = dataclasses.replace(scene, volume=volume)
+    if scene.skin is not None and scene.skin.file:
+        skin = dataclasses.replace(scene.skin, file=existing("skin.file", scene.skin.file))
+        scene = dataclasses.replace(scene, skin=skin)
+    if scene.path:
+        scene = dataclasses.replace(scene, path=existing("path", scene.path))
+    return scene

@@ -1,0 +1,45 @@
+"""Where the installed scenes, launch file, layouts and probe paths lie."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from us_sim.errors import UsSimError
+
+__all__ = ["shared_path", "shared_roots"]
+
+
+def shared_roots() -> Iterator[Path]:
+    """Folders that may hold ``config`` and ``bags``: the checkout, ROS 2 prefixes, pip's share."""
+    checkout = Path(__file__).resolve().parents[1]
+    if (checkout / "package.xml").is_file():
+        yield checkout
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix:
+            yield Path(prefix) / "share" / "us_sim"
+    try:
+        distribution = importlib.metadata.distribution("us_sim")
+    except importlib.metadata.PackageNotFoundError:
+        return
+    for file in distribution.files or []:
+        if file.parts[-3:] == ("share", "us_sim", "package.xml"):
+            yield Path(str(distribution.locate_file(file))).resolve().parent
+
+
+def shared_path(relative: str) -> Path:
+    """The first existing ``relative`` path among :func:`shared_roots`.
+
+    Raises:
+        UsSimError: no root has it.
+    """
+    roots = list(shared_roots())
+    for root in roots:
+        if (root / relative).exists():
+            return root / relative
+    raise UsSimError(
+        f"{relative} is not installed with us_sim (looked in "
+        f"{', '.join(map(str, roots)) or 'no folder at all'}); install the package again"
+    )
