@@ -1,0 +1,42 @@
+"""What a tissue solver returns for a probe pose, and the state that solvers hand to each other.
+
+>>> import numpy as np
+>>> from us_sim.tissue.deformation import TissueState
+>>> TissueState.at_rest(2).displacement
+array([[0., 0., 0.],
+       [0., 0., 0.]])
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Deformation", "TissueState"]
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """The deformed tissue and what it does to the probe."""
+
+    nodes: NDArray[np.float64]  # (N, 3), m, frame patient, in mesh order
+    contact_nodes: NDArray[np.int32]  # (K,), nodes that the probe pushes
+    force: NDArray[np.float64]  # (3,), N, of the tissue on the probe, frame probe
+    torque: NDArray[np.float64]  # (3,), N m, likewise, about the origin of frame probe
+    residual: float  # unbalanced force over contact force, of the solver's own equations
+    action: str = ""  # what the solver did to stay stable, in words; '' when nothing
+
+
+@dataclass(frozen=True, eq=False)
+class TissueState:
+    """What a solver needs of another one to go on from where it is."""
+
+    displacement: NDArray[np.float64]  # (N, 3), m
+    velocity: NDArray[np.float64]  # (N, 3), m/s
+
+    @classmethod
+    def at_rest(cls, count: int) -> TissueState:
+        """Undeformed and still, for ``count`` nodes."""
+        return cls(np.zeros((count, 3)), np.zeros((count, 3)))
