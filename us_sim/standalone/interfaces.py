@@ -1,0 +1,232 @@
+"""What ROS 2 Jazzy's interfaces are made of: fields, constants, defaults and type hashes.
+
+The .msg files come from rosbags' type store; the services, which it lacks, are written down here.
+
+>>> from us_sim.standalone.interfaces import interface, type_hash
+>>> [(field.name, field.idl_type) for field in interface("sensor_msgs/msg/Image").fields][-2:]
+[('step', 'uint32'), ('data', 'sequence<uint8>')]
+>>> type_hash("sensor_msgs/msg/Image")[:16]
+'RIHS01_d31d41a9a'
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from us_sim.errors import UsSimError
+
+__all__ = [
+    "Field",
+    "Interface",
+    "InterfaceError",
+    "interface",
+    "message_names",
+    "packages",
+    "service_names",
+    "type_hash",
+]
+
+PLACEHOLDER = "structure_needs_at_least_one_member"
+
+_SERVICES = {
+    "rcl_interfaces/srv/DescribeParameters": (
+        "string[] names",
+        "rcl_interfaces/ParameterDescriptor[] descriptors",
+    ),
+    "rcl_interfaces/srv/GetLoggerLevels": (
+        "string[] names",
+        "rcl_interfaces/LoggerLevel[] levels",
+    ),
+    "rcl_interfaces/srv/GetParameterTypes": ("string[] names", "uint8[] types"),
+    "rcl_interfaces/srv/GetParameters": (
+        "string[] names",
+        "rcl_interfaces/ParameterValue[] values",
+    ),
+    "rcl_interfaces/srv/ListParameters": (
+        "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth",
+        "rcl_interfaces/ListParametersResult result",
+    ),
+    "rcl_interfaces/srv/SetLoggerLevels": (
+        "rcl_interfaces/LoggerLevel[] levels",
+        "rcl_interfaces/SetLoggerLevelsResult[] results",
+    ),
+    "rcl_interfaces/srv/SetParameters": (
+        "rcl_interfaces/Parameter[] parameters",
+        "rcl_interfaces/SetParametersResult[] results",
+    ),
+    "rcl_interfaces/srv/SetParametersAtomically": (
+        "rcl_interfaces/Parameter[] parameters",
+        "rcl_interfaces/SetParametersResult result",
+    ),
+    "std_srvs/srv/Empty": ("", ""),
+    "std_srvs/srv/SetBool": ("bool data", "bool success\nstring message"),
+    "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
+}
+
+# The only defaults that Jazzy's common interfaces declare (rosbags drops them).
+_DEFAULTS = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
+
+_IDL_NAMES = {
+    "bool": "boolean",
+    "byte": "octet",
+    "char": "uint8",
+    "float32": "float",
+    "float64": "double",
+}
+
+
+class InterfaceError(UsSimError):
+    """There is no such message or service."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a message.
+
+    Attributes:
+        kind: the primitive's name (``uint8``, ``float64``, ``string``, …) or a message's full name.
+        is_message: whether ``kind`` names a message.
+        shape: ``scalar``, ``array`` (of ``size`` elements) or ``sequence`` (at most ``size``, 0 for
+            unbounded).
+        string_bound: the longest string allowed, 0 for any.
+        default: the declared default, or None for the type's own.
+    """
+
+    name: str
+    kind: str
+    is_message: bool
+    shape: str
+    size: int
+    string_bound: int
+    default: Any
+
+    @property
+    def idl_type(self) -> str:
+        """The type as rosidl's ``get_fields_and_field_types`` writes it."""
+        if self.is_message:
+            package, _, name = self.kind.split("/")
+            element = f"{package}/{name}"
+        else:
+            element = _IDL_NAMES.get(self.kind, self.kind)
+            if self.string_bound:
+                element += f"<{self.string_bound}>"
+        if self.shape == "array":
+            return f"{element}[{self.size}]"
+        if self.shape == "sequence":
+            return f"sequence<{element}, {self.size}>" if self.size else f"sequence<{element}>"
+        return element
+
+
+@dataclass(frozen=True)
+class Interface:
+    """A message: its full name (``geometry_msgs/msg/Point``), fields and constants."""
+
+    name: str
+    fields: tuple[Field, ...]
+    constants: dict[str, Any]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it has no fields, so that a placeholder byte goes over the wire."""
+        return not self.fields
+
+
+@cache
+def interface(name: str) -> Interface:
+    """The message ``name``; requests and responses are ``pkg/srv/Name_Request`` and so on.
+
+    Raises:
+        InterfaceError: Jazzy's type store has no such message.
+    """
+    definitions = _typestore().fielddefs
+    if name not in definitions:
+        raise InterfaceError(
+            f"there is no message {name!r} in the ROS 2 Jazzy type store; "
+            f"names look like 'sensor_msgs/msg/Image'"
+        )
+    constants, fields = definitions[name]
+    return Interface(
+        name=name,
+        fields=tuple(_field(name, *field) for field in fields if field[0] != PLACEHOLDER),
+        constants={
+            constant: bytes([value]) if kind == "byte" else value  # type: ignore[list-item]
+            for constant, kind, value in constants
+        },
+    )
+
+
+def message_names(package: str) -> list[str]:
+    """The short names of a package's messages, sorted."""
+    prefix = f"{package}/msg/"
+    names = _typestore().fielddefs
+    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
+
+
+def service_names(package: str) -> list[str]:
+    """The short names of a package's services, sorted."""
+    prefix = f"{package}/srv/"
+    return sorted(name.removeprefix(prefix) for name in _SERVICES if name.startswith(prefix))
+
+
+def packages() -> list[str]:
+    """The packages that have messages or services, sorted."""
+    names = [*_typestore().fielddefs, *_SERVICES]
+    return sorted({name.split("/")[0] for name in names})
+
+
+@cache
+def type_hash(name: str) -> str:
+    """The ``RIHS01_…`` hash of a message, request, response or service (REP 2016).
+
+    Raises:
+        InterfaceError: there is no such type.
+    """
+    store = _typestore()
+    if name not in store.fielddefs:
+        raise InterfaceError(f"there is no interface {name!r} in the ROS 2 Jazzy type store")
+    return store.hash_rihs01(name)
+
+
+@cache
+def _typestore() -> Any:
+    """rosbags' Jazzy store with the services' messages, as rosidl derives them, added."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for service, texts in _SERVICES.items():
+        package = service.split("/")[0]
+        for part, text in zip(("Request", "Response"), texts, strict=True):
+            name = f"{service}_{part}"
+            # The parser only takes names in msg/, so give it one and move the result.
+            parsed = get_types_from_msg(text, f"{package}/msg/Moved")[f"{package}/msg/Moved"]
+            store.fielddefs[name] = parsed
+        store.fielddefs[f"{service}_Event"] = (
+            [],
+            [
+                ("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")),
+                ("request", (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_Request"), 1))),
+                ("response", (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_Response"), 1))),
+            ],
+        )
+        store.fielddefs[service] = (
+            [],
+            [
+                ("request_message", (Nodetype.NAME, f"{service}_Request")),
+                ("response_message", (Nodetype.NAME, f"{service}_Response")),
+                ("event_message", (Nodetype.NAME, f"{service}_Event")),
+            ],
+        )
+    return store
+
+
+def _field(owner: str, name: str, description: Any) -> Field:
+    shape, size = "scalar", 0
+    if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        shape = "array" if description[0] == Nodetype.ARRAY else "sequence"
+        description, size = description[1]
+    is_message = description[0] == Nodetype.NAME
+    kind, bound = (description[1], 0) if is_message else description[1]
+    return Field(name, kind, is_message, shape, size, bound, _DEFAULTS.get((owner, name)))
