@@ -1,0 +1,289 @@
+"""Reading one MCAP file, also one that was cut off: what was written before the cut is recovered.
+
+A whole file is read by the index in its summary. Without one (the recorder was killed, the disk
+ran full, the copy broke off) the records are walked from the start up to the first that is not
+there in full, and of a chunk that is cut its leading messages are kept.
+
+The format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Schema
+from mcap.summary import Summary
+
+from us_sim.errors import BagError
+from us_sim.recording.qos import qos_from_yaml
+from us_sim.recording.schemas import normalized_type
+from us_sim.recording.topic import BagMessage, BagTopic
+
+__all__ = ["MAGIC", "McapFile"]
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of compression name
+
+# What the parsers raise when the bytes are not what they should be.
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    RuntimeError,
+    StopIteration,
+    MemoryError,
+)
+
+
+class _Run(NamedTuple):
+    """A stretch of the file that holds messages: a chunk, or records outside of chunks."""
+
+    start: int  # ns, lowest log time in it
+    offset: int  # bytes, of its first record's opcode
+    length: int  # bytes
+
+
+class McapFile:
+    """One MCAP file as a Storage.
+
+    Args:
+        path: the file.
+        label: what errors call it, where that is not its path.
+
+    Raises:
+        BagError: the file is empty, no MCAP, or of a topic with two types.
+    """
+
+    def __init__(self, path: Path, label: str = "") -> None:
+        self._path = path
+        self._label = label or str(path)
+        self.note = ""
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._counts: Counter[int] = Counter()
+        self._runs: list[_Run] = []
+        self.start: int | None = None
+        self.end: int | None = None
+        with path.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise BagError(f"{self._label} is not an MCAP file: it does not start as one")
+            summary = _summary(stream)
+            if summary is not None:
+                self._take(summary)
+            else:
+                self._scan(stream)
+        self.topics = self._topics()
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """The messages of these topics in the order of their log times.
+
+        Raises:
+            BagError: a chunk is damaged.
+        """
+        wanted = {
+            id: (channel.topic, _type_name(self._schemas.get(channel.schema_id)))
+            for id, channel in self._channels.items()
+            if channel.topic in topics
+        }
+        # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
+        pending: list[tuple[int, int, int, BagMessage]] = []
+        with self._path.open("rb") as stream:
+            for number, run in enumerate(self._runs):
+                while pending and pending[0][0] <= run.start:
+                    yield heapq.heappop(pending)[-1]
+                for index, content in enumerate(self._run_messages(stream, run)):
+                    channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
+                    if channel in wanted:
+                        data = bytes(content[_MESSAGE.size :])
+                        message = BagMessage(*wanted[channel], log_time, publish_time, data)
+                        heapq.heappush(pending, (log_time, number, index, message))
+        while pending:
+            yield heapq.heappop(pending)[-1]
+
+    def _take(self, summary: Summary) -> None:
+        """Believes the summary of a whole file."""
+        assert summary.statistics is not None
+        self._schemas = summary.schemas
+        self._channels = summary.channels
+        self._counts.update(summary.statistics.channel_message_counts)
+        self._runs = sorted(
+            _Run(chunk.message_start_time, chunk.chunk_start_offset, chunk.chunk_length)
+            for chunk in summary.chunk_indexes
+        )
+        if summary.statistics.message_count:
+            self.start = summary.statistics.message_start_time
+            self.end = summary.statistics.message_end_time
+
+    def _scan(self, stream: BinaryIO) -> None:
+        """Walks the records of a file that has no usable summary."""
+        size = stream.seek(0, 2)
+        position = len(MAGIC)
+        ended = False
+        while not ended:
+            stream.seek(position)
+            header = stream.read(_RECORD.size)
+            if len(header) < _RECORD.size:
+                break
+            opcode, length = _RECORD.unpack(header)
+            whole = position + _RECORD.size + length <= size
+            if opcode == 0 or not (whole or opcode == Opcode.CHUNK):
+                break  # a zero is what file systems fill a lost block with
+            ended = opcode == Opcode.DATA_END
+            if opcode in (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                run_length = _RECORD.size + min(length, size - position - _RECORD.size)
+                try:
+                    self._scan_run(stream, position, run_length)
+                except _DAMAGE:
+                    break
+            if not whole:
+                break
+            position += _RECORD.size + length
+        self._runs.sort()
+        stream.seek(max(0, size - len(MAGIC)))
+        if not (ended and stream.read() == MAGIC):
+            count = sum(self._counts.values())
+            seconds = (self.end - self.start) / 1e9 if self.start and self.end else 0.0
+            self.note = (
+                f"{self._label} was not ended properly (it breaks off at byte {position} of "
+                f"{size}): {count} messages over {seconds:.1f} s were recovered"
+            )
+
+    def _scan_run(self, stream: BinaryIO, offset: int, length: int) -> None:
+        """Learns schemas, channels, counts and times of one record or chunk."""
+        first: int | None = None
+        for opcode, content in _records(stream, offset, length, self._label):
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(_data_stream(content))
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(_data_stream(content))
+                self._channels[channel.id] = channel
+            elif opcode == Opcode.MESSAGE:
+                id, _, log_time, _ = _MESSAGE.unpack_from(content)
+                if id not in self._channels:
+                    continue
+                self._counts[id] += 1
+                first = log_time if first is None else min(first, log_time)
+                self.start = log_time if self.start is None else min(self.start, log_time)
+                self.end = log_time if self.end is None else max(self.end, log_time)
+        if first is not None:
+            self._runs.append(_Run(first, offset, length))
+
+    def _run_messages(self, stream: BinaryIO, run: _Run) -> Iterator[memoryview]:
+        try:
+            for opcode, content in _records(stream, run.offset, run.length, self._label):
+                if opcode == Opcode.MESSAGE:
+                    yield content
+        except _DAMAGE as error:
+            raise BagError(
+                f"{self._label} is damaged in its chunk at byte {run.offset}: {error}"
+            ) from None
+
+    def _topics(self) -> tuple[BagTopic, ...]:
+        topics: dict[str, BagTopic] = {}
+        for id, channel in self._channels.items():
+            schema = self._schemas.get(channel.schema_id)
+            topic = BagTopic(
+                name=channel.topic,
+                type_name=_type_name(schema),
+                message_count=self._counts[id],
+                qos=qos_from_yaml(channel.metadata.get("offered_qos_profiles")),
+                type_hash=channel.metadata.get("topic_type_hash", ""),
+                encoding=channel.message_encoding,
+                schema=_schema_text(schema),
+            )
+            earlier = topics.get(topic.name)
+            topics[topic.name] = earlier.joined(topic, self._label) if earlier else topic
+        return tuple(topics.values())
+
+
+def _summary(stream: BinaryIO) -> Summary | None:
+    """The summary of a file that has one with statistics and an index of its messages."""
+    try:
+        stream.seek(-len(MAGIC), 2)
+        if stream.read() != MAGIC:
+            return None
+        stream.seek(0)
+        summary = SeekingReader(stream).get_summary()
+    except (*_DAMAGE, OSError):
+        return None
+    if summary is None or summary.statistics is None:
+        return None
+    statistics = summary.statistics
+    indexed = len(summary.chunk_indexes) == statistics.chunk_count
+    if not indexed or (statistics.message_count and not summary.chunk_indexes):
+        return None
+    described = summary.channels.keys() >= statistics.channel_message_counts.keys()
+    return summary if described else None
+
+
+def _records(
+    stream: BinaryIO, offset: int, length: int, label: str
+) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and content of a record outside of chunks, or of each that a chunk holds."""
+    stream.seek(offset)
+    content = memoryview(stream.read(length))
+    opcode, declared = _RECORD.unpack_from(content)
+    content = content[_RECORD.size :]
+    if opcode != Opcode.CHUNK:
+        yield opcode, content
+        return
+    content = _chunk_records(content, whole=len(content) == declared, label=label)
+    position = 0
+    while position + _RECORD.size <= len(content):
+        opcode, declared = _RECORD.unpack_from(content, position)
+        begin = position + _RECORD.size
+        position = begin + declared
+        if position > len(content):
+            return
+        yield opcode, content[begin:position]
+
+
+def _chunk_records(content: memoryview, *, whole: bool, label: str) -> memoryview:
+    """The records in a chunk, decompressed; of a chunk that is cut, those before the cut."""
+    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+    begin = _CHUNK.size + name_length + 8
+    compression = bytes(content[_CHUNK.size : _CHUNK.size + name_length]).decode()
+    packed = content[begin:]
+    if compression == "":
+        records = packed
+    elif compression == "zstd":
+        records = memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(packed))
+    elif compression == "lz4":
+        records = memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed))
+    else:
+        raise BagError(f"{label} is compressed with {compression!r}: use zstd, lz4 or none")
+    if whole and (len(records) != size or (crc and zlib.crc32(records) != crc)):
+        raise ValueError("its checksum does not match")
+    return records
+
+
+def _data_stream(content: memoryview) -> ReadDataStream:
+    return ReadDataStream(BytesIO(content))
+
+
+def _type_name(schema: Schema | None) -> str:
+    return normalized_type(schema.name) if schema else ""
+
+
+def _schema_text(schema: Schema | None) -> str | None:
+    if schema is None or schema.encoding != "ros2msg":
+        return None
+    return schema.data.decode("utf-8", errors="replace")

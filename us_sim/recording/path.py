@@ -1,0 +1,194 @@
+"""A probe's path: the poses of one PoseStamped topic of a bag, as arrays.
+
+>>> import numpy as np, tempfile
+>>> from us_sim.recording.path import ProbePath, read_path, write_path
+>>> stamps = 1_700_000_000_000_000_000 + np.array([0, 16_666_667])
+>>> positions = np.array([[0, 0, -0.01], [0, 0, -0.009]])
+>>> orientations = np.array([[0, 0, 0, 1.0], [0, 0, 0, 1.0]])
+>>> file = tempfile.mkdtemp() + "/path.mcap"
+>>> write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
+>>> read_path(file).positions[:, 2]
+array([-0.01 , -0.009])
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import BagError
+from us_sim.recording.qos import QosProfile
+from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.writer import BagWriter
+
+__all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path"]
+
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+
+
+@dataclass(frozen=True, eq=False)
+class ProbePath:
+    """Poses in the order in which they were recorded; their stamps may go back.
+
+    Raises:
+        BagError: the arrays are not of K poses.
+    """
+
+    topic: str
+    frame_id: str
+    stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
+    positions: NDArray[np.float64]  # (K, 3) m, frame frame_id
+    orientations: NDArray[np.float64]  # (K, 4) x, y, z, w as recorded, not normalised
+    log_times: NDArray[np.int64] = field(  # (K,) ns since the epoch; the stamps when not given
+        default_factory=lambda: np.empty(0, np.int64)
+    )
+    rejected: int = 0  # poses of the topic left out: not finite, or without an orientation
+    note: str = ""  # what is wrong with the recording, in a sentence; empty when nothing is
+
+    def __post_init__(self) -> None:
+        if not len(self.log_times):
+            object.__setattr__(self, "log_times", self.stamps)
+        count = len(self.stamps)
+        shapes = [(count,), (count, 3), (count, 4), (count,)]
+        arrays = [self.stamps, self.positions, self.orientations, self.log_times]
+        if [array.shape for array in arrays] != shapes:
+            raise BagError(
+                f"a path of {count} stamps needs as many positions (K, 3), orientations (K, 4) "
+                f"and log times, not {[array.shape for array in arrays[1:]]}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last recorded pose."""
+        return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
+
+
+def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
+    """Reads the poses of a bag.
+
+    Poses that are not finite or have no orientation are left out and counted.
+
+    Args:
+        path: any bag that ``read_bag`` reads.
+        topic: its name, with or without the leading slash; the bag's only PoseStamped topic when
+            not given.
+
+    Raises:
+        BagError: there is no such bag or topic, several come into question, the topic is of
+            another type or encoding, its poses are of several frames, or none is usable.
+    """
+    bag = read_bag(path)
+    chosen = _pose_topic(bag, topic)
+    if chosen.message_count == 0:
+        raise BagError(f"{bag.path} holds no pose on {chosen.name}; {bag.note or 'it is silent'}")
+    return _extract(bag, chosen, list(bag.messages([chosen.name])))
+
+
+def write_path(
+    file: str | Path, path: ProbePath, *, qos: QosProfile | None = None, sidecar: bool = True
+) -> None:
+    """Writes a path as a bag of its one topic, compressed.
+
+    Args:
+        file: as ``BagWriter`` takes it.
+        path: recorded at its log times.
+        qos: what the topic's publisher offers; reliable, keep last 10 when not given.
+        sidecar: False leaves ``metadata.yaml`` away.
+
+    Raises:
+        BagError: the file exists or cannot be written.
+    """
+    with BagWriter(file, compression="zstd", sidecar=sidecar) as writer:
+        writer.add_topic(path.topic, POSE_STAMPED, [qos or QosProfile()])
+        rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
+        for stamp, log_time, position, orientation in rows:
+            message = _serialized(int(stamp), path.frame_id, position, orientation)
+            writer.write(path.topic, message, int(log_time), int(stamp))
+
+
+def _serialized(
+    stamp: int, frame_id: str, position: NDArray[np.float64], orientation: NDArray[np.float64]
+) -> memoryview:
+    """A PoseStamped as CDR; stamp in ns."""
+    store = jazzy_definitions()
+    types = store.types
+    message = types[POSE_STAMPED](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id=frame_id
+        ),
+        pose=types["geometry_msgs/msg/Pose"](
+            position=types["geometry_msgs/msg/Point"](*position.tolist()),
+            orientation=types["geometry_msgs/msg/Quaternion"](*orientation.tolist()),
+        ),
+    )
+    return store.serialize_cdr(message, POSE_STAMPED, little_endian=True)
+
+
+def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
+    """The topic asked for, or the bag's only one with poses."""
+    if name is not None:
+        topic = bag.topic(name)
+        if topic.type_name != POSE_STAMPED:
+            raise BagError(
+                f"{bag.path} holds {topic.name} as {topic.type_name}: a path needs {POSE_STAMPED}"
+            )
+        return topic
+    poses = [topic for topic in bag.topics if topic.type_name == POSE_STAMPED]
+    if len(poses) == 1:
+        return poses[0]
+    if poses:
+        names = ", ".join(sorted(topic.name for topic in poses))
+        raise BagError(f"{bag.path} holds poses on several topics: name one of {names}")
+    found = ", ".join(sorted(f"{topic.name} ({topic.type_name})" for topic in bag.topics))
+    raise BagError(f"{bag.path} holds no topic of {POSE_STAMPED}; it has {found or 'no topic'}")
+
+
+def _extract(bag: Bag, topic: BagTopic, messages: list[BagMessage]) -> ProbePath:
+    """The usable poses of the messages of one topic."""
+    count = len(messages)
+    stamps, log_times = np.empty(count, np.int64), np.empty(count, np.int64)
+    poses = np.empty((count, 7))
+    frames: dict[str, None] = {}
+    for k, raw in enumerate(messages):
+        message = bag.deserialize(raw)
+        stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
+        stamps[k] = stamp.sec * 10**9 + stamp.nanosec
+        log_times[k] = raw.log_time
+        poses[k] = p.x, p.y, p.z, q.x, q.y, q.z, q.w
+        frames[message.header.frame_id] = None
+    if len(frames) > 1:
+        raise BagError(
+            f"{bag.path} holds poses on {topic.name} in the frames {', '.join(frames)}: a path "
+            f"has one frame"
+        )
+    # What us_sim.pose.Pose refuses; a zero quaternion is what a tracker sends for a lost marker.
+    with np.errstate(invalid="ignore"):
+        has_orientation = np.linalg.norm(poses[:, 3:], axis=1) >= 1e-6
+    usable = np.isfinite(poses).all(axis=1) & has_orientation
+    rejected = count - int(usable.sum())
+    notes = [bag.note] if bag.note else []
+    if rejected:
+        notes.append(
+            f"{rejected} of the {count} poses on {topic.name} are not finite or have no "
+            f"orientation and are left out, the first being number {int(np.argmin(usable)) + 1}"
+        )
+    if rejected == count:
+        raise BagError(f"{bag.path} holds no usable pose: {'; '.join(notes)}")
+    return ProbePath(
+        topic=topic.name,
+        frame_id=next(iter(frames)),
+        stamps=stamps[usable],
+        positions=poses[usable, :3],
+        orientations=poses[usable, 3:],
+        log_times=log_times[usable],
+        rejected=rejected,
+        note="; ".join(notes),
+    )

@@ -1,0 +1,98 @@
+"""The probe path of the demo: come down, press, hold, slide and rock, release, lift.
+
+``python -m us_sim.recording.press_and_slide FILE.mcap`` writes it as a bag.
+
+>>> from us_sim.recording.press_and_slide import press_and_slide
+>>> path = press_and_slide()
+>>> len(path), float(path.positions[:, 2].min()), float(path.positions[:, 2].max())
+(600, -0.01, 0.012)
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import BagError
+from us_sim.recording.path import ProbePath, write_path
+
+__all__ = ["press_and_slide"]
+
+_EPOCH = 1_700_000_000 * 10**9  # ns
+
+# Key poses, each a time in s of the ten and a value, between which the probe moves.
+_KEYED_DURATION = 10.0
+_SLIDE = np.array([[5.0, 0.0], [6.25, 0.008], [7.5, 0.0]])  # m along y, the vessels
+_ROCK = np.array([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]])  # degrees about x
+# Share of the hover height where negative, above the skin, and of the depth where positive.
+_PRESS = np.array(
+    [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]],
+)
+
+
+def press_and_slide(
+    rate: float = 60.0, duration: float = 10.0, depth: float = 0.012, hover: float = 0.010
+) -> ProbePath:
+    """A path that touches flat skin at the origin, presses on it and lets go of it.
+
+    Between its key poses it moves with minimum jerk (Flash and Hogan 1985), as a hand does, so it
+    rests for an instant at each of them.
+
+    Args:
+        rate: poses per second.
+        duration: s; the phases keep their shares of it.
+        depth: m, of the press below the skin.
+        hover: m, height above the skin before and after.
+
+    Returns:
+        ``round(rate * duration)`` poses on ``/tracker/pose`` in frame ``patient``.
+
+    Raises:
+        BagError: a rate or duration is not positive, or a length negative.
+    """
+    if not (rate > 0 and duration > 0 and depth >= 0 and hover >= 0):
+        raise BagError(
+            f"a path cannot have rate {rate}, duration {duration}, depth {depth}, hover {hover}: "
+            f"the first two must be positive, the others not negative"
+        )
+    times = np.arange(round(rate * duration)) / rate
+    phase = times * (_KEYED_DURATION / duration)
+    press = _minimum_jerk(_PRESS, phase)
+    half_angle = np.radians(_minimum_jerk(_ROCK, phase)) / 2
+    positions = np.zeros((len(times), 3))
+    positions[:, 1] = _minimum_jerk(_SLIDE, phase)
+    positions[:, 2] = press * np.where(press < 0, hover, depth)
+    orientations = np.zeros((len(times), 4))
+    orientations[:, 0] = np.sin(half_angle)
+    orientations[:, 3] = np.cos(half_angle)
+    stamps = _EPOCH + np.round(times * 1e9).astype(np.int64)
+    return ProbePath("/tracker/pose", "patient", stamps, positions, orientations)
+
+
+def _minimum_jerk(keys: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) values at times (K,) s, at rest at each of the keys (N, 2) and outside of them."""
+    at, values = keys.T
+    left = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
+    share = np.clip((times - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
+    blend = share**3 * (10 - 15 * share + 6 * share**2)
+    return values[left] + blend * (values[left + 1] - values[left])
+
+
+def main(arguments: list[str]) -> int:
+    """Writes the path where the one argument says; returns the exit status."""
+    if len(arguments) != 1:
+        print("usage: python -m us_sim.recording.press_and_slide FILE.mcap", file=sys.stderr)
+        return 2
+    try:
+        # The folder of the project's paths holds one bag per file, so none may claim it.
+        write_path(arguments[0], press_and_slide(), sidecar=False)
+    except BagError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

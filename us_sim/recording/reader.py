@@ -1,0 +1,187 @@
+"""Reading bags: MCAP or SQLite, one file or a folder, compressed or not, whole or cut off.
+
+>>> import tempfile
+>>> from us_sim.recording.reader import read_bag
+>>> from us_sim.recording.writer import BagWriter
+>>> file = tempfile.mkdtemp() + "/note.mcap"
+>>> with BagWriter(file) as writer:
+...     writer.add_topic("/note", "std_msgs/msg/String")
+...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
+>>> bag = read_bag(file)
+>>> [bag.deserialize(message).data for message in bag.messages()]
+['hi']
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import zstandard
+
+from us_sim.errors import BagError
+from us_sim.recording.metadata import BagMetadata
+from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
+from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
+from us_sim.recording.topic import BagMessage, BagTopic
+
+__all__ = ["Bag", "read_bag"]
+
+
+class Bag:
+    """A bag opened for reading; made by :func:`read_bag`."""
+
+    def __init__(
+        self,
+        path: Path,
+        storages: list[Storage],
+        metadata: BagMetadata | None,
+        scratch: Scratch,
+    ) -> None:
+        self.path = path
+        self.metadata = metadata
+        self._storages = storages
+        self._scratch = scratch  # kept alive with the files that it unpacked
+        self._decompress_messages = metadata is not None and metadata.compression_mode == "MESSAGE"
+        topics: dict[str, BagTopic] = {}
+        for topic in (topic for storage in storages for topic in storage.topics):
+            earlier = topics.get(topic.name)
+            topics[topic.name] = earlier.joined(topic, str(path)) if earlier else topic
+        for entry in metadata.topics if metadata else ():
+            type_name = normalized_type(entry.type_name)
+            silent = BagTopic(entry.name, type_name, 0, entry.qos, entry.type_hash, entry.encoding)
+            topics.setdefault(entry.name, silent)
+        self.topics = tuple(topics.values())
+        self._topics = topics
+
+    @property
+    def start(self) -> int | None:
+        """Lowest log time in ns since the epoch; None without messages."""
+        times = [storage.start for storage in self._storages if storage.start is not None]
+        return min(times, default=None)
+
+    @property
+    def end(self) -> int | None:
+        """Highest log time in ns since the epoch; None without messages."""
+        times = [storage.end for storage in self._storages if storage.end is not None]
+        return max(times, default=None)
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages on all topics."""
+        return sum(topic.message_count for topic in self.topics)
+
+    @property
+    def complete(self) -> bool:
+        """False when a file breaks off; then :attr:`note` says how much was recovered."""
+        return not self.note
+
+    @property
+    def note(self) -> str:
+        """What is wrong with a bag that was not ended properly; empty when whole."""
+        return "; ".join(storage.note for storage in self._storages if storage.note)
+
+    def topic(self, name: str) -> BagTopic:
+        """The topic of this name, with or without its leading slash.
+
+        Raises:
+            BagError: the bag has no such topic.
+        """
+        for candidate in (name, f"/{name}", name.removeprefix("/")):
+            if candidate in self._topics:
+                return self._topics[candidate]
+        raise BagError(
+            f"{self.path} has no topic {name}; it has {', '.join(sorted(self._topics)) or 'none'}"
+        )
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """The messages of all topics or of these, in the order of their log times.
+
+        Raises:
+            BagError: the bag has no such topic, or is damaged.
+        """
+        names = {self.topic(name).name for name in topics} if topics is not None else self._topics
+        streams = [storage.messages(names) for storage in self._storages]
+        for message in heapq.merge(*streams, key=lambda message: message.log_time):
+            if self._decompress_messages:
+                try:
+                    data = zstandard.ZstdDecompressor().decompressobj().decompress(message.data)
+                except zstandard.ZstdError as error:
+                    raise BagError(f"{self.path} is damaged: {error}") from None
+                message = message._replace(data=data)
+            yield message
+
+    def deserialize(self, message: BagMessage) -> Any:
+        """The message as a rosbags dataclass, by the definition that the bag carries.
+
+        Raises:
+            BagError: it is not CDR, its type is unknown, or its bytes do not fit the type.
+        """
+        topic = self._topics[message.topic]
+        if topic.encoding != "cdr":
+            raise BagError(
+                f"{self.path} holds {topic.name} in the encoding {topic.encoding!r}: only cdr, "
+                f"what ROS 2 writes, can be read"
+            )
+        if topic.schema is not None:
+            store = definitions(topic.type_name, topic.schema)
+        else:
+            store = jazzy_definitions()
+            if topic.type_name not in store.fielddefs:
+                raise BagError(
+                    f"{self.path} holds {topic.name} of type {topic.type_name} without its "
+                    f"definition: record it again with MCAP, which carries definitions"
+                )
+        try:
+            return store.deserialize_cdr(message.data, topic.type_name)
+        except Exception as error:
+            # Generated decoders raise whatever wrong bytes lead them to.
+            raise BagError(
+                f"{self.path} holds a message on {topic.name} at {message.log_time} ns that is no "
+                f"{topic.type_name}: {error}"
+            ) from None
+
+    def summary(self) -> dict[str, Any]:
+        """What ``us-sim bag info`` shows, in types that JSON has; times in ns since the epoch."""
+        start, end = self.start, self.end
+        return {
+            "path": str(self.path),
+            "complete": self.complete,
+            "note": self.note,
+            "start": start,
+            "end": end,
+            "duration": end - start if start is not None and end is not None else 0,
+            "message_count": self.message_count,
+            "topics": [
+                {
+                    "name": topic.name,
+                    "type": topic.type_name,
+                    "message_count": topic.message_count,
+                    "encoding": topic.encoding,
+                    "type_hash": topic.type_hash,
+                    "qos": [" ".join(profile.lines()[:4]) for profile in topic.qos],
+                }
+                for topic in sorted(self.topics, key=lambda topic: topic.name)
+            ],
+        }
+
+
+def read_bag(path: str | Path) -> Bag:
+    """Opens a bag for reading.
+
+    Args:
+        path: an MCAP or SQLite file, either of them compressed with zstd, or a folder with such
+            files, with or without their ``metadata.yaml``.
+
+    Raises:
+        BagError: there is no bag, or it cannot be read; a file that is only cut off can.
+    """
+    path = Path(path)
+    try:
+        files, metadata = bag_files(path)
+        scratch = Scratch()
+        return Bag(path, [open_storage(file, scratch) for file in files], metadata, scratch)
+    except OSError as error:
+        raise BagError(f"{path} cannot be read: {error.strerror or error}") from None

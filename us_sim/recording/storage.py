@@ -1,0 +1,119 @@
+"""The files of a bag: which they are, and what reads each, told by its first bytes."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import weakref
+from collections.abc import Collection, Iterator
+from pathlib import Path, PurePosixPath
+from typing import Protocol
+
+import zstandard
+
+from us_sim.errors import BagError
+from us_sim.recording import mcap_file, sqlite_file
+from us_sim.recording.mcap_file import McapFile
+from us_sim.recording.metadata import BagMetadata, read_metadata
+from us_sim.recording.sqlite_file import SqliteFile
+from us_sim.recording.topic import BagMessage, BagTopic
+
+__all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
+
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+
+
+class Storage(Protocol):
+    """One readable file of a bag."""
+
+    topics: tuple[BagTopic, ...]
+    start: int | None  # ns, lowest log time; None without messages
+    end: int | None  # ns, highest log time
+    note: str  # what is wrong with a file that was not ended properly; empty when whole
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """The messages of these topics in the order of their log times."""
+        ...
+
+
+class Scratch:
+    """A temporary folder for unpacked files, made when needed and removed with this object."""
+
+    def __init__(self) -> None:
+        self._folder: str | None = None
+
+    def unpack(self, file: Path) -> Path:
+        """A decompressed copy of a zstd file.
+
+        Raises:
+            BagError: the file is damaged or cut off.
+        """
+        if self._folder is None:
+            self._folder = tempfile.mkdtemp(prefix="us_sim_bag_")
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        copy = Path(self._folder, file.name.removesuffix(".zstd"))
+        with file.open("rb") as packed, copy.open("wb") as unpacked:
+            try:
+                zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
+            except zstandard.ZstdError as error:
+                raise BagError(f"{file} cannot be decompressed: {error}") from None
+        return copy
+
+
+def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
+    """The files that a bag consists of, in their order, and its ``metadata.yaml`` if it has one.
+
+    Raises:
+        BagError: there are none, some are missing, or it is open which of several to read.
+    """
+    if path.is_file():
+        return [path], None
+    if not path.is_dir():
+        raise BagError(f"there is no bag at {path}: give an .mcap or .db3 file, or a bag's folder")
+    if (path / "metadata.yaml").is_file():
+        metadata = read_metadata(path / "metadata.yaml")
+        return [_listed_file(path, file.path) for file in metadata.files], metadata
+    files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
+    if not files:
+        raise BagError(f"{path} holds no bag: neither metadata.yaml nor an .mcap or .db3 file")
+    numbered = {file: re.fullmatch(r"(.*)_(\d+)(\..*)", file.name) for file in files}
+    parts = {(match[1], match[3]) if match else file for file, match in numbered.items()}
+    if len(parts) > 1:
+        names = ", ".join(file.name for file in files)
+        raise BagError(f"{path} holds several bags and no metadata.yaml: give one of {names}")
+    return sorted(files, key=lambda file: int(m[2]) if (m := numbered[file]) else 0), None
+
+
+def open_storage(file: Path, scratch: Scratch) -> Storage:
+    """What reads a file, by its first bytes and whatever its name.
+
+    Raises:
+        BagError: the file is empty, no bag, or damaged.
+    """
+    return _open(file, str(file), scratch)
+
+
+def _open(file: Path, label: str, scratch: Scratch) -> Storage:
+    with file.open("rb") as stream:
+        start = stream.read(16)
+    if not start:
+        raise BagError(f"{label} is empty: its recorder was ended before it wrote anything")
+    if start.startswith(mcap_file.MAGIC):
+        return McapFile(file, label)
+    if start == sqlite_file.MAGIC:
+        return SqliteFile(file, label)
+    if start.startswith(_ZSTD_MAGIC):
+        return _open(scratch.unpack(file), label, scratch)
+    if start.startswith(b"#ROSBAG"):
+        raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
+    raise BagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")
+
+
+def _listed_file(folder: Path, listed: str) -> Path:
+    """A file that metadata.yaml names; before version 4 its path began with the bag's folder."""
+    for file in (folder / listed, folder / PurePosixPath(listed).name):
+        if file.is_file():
+            return file
+    raise BagError(f"{folder / 'metadata.yaml'} names {listed}, which is not there")
