@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 NODES = [
     "path_player",
     "probe_tracker",
+    "session_player",
     "session_recorder",
     "skin_deformer",
     "slice_interpolator",

@@ -91,7 +91,7 @@ class TissueSection:
 
 @dataclass(frozen=True)
 class SkinSection:
-    """The skin membrane: a surface file, or a sheet that bends down on both sides of a flat part."""
+    """The skin membrane: a surface file, or a sheet bent down on both sides of a flat part."""
 
     file: str | None = _given(default=None)
     size: tuple[float, float] = _given(Quantity("length", 0.01, 2.0), default=(0.2, 0.2))

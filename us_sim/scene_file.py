@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import itertools
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -161,7 +162,7 @@ def _check_volume(volume: VolumeSection, origin: str) -> None:
         raise SceneError(f"{origin}: volume: has both `file` and `phantom`; keep one")
     if not volume.file and not volume.phantom:
         raise SceneError(
-            f"{origin}: volume.file: is missing; name a volume file there, or give one with --volume"
+            f"{origin}: volume.file: is missing; name a file there, or give one with --volume"
         )
 
 
@@ -181,7 +182,7 @@ def _check_tissue(scene: Scene, tissue: TissueSection, origin: str) -> None:
             )
         planes = mesh.planes.get(name)
         if planes is not None and (
-            len(planes) < 2 or any(b <= a for a, b in zip(planes, planes[1:], strict=False))
+            len(planes) < 2 or any(b <= a for a, b in itertools.pairwise(planes))
         ):
             raise SceneError(
                 f"{origin}: tissue.mesh.planes.{name}: needs two or more rising coordinates"

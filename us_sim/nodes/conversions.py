@@ -17,13 +17,14 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker
 
-from us_sim.errors import MeshError
+from us_sim.errors import MeshError, VolumeError
 from us_sim.pose import Pose
 
 __all__ = [
     "cloud_message",
     "image_message",
     "mesh_message",
+    "pixels_from",
     "pose_from",
     "pose_message",
     "surface_marker",
@@ -94,9 +95,25 @@ def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
     return message
 
 
-def cloud_message(
-    columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str
-) -> PointCloud2:
+def pixels_from(message: Image) -> NDArray[np.uint8]:
+    """The (rows, columns) pixels of a ``mono8`` image.
+
+    Raises:
+        VolumeError: another encoding, or fewer bytes than the stated size.
+    """
+    if message.encoding not in ("mono8", "8UC1"):
+        raise VolumeError(f"the image is {message.encoding}; it must be mono8")
+    step = message.step or message.width
+    if len(message.data) < message.height * step:
+        raise VolumeError(
+            f"the image holds {len(message.data)} bytes, but says it has {message.height} rows "
+            f"of {step}"
+        )
+    rows = np.frombuffer(message.data, dtype=np.uint8, count=message.height * step)
+    return rows.reshape(message.height, step)[:, : message.width]
+
+
+def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str) -> PointCloud2:
     """A float32 cloud whose fields are the ``columns``, each (N,), in their order."""
     table = np.column_stack(list(columns.values())).astype("<f4")
     message = PointCloud2()

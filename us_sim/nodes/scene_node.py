@@ -56,9 +56,7 @@ class SceneNode(Node):
 
     def newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
         """Call ``work`` with the newest message of ``topic`` (with each one in lockstep)."""
-        self.listen(
-            message_type, topic, Newest(self, self.health, work, lockstep=self.lockstep)
-        )
+        self.listen(message_type, topic, Newest(self, self.health, work, lockstep=self.lockstep))
 
     def listen(
         self,

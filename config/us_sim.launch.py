@@ -1,0 +1,59 @@
+"""Launch the nodes that a scene needs: ``ros2 launch us_sim us_sim.launch.py scene:=upper_arm``."""
+
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from us_sim.scene_file import load_scene
+from us_sim.share import shared_path
+
+
+def nodes(context):
+    """One action for each node, and one line for each that is left out."""
+    scene_name, path, record, volume = (
+        LaunchConfiguration(name).perform(context) for name in ("scene", "path", "record", "volume")
+    )
+    scene = load_scene(scene_name, volume=volume or None)
+    parameters = {"scene": scene.origin, "volume": scene.volume.file or ""}
+    actions = []
+    if record:
+        file = str(Path(record).expanduser().resolve())
+        actions.append(node("session_recorder", {"file": file}))
+    for part in scene.parts():
+        if part.needed:
+            actions.append(node(part.node, parameters))
+        else:
+            actions.append(LogInfo(msg=f"{part.node} is left out: {part.reason}"))
+    if path:
+        bag = Path(path).expanduser()
+        bag = bag if bag.exists() else shared_path(f"bags/{path}")
+        awaited = ["probe/pose", "ultrasound/image"]
+        actions.append(node("path_player", {"path": str(bag.resolve()), "await_topics": awaited}))
+    return actions
+
+
+def node(name, parameters):
+    """A node of this package."""
+    return Node(
+        package="us_sim", executable=name, name=name, parameters=[parameters], output="screen"
+    )
+
+
+def generate_launch_description():
+    """Arguments: scene, path, record, volume."""
+    arguments = {
+        "scene": ("upper_arm", "scene file, or name of an installed one"),
+        "path": ("", "bag with a probe path to play; empty: poses come from outside"),
+        "record": ("", "MCAP file to record to; empty: nothing is recorded"),
+        "volume": ("", "volume file that replaces the scene's"),
+    }
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(name, default_value=default, description=description)
+            for name, (default, description) in arguments.items()
+        ]
+        + [OpaqueFunction(function=nodes)]
+    )

@@ -1,0 +1,44 @@
+"""The skin node: rest mesh latched, vertices with normals, a marker for who asks."""
+
+import numpy as np
+from conftest import pose_at
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import Mesh
+from visualization_msgs.msg import Marker
+
+from us_sim.assembly import membrane_of
+from us_sim.nodes.conversions import vectors_from
+from us_sim.nodes.skin_deformer import SkinDeformer
+from us_sim.pose import Pose
+from us_sim.scene_file import load_scene
+
+
+def test_vertices_normals_marker_and_latched_mesh(bench, small_scene):
+    bench.make(SkinDeformer, scene=str(small_scene), lockstep=True)
+    clouds = bench.collect(PointCloud2, "skin/nodes")
+    markers = bench.collect(Marker, "skin/marker")
+    meshes = bench.collect(Mesh, "skin/mesh", latched=True)
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: meshes)
+    for topic in ("skin/nodes", "skin/marker"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    publisher.publish(pose_at(0.006, 5))
+    bench.spin_until(lambda: clouds and markers)
+    membrane = membrane_of(load_scene(small_scene))
+    expected = membrane.deform(Pose([0.0, 0.0, 0.006], [0.0, 0.0, 0.0, 1.0]))
+    assert clouds[0].header.stamp.sec == 5
+    assert [field.name for field in clouds[0].fields] == [
+        *("x", "y", "z"),
+        *("normal_x", "normal_y", "normal_z"),
+    ]
+    table = np.frombuffer(clouds[0].data, np.float32).reshape(-1, 6)
+    np.testing.assert_allclose(vectors_from(clouds[0]), expected.vertices, atol=1e-7)
+    np.testing.assert_allclose(table[:, 3:], expected.normals, atol=1e-6)
+    triangles = membrane.surface.triangles
+    assert len(meshes[0].triangles) == len(triangles)
+    assert list(meshes[0].triangles[3].vertex_indices) == triangles[3].tolist()
+    corner = markers[0].points[0]
+    np.testing.assert_allclose(
+        [corner.x, corner.y, corner.z], expected.vertices[triangles[0, 0]], atol=1e-6
+    )

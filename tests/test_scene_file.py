@@ -1,0 +1,137 @@
+"""Scene files: what they mean, and one sentence with file and key for each kind of mistake."""
+
+import copy
+
+import pytest
+import yaml
+
+from us_sim.assembly import collider_of
+from us_sim.errors import SceneError
+from us_sim.scene_file import find_scene, load_scene, parse_scene
+from us_sim.share import shared_path
+
+COMPLETE = yaml.safe_load(
+    """
+name: test
+volume: {phantom: upper_arm, seed: 3, voxel_size: 1 mm}
+probe:
+  aperture: 40 mm
+  depth: 0.03
+  image: [64, 48]
+  collider: {shape: sphere, radius: 2 cm}
+tissue:
+  mesh: {lower: [-20 mm, -20 mm, 0], upper: [20 mm, 20 mm, 40 mm], nodes: [3, 4, 5]}
+  materials: {muscle: {young_modulus: 12 kPa, poisson_ratio: 0.4}}
+skin: {spacing: 5 mm}
+"""
+)
+
+
+def changed(key: str, value: object) -> dict:
+    """The complete scene with the value at a dotted key set (or, with None, removed)."""
+    document = copy.deepcopy(COMPLETE)
+    *parents, last = key.split(".")
+    section = document
+    for parent in parents:
+        section = section[parent]
+    if value is None:
+        del section[last]
+    else:
+        section[last] = value
+    return document
+
+
+def test_units_are_si_inside():
+    scene = parse_scene(COMPLETE)
+    assert scene.volume.voxel_size == pytest.approx(1e-3)
+    assert scene.probe.aperture == pytest.approx(0.04)
+    assert scene.probe.depth == 0.03
+    assert scene.tissue.mesh.upper == pytest.approx((0.02, 0.02, 0.04))
+    assert scene.tissue.mesh.nodes == (3, 4, 5)
+    assert scene.tissue.materials["muscle"].young_modulus == pytest.approx(12e3)
+    assert collider_of(scene).radius == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("volum", {}, r"unknown key `volum`; did you mean `volume`\?"),
+        ("probe.apertur", 1, "probe: unknown key `apertur`"),
+        ("probe.aperture", 40, r"probe.aperture: 40 m is outside .* did you mean '40 mm'\?"),
+        ("probe.aperture", "40 kPa", "probe.aperture: '40 kPa' is not a length"),
+        ("probe.aperture", float("nan"), "probe.aperture: nan is not finite"),
+        ("probe.aperture", True, "probe.aperture: True is not a length"),
+        ("probe.aperture", None, "probe.aperture: is missing"),
+        ("probe.image", [512], "probe.image: needs 2 values, not 1"),
+        ("probe.image", [512, 1.5], r"probe.image\[1\]: 1.5 is not a whole number"),
+        ("probe.geometry", "round", "probe.geometry: 'round' is not one of linear"),
+        ("probe.collider", None, "probe.collider: is missing"),
+        ("volume", None, "volume: is missing"),
+        ("volume.phantom", "leg", "volume.phantom: 'leg' is not one of upper_arm"),
+        ("volume", {}, "volume.file: is missing; name a file there, or give one with --volume"),
+        ("volume.file", "a.mha", "has both `file` and `phantom`"),
+        ("volume", {"file": "nowhere.mha"}, "volume.file: there is no file .*nowhere.mha"),
+        ("path", "nowhere.mcap", "path: there is no file .*nowhere.mcap"),
+        ("skin.file", "nowhere.obj", "skin.file: there is no file .*nowhere.obj"),
+        ("tissue.mesh.upper", [1, 1, -1], r"tissue.mesh.upper\[2\]: -1 m is not above"),
+        ("tissue.mesh.planes", {"x": [0, 0]}, "tissue.mesh.planes.x: needs two or more rising"),
+        ("tissue.mesh.planes", {"w": [0, 1]}, "tissue.mesh.planes: unknown axis `w`"),
+        ("tissue.mesh", 3, "tissue.mesh: must be a mapping of keys, not 3"),
+        ("tissue.solver", "magic", "tissue.solver: 'magic' is not one of fem_cg, msds"),
+        ("tissue.materials", {}, "tissue.materials: names no material"),
+        (
+            "tissue.materials.muscle.poisson_ratio",
+            0.5,
+            "tissue.materials.muscle.poisson_ratio: 0.5 is outside",
+        ),
+        ("name", 5, "name: must be a text, not 5"),
+    ],
+)
+def test_each_mistake_is_one_sentence_with_file_and_key(key, value, words):
+    with pytest.raises(SceneError, match=words) as caught:
+        parse_scene(changed(key, value), origin="my.yaml")
+    assert str(caught.value).startswith("my.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_collider_needs_its_own_dimensions_and_no_others():
+    with pytest.raises(SceneError, match=r"probe.collider.length: is missing; a capsule needs"):
+        collider_of(parse_scene(changed("probe.collider.shape", "capsule")))
+    with pytest.raises(SceneError, match=r"probe.collider.width: a sphere has no width"):
+        collider_of(parse_scene(changed("probe.collider.width", 0.01)))
+
+
+def test_a_broken_file_is_named_with_its_line(tmp_path):
+    file = tmp_path / "broken.yaml"
+    file.write_text("name: test\nvolume: [1, 2\n")
+    with pytest.raises(SceneError, match=r"broken.yaml: line 3: is not YAML"):
+        load_scene(file)
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match=r"broken.yaml"):
+        load_scene(file)
+    file.write_text("just text")
+    with pytest.raises(SceneError, match=r"must be a mapping of keys, not 'just text'"):
+        load_scene(file)
+
+
+def test_an_unknown_scene_lists_the_installed_ones():
+    with pytest.raises(SceneError, match=r"installed scenes are .*liver_sweep, upper_arm"):
+        find_scene("nowhere")
+
+
+def test_the_installed_scenes_are_valid(tmp_path):
+    volume = tmp_path / "volume.mha"
+    volume.touch()
+    assert load_scene("upper_arm").tissue is not None
+    assert load_scene("liver_sweep", volume=volume).volume.file == str(volume)
+    with pytest.raises(SceneError, match="volume.file: is missing"):
+        load_scene("liver_sweep")
+    for file in shared_path("config/scenes").glob("*.yaml"):
+        load_scene(file, volume=volume)
+
+
+def test_what_a_scene_does_not_name_is_not_needed():
+    needed = {part.node for part in parse_scene(changed("skin", None)).parts() if part.needed}
+    assert needed == {"probe_tracker", "tissue_deformer", "slice_interpolator"}
+    reasons = {part.node: part.reason for part in parse_scene(changed("tissue", None)).parts()}
+    assert reasons["tissue_deformer"] == "the scene has no `tissue`: the volume is sliced rigidly"

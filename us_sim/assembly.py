@@ -1,0 +1,215 @@
+"""The objects a scene names, each made (and its module imported) only when it is asked for.
+
+>>> from us_sim.assembly import probe_of
+>>> from us_sim.scene_file import parse_scene
+>>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
+...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
+>>> probe_of(scene).columns
+400
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import SceneError
+from us_sim.pose import Pose
+from us_sim.scene import Scene, TissueSection
+
+if TYPE_CHECKING:
+    from us_sim.collider import Collider
+    from us_sim.skin.membrane import SkinMembrane
+    from us_sim.slicing.probe import LinearProbe
+    from us_sim.tissue.mesh import TetrahedralMesh
+    from us_sim.tissue.model import TissueModel
+    from us_sim.volume.volume import Volume
+
+__all__ = ["collider_of", "membrane_of", "probe_of", "tissue_model_of", "volume_of"]
+
+
+def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
+    """The scene's volume in frame ``patient``.
+
+    Raises:
+        VolumeError: its file cannot be read.
+    """
+    if scene.volume.file:
+        from us_sim.volume.readers import read_volume
+
+        volume = read_volume(Path(scene.volume.file))
+    else:
+        from us_sim.volume.phantom import cached_phantom
+
+        assert scene.volume.phantom is not None
+        volume = cached_phantom(
+            scene.volume.phantom, scene.volume.seed, scene.volume.voxel_size, progress
+        )
+    patient_from_volume = Pose(
+        np.array(scene.volume.pose.position), np.array(scene.volume.pose.orientation)
+    )
+    return dataclasses.replace(
+        volume, index_to_patient=patient_from_volume.matrix @ volume.index_to_patient
+    )
+
+
+def probe_of(scene: Scene) -> LinearProbe:
+    """The transducer that images."""
+    from us_sim.slicing.probe import LinearProbe
+
+    columns, rows = scene.probe.image
+    return LinearProbe(
+        aperture=scene.probe.aperture, depth=scene.probe.depth, columns=columns, rows=rows
+    )
+
+
+def collider_of(scene: Scene) -> Collider:
+    """The probe's shape that presses.
+
+    Raises:
+        SceneError: a dimension of that shape is missing, or one is given that it does not have.
+    """
+    from us_sim import collider
+
+    section = scene.probe.collider
+    if section is None:
+        raise SceneError(f"{scene.origin}: probe.collider: is missing")
+    shapes: dict[str, Any] = {
+        "sphere": collider.Sphere,
+        "capsule": collider.Capsule,
+        "rounded_box": collider.RoundedBox,
+    }
+    shape = shapes[section.shape]
+    needed = [f.name for f in dataclasses.fields(shape)]
+    given = {k: v for k, v in dataclasses.asdict(section).items() if k != "shape" and v is not None}
+    for name in needed:
+        if name not in given:
+            raise SceneError(
+                f"{scene.origin}: probe.collider.{name}: is missing; a {section.shape} needs "
+                f"{', '.join(needed)}"
+            )
+    for name in given:
+        if name not in needed:
+            raise SceneError(
+                f"{scene.origin}: probe.collider.{name}: a {section.shape} has no {name}; it has "
+                f"{', '.join(needed)}"
+            )
+    return shape(**given)
+
+
+def tissue_model_of(scene: Scene, volume: Volume) -> TissueModel:
+    """Mesh, materials, fixed nodes and collider of the scene's tissue.
+
+    Raises:
+        SceneError: a label of the volume has no material, or a material or fixed part is unknown.
+        MeshError, MaterialError: the mesh or a material cannot be used.
+    """
+    from us_sim.tissue.model import TissueModel
+
+    section = scene.tissue
+    if section is None:
+        raise SceneError(f"{scene.origin}: tissue: is missing")
+    mesh = _box(section)
+    fixed = _fixed_nodes(scene, section, mesh, volume)
+    from us_sim.tissue.box import face_nodes
+
+    contact = np.setdiff1d(face_nodes(mesh, "top"), np.flatnonzero(fixed)).astype(np.int32)
+    return TissueModel(
+        mesh=mesh,
+        materials=_materials(scene, section, mesh, volume),
+        fixed=fixed,
+        collider=collider_of(scene),
+        contact_nodes=contact,
+    )
+
+
+def membrane_of(scene: Scene) -> SkinMembrane:
+    """The scene's skin, pressed by the scene's probe."""
+    from us_sim.skin import surface
+    from us_sim.skin.membrane import SkinMembrane
+
+    section = scene.skin
+    if section is None:
+        raise SceneError(f"{scene.origin}: skin: is missing")
+    if section.file:
+        sheet = surface.read_surface(Path(section.file))
+    elif section.flat_width >= section.size[0]:
+        sheet = surface.plane_surface(section.size, section.spacing)
+    else:
+        sheet = surface.bent_surface(
+            section.size, section.spacing, flat_width=section.flat_width, radius=section.radius
+        )
+    return SkinMembrane(
+        sheet,
+        collider_of(scene),
+        stiffness=section.stiffness,
+        anchor_stiffness=section.anchor_stiffness,
+        density=section.density,
+    )
+
+
+def _box(section: TissueSection) -> TetrahedralMesh:
+    from us_sim.tissue.mesh import box_mesh, uniform_planes
+
+    planes = [
+        np.array(section.mesh.planes[axis])
+        if axis in section.mesh.planes
+        else uniform_planes(section.mesh.lower[i], section.mesh.upper[i], section.mesh.nodes[i])
+        for i, axis in enumerate("xyz")
+    ]
+    return box_mesh(*planes)
+
+
+def _materials(scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volume: Volume) -> Any:
+    from us_sim.tissue.materials import Material, average_over_labels, uniform_material
+
+    materials = {
+        name: Material(given.young_modulus, given.poisson_ratio, given.density)
+        for name, given in section.materials.items()
+    }
+    if volume.labels is None:
+        if list(materials) != ["tissue"]:
+            raise SceneError(
+                f"{scene.origin}: tissue.materials: this volume has no labels, so it takes one "
+                f"material named `tissue`, not {', '.join(materials)}"
+            )
+        return uniform_material(mesh, materials["tissue"])
+    by_label = {}
+    for label, name in volume.label_names.items():
+        if name not in materials:
+            raise SceneError(f"{scene.origin}: tissue.materials.{name}: is missing")
+        by_label[label] = materials.pop(name)
+    if materials:
+        raise SceneError(
+            f"{scene.origin}: tissue.materials.{next(iter(materials))}: the volume has no such "
+            f"label; it has {', '.join(volume.label_names.values())}"
+        )
+    return average_over_labels(mesh, volume.labels, volume.patient_to_index, by_label)
+
+
+def _fixed_nodes(
+    scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volume: Volume
+) -> NDArray[np.bool_]:
+    """Nodes on the named faces, and nodes inside the named labels (the skeleton is rigid)."""
+    from us_sim.tissue.box import FACES, face_nodes, nodes_in_label
+
+    numbers = {name: label for label, name in volume.label_names.items()}
+    fixed = np.zeros(len(mesh.nodes), dtype=bool)
+    for name in section.fixed:
+        if name in FACES:
+            fixed[face_nodes(mesh, name)] = True
+        elif name in numbers and volume.labels is not None:
+            fixed[nodes_in_label(mesh, volume.labels, volume.patient_to_index, numbers[name])] = (
+                True
+            )
+        else:
+            raise SceneError(
+                f"{scene.origin}: tissue.fixed: `{name}` is neither a face ({', '.join(FACES)}) "
+                f"nor a label of the volume ({', '.join(numbers) or 'it has none'})"
+            )
+    return fixed

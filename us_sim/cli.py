@@ -1,0 +1,166 @@
+"""The command `us-sim`: demo, run, render, play, bag info."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from us_sim import __version__
+from us_sim.errors import UsSimError
+
+__all__ = ["main"]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
+    parsed = _parser().parse_args(args)
+    try:
+        return int(parsed.command(parsed) or 0)
+    except UsSimError as error:
+        print(f"us-sim: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("us-sim: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="us-sim", description="Interactive simulation of compression ultrasonography."
+    )
+    parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    demo = commands.add_parser("demo", help="press on the virtual arm; images, summary, recording")
+    demo.add_argument("scene", nargs="?", default="upper_arm", help="scene file or name")
+    demo.add_argument("--out", type=Path, default=Path("us_sim_demo"), help="folder to write to")
+    _scene_options(demo)
+    _live_options(demo)
+    demo.set_defaults(command=_demo)
+
+    run = commands.add_parser("run", help="run the nodes of a scene until Ctrl-C")
+    run.add_argument("scene", help="scene file, or name of an installed one")
+    run.add_argument("--record", type=Path, metavar="FILE", help="record the session to this MCAP")
+    run.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    run.add_argument("--path", type=Path, metavar="BAG", help="play this bag's probe path")
+    run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
+    _scene_options(run)
+    _live_options(run)
+    run.set_defaults(command=_run)
+
+    render = commands.add_parser("render", help="one image for every pose of a path, repeatably")
+    render.add_argument("scene", help="scene file, or name of an installed one")
+    render.add_argument("--path", type=Path, metavar="BAG", help="bag with the probe path")
+    render.add_argument("--out", type=Path, required=True, help="folder to write to")
+    _scene_options(render)
+    render.set_defaults(command=_render)
+
+    play = commands.add_parser("play", help="play a bag's probe path into a running simulation")
+    play.add_argument("bag", type=Path)
+    play.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
+    play.add_argument("--rate", type=float, default=1.0, help="speed factor")
+    play.add_argument("--loop", action="store_true", help="start again at the end")
+    play.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    play.add_argument("--network", action="store_true", help="talk beyond this host")
+    play.set_defaults(command=_play)
+
+    bag = commands.add_parser("bag", help="look at recordings")
+    bag_commands = bag.add_subparsers(required=True, metavar="COMMAND")
+    info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
+    info.add_argument("file", type=Path)
+    info.set_defaults(command=_bag_info)
+    return parser
+
+
+def _scene_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
+    )
+
+
+def _live_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--network", action="store_true", help="talk beyond this host")
+    parser.add_argument(
+        "--param",
+        action="append",
+        default=[],
+        metavar="NODE.NAME=VALUE",
+        help="set a node's parameter; may be given again",
+    )
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from us_sim.live import demo
+
+    return demo(args.scene, args.volume, args.out, _parameters(args.param), network=args.network)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from us_sim.live import dry_run, run
+    from us_sim.scene_file import load_scene
+
+    if args.duration is not None and not args.duration > 0:
+        raise UsSimError(f"--duration {args.duration:g}: must be more than 0 seconds")
+    scene = load_scene(args.scene, volume=args.volume)
+    parameters = _parameters(args.param)
+    if args.dry_run:
+        print(dry_run(scene, parameters, record=args.record, path=args.path))
+        return 0
+    return run(
+        scene,
+        parameters,
+        record=args.record,
+        path=args.path,
+        duration=args.duration,
+        network=args.network,
+    )
+
+
+def _render(args: argparse.Namespace) -> int:
+    from us_sim.lockstep import render_scene
+    from us_sim.scene_file import load_scene
+
+    return render_scene(load_scene(args.scene, volume=args.volume), args.path, args.out)
+
+
+def _play(args: argparse.Namespace) -> int:
+    from us_sim.live import play
+
+    return play(
+        args.bag,
+        topic=args.topic,
+        rate=args.rate,
+        loop=args.loop,
+        everything=args.everything,
+        network=args.network,
+    )
+
+
+def _bag_info(args: argparse.Namespace) -> int:
+    from us_sim.recording.reader import describe, read_bag
+
+    print(describe(read_bag(args.file)))
+    return 0
+
+
+def _parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
+    """``node.name=value`` texts by node."""
+    parameters: dict[str, dict[str, str]] = {}
+    for text in texts:
+        target, equals, value = text.partition("=")
+        node, dot, name = target.partition(".")
+        if not (equals and dot and node and name):
+            raise UsSimError(
+                f"--param {text}: write NODE.NAME=VALUE, e.g. tissue_deformer.solver=msds"
+            )
+        parameters.setdefault(node, {})[name] = value
+    return parameters
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""The node processes of a scene: which run with which parameters, and how they end together."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from us_sim.errors import UsSimError
+from us_sim.scene import Scene
+
+__all__ = ["NodeProcess", "ProcessGroup", "keep_on_this_host", "simulation_nodes"]
+
+_PR_SET_PDEATHSIG = 1
+STOP_S = 1.0
+"""How long nodes may take to end before the recorder is told to; then as long again at most."""
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """One node and its parameters (JSON-like values; a raw text is passed as YAML)."""
+
+    node: str
+    parameters: dict[str, object] = field(default_factory=dict)
+    raw_parameters: dict[str, str] = field(default_factory=dict)
+
+    def command(self) -> list[str]:
+        """The command line that runs it, in ROS 2 and without."""
+        command = [sys.executable, "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
+        for name, value in self.parameters.items():
+            command += ["-p", f"{name}:={json.dumps(value)}"]
+        for name, text in self.raw_parameters.items():
+            command += ["-p", f"{name}:={text}"]
+        return command
+
+
+def simulation_nodes(
+    scene: Scene, parameters: dict[str, dict[str, str]] | None = None
+) -> list[NodeProcess]:
+    """The nodes that ``scene`` needs; ``parameters`` gives extra ones by node, as YAML texts.
+
+    Raises:
+        UsSimError: a parameter is for a node that this scene does not run.
+    """
+    given = dict(parameters or {})
+    common: dict[str, object] = {"scene": scene.origin}
+    if scene.volume.file:
+        common["volume"] = scene.volume.file
+    nodes = [
+        NodeProcess(part.node, common, given.pop(part.node, {}))
+        for part in scene.parts()
+        if part.needed
+    ]
+    if given:
+        raise UsSimError(
+            f"--param {next(iter(given))}: this scene does not run such a node; it runs "
+            f"{', '.join(process.node for process in nodes)}"
+        )
+    return nodes
+
+
+def keep_on_this_host(*, network: bool) -> None:
+    """Let what this process starts talk on this host only, unless the environment says otherwise.
+
+    Nobody on a hospital's network should meet a simulator by accident.
+    """
+    if not network:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+class ProcessGroup:
+    """Processes started together, watched, and ended together: the recorder last.
+
+    Args:
+        log: where their output goes; None leaves it on this terminal.
+    """
+
+    def __init__(self, log: Path | None = None) -> None:
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._log_path = log
+        self._log: IO[bytes] | None = log.open("wb") if log else None
+
+    def start(self, processes: Sequence[NodeProcess]) -> None:
+        """Start each; they end with this process, whatever happens to it."""
+        for process in processes:
+            self._processes[process.node] = subprocess.Popen(
+                process.command(),
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                start_new_session=True,
+                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+            )
+
+    def is_running(self, node: str) -> bool:
+        """Whether that node was started and has not ended."""
+        process = self._processes.get(node)
+        return process is not None and process.poll() is None
+
+    def check(self) -> None:
+        """Raise UsSimError when a node has ended with an error."""
+        for node, process in self._processes.items():
+            status = process.poll()
+            if status:
+                raise UsSimError(self._complaint(node, status))
+
+    def _complaint(self, node: str, status: int) -> str:
+        """What the node said last, if it said it in our words."""
+        if self._log_path is not None:
+            lines = self._log_path.read_text(errors="replace").splitlines()
+            said = [line for line in lines if line.startswith("us_sim: ")]
+            if said:
+                return said[-1].removeprefix("us_sim: ")
+            return f"{node} ended with status {status}; see {self._log_path}"
+        return f"{node} ended with status {status}"
+
+    def stop(self) -> None:
+        """End every process: SIGINT first, the recorder after the others, SIGKILL at the last."""
+        recorder = "session_recorder"
+        self._interrupt([node for node in self._processes if node != recorder])
+        self._interrupt([recorder] if recorder in self._processes else [])
+        for process in self._processes.values():
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        if self._log is not None:
+            self._log.close()
+
+    def _interrupt(self, nodes: list[str]) -> None:
+        waiting = [self._processes[node] for node in nodes]
+        for process in waiting:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + STOP_S * 0.9
+        for process in waiting:
+            try:
+                process.wait(max(deadline - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)

@@ -1,0 +1,151 @@
+"""Lockstep: all nodes of a scene in one process, one image out for every pose in, repeatably."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import UsSimError
+from us_sim.graph import keep_on_this_host
+from us_sim.live import prepare_volume
+from us_sim.progress import Progress
+from us_sim.recording.path import read_path
+from us_sim.scene import Scene
+
+__all__ = ["render", "render_scene"]
+
+QUIET_S = 0.25
+"""Silence after which everything that was sent has been taken."""
+
+
+def render_scene(scene: Scene, path: Path | None, out: Path) -> int:
+    """`us-sim render`: with checks of its arguments, and progress.
+
+    Raises:
+        UsSimError: no path, an output folder that is not empty, or what :func:`render` raises.
+    """
+    keep_on_this_host(network=False)
+    path = path or (Path(scene.path) if scene.path else None)
+    if path is None:
+        raise UsSimError(f"{scene.origin}: path: is missing; give a bag with --path")
+    if out.exists() and any(out.iterdir()):
+        raise UsSimError(f"--out {out}: is not empty; choose another folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    prepare_volume(scene)
+    with Progress("rendering", len(read_path(path).stamps), "images") as bar:
+        count = render(scene, path, out, lambda done, _: bar.update(done))
+    print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
+    return 0
+
+
+def render(scene: Scene, path: Path, out: Path, progress: Callable[[int, int], None]) -> int:
+    """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
+
+    Args:
+        progress: called with the images done and the poses there are.
+
+    Returns:
+        The number of images, equal to the number of poses.
+
+    Raises:
+        UsSimError: bad input, or an output that cannot be written.
+    """
+    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    context = Context()
+    domain = None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100
+    rclpy.init(
+        args=[],
+        context=context,
+        domain_id=domain,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    executor = SingleThreadedExecutor(context=context)
+    nodes: list[Any] = []
+    try:
+        for module, name, parameters in _nodes(scene, path, out):
+            nodes.append(_created(module, name, parameters, context))
+            executor.add_node(nodes[-1])
+        return _spin(executor, nodes, progress)
+    finally:
+        for node in reversed(nodes):
+            executor.remove_node(node)
+            node.destroy_node()
+        executor.shutdown()
+        context.try_shutdown()
+
+
+def _nodes(scene: Scene, path: Path, out: Path) -> list[tuple[str, str, dict[str, object]]]:
+    """Module, class and parameters of each node: listeners first, the player last."""
+    common: dict[str, object] = {"scene": scene.origin, "lockstep": True}
+    if scene.volume.file:
+        common["volume"] = scene.volume.file
+    classes = {part.node: _class_name(part.node) for part in scene.parts() if part.needed}
+    recorder = {
+        "file": str(out / "session.mcap"),
+        "compression": "zstd",
+        "exclude": ["/diagnostics"],
+    }
+    player = {
+        "path": str(path),
+        "lockstep": True,
+        "await_topics": [
+            "tracker/pose",
+            "probe/pose",
+            "ultrasound/image",
+            *(["tissue/nodes"] if scene.tissue else []),
+            *(["skin/nodes"] if scene.skin else []),
+        ],
+        "await_subscriber": "session_recorder",
+    }
+    return [
+        ("session_recorder", "SessionRecorder", recorder),
+        ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
+        *((node, name, common) for node, name in classes.items()),
+        ("path_player", "PathPlayer", player),
+    ]
+
+
+def _class_name(node: str) -> str:
+    return "".join(word.capitalize() for word in node.split("_"))
+
+
+def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:
+    from rclpy.parameter import Parameter
+
+    node = getattr(importlib.import_module(f"us_sim.nodes.{module}"), name)
+    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
+    return node(context=context, parameter_overrides=overrides)
+
+
+def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None]) -> int:
+    """Until the path is at its end and nothing more arrives."""
+    recorder, writer, player = nodes[0], nodes[1], nodes[-1]
+    clock = player.get_clock()
+    total = player.pose_count
+    changed, last = clock.now().nanoseconds, (-1, -1)
+    while True:
+        executor.spin_once(timeout_sec=0.05)
+        state = (writer.count, recorder.health.received)
+        now = clock.now().nanoseconds
+        if state != last:
+            if state[0] != last[0]:
+                progress(state[0], total)
+            changed, last = now, state
+        silence = (now - changed) * 1e-9
+        if player.finished.done() and silence > QUIET_S:
+            return int(writer.count)
+        if silence > 60.0:
+            raise UsSimError(
+                f"no image came for pose {writer.count} in a minute; the path is rendered up to it"
+            )

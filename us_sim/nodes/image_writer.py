@@ -1,0 +1,39 @@
+"""Writes the images of a session as numbered PNG files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+
+from us_sim.errors import UsSimError
+from us_sim.nodes.conversions import pixels_from
+from us_sim.nodes.qos import EVERY, overridable
+
+__all__ = ["ImageWriter"]
+
+
+class ImageWriter(Node):
+    """``ultrasound/image`` to ``folder/000000.png``, ``000001.png``, …"""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("image_writer", **kwargs)
+        folder = self.declare_parameter(
+            "folder", "images", ParameterDescriptor(description="where the PNG files go")
+        ).value
+        self._folder = Path(folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self.count = 0
+        self.create_subscription(
+            Image, "ultrasound/image", self._write, EVERY, qos_overriding_options=overridable()
+        )
+
+    def _write(self, message: Image) -> None:
+        file = self._folder / f"{self.count:06d}.png"
+        if not cv2.imwrite(str(file), pixels_from(message)):
+            raise UsSimError(f"{file} cannot be written; choose another folder with --out")
+        self.count += 1

@@ -1,0 +1,145 @@
+"""Plays a recorded probe path as a tracker would."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.task import Future
+from rclpy.time import Time
+from sensor_msgs.msg import Image
+
+from us_sim.nodes.conversions import pose_message
+from us_sim.nodes.health import Health
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.pose import Pose
+from us_sim.recording.path import read_path
+
+__all__ = ["PathPlayer", "main"]
+
+
+class PathPlayer(Node):
+    """A bag's poses on ``tracker/pose``.
+
+    Parameters: ``path`` (bag), ``topic`` (empty: its only PoseStamped topic), ``rate`` (speed
+    factor), ``loop``, ``restamp`` (stamp with the time of sending; else the recorded stamps),
+    ``lockstep`` (send the next pose when the image of the last has come), ``await_topics`` (begin
+    when each has a publisher), ``await_subscriber`` (and that node subscribes to each).
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("path_player", **kwargs)
+        path = self._declared("path", "", "bag with a PoseStamped topic")
+        topic = self._declared("topic", "", "topic in the bag; empty: the only one of that type")
+        self._rate = self._declared("rate", 1.0, "speed factor", low=0.01, high=100.0)
+        self._loop = self._declared("loop", False, "start again at the end")
+        self._restamp = self._declared("restamp", True, "stamp poses when they are sent")
+        self._lockstep = self._declared("lockstep", False, "wait for each pose's image")
+        self._awaited = self._declared("await_topics", [""], "begin when these are published")
+        self._subscriber = self._declared(
+            "await_subscriber", "", "and this node subscribes to them"
+        )
+        self._path = read_path(path, topic or None)
+        self._next = 0
+        self._begun = 0
+        self.finished = Future()
+        self.health = Health(self, str(path))
+        qos = EVERY if self._lockstep else STREAM
+        self._poses = self.create_publisher(
+            PoseStamped, "tracker/pose", qos, qos_overriding_options=overridable()
+        )
+        if self._lockstep:
+            self.create_subscription(
+                Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
+            )
+        self._starting = self.create_timer(0.05, self._begin)
+        count = len(self._path.stamps)
+        self.pose_count = count
+        self.get_logger().info(f"{count} poses of {self._path.topic} in {path}")
+
+    def _declared(
+        self,
+        name: str,
+        value: Any,
+        description: str,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+    ) -> Any:
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        if low is not None and high is not None:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        return self.declare_parameter(name, value, descriptor).value
+
+    def _begin(self) -> None:
+        """Start once somebody listens and the awaited topics are there."""
+        if not self._poses.get_subscription_count() or not all(map(self._is_there, self._awaited)):
+            return
+        self._starting.cancel()
+        self._begun = self.get_clock().now().nanoseconds
+        self.health.state = "playing"
+        self.get_logger().info("playing")
+        if self._lockstep:
+            self._send()
+            return
+        steps = np.diff(self._path.stamps)
+        period = float(np.median(steps)) * 1e-9 / self._rate if len(steps) else 0.01
+        self._half_period = 0.5e9 * period
+        self.create_timer(max(period, 1e-4), self._tick)
+
+    def _is_there(self, topic: str) -> bool:
+        if not topic:
+            return True
+        if not self.count_publishers(topic):
+            return False
+        listeners = self.get_subscriptions_info_by_topic(self.resolve_topic_name(topic))
+        return not self._subscriber or self._subscriber in {info.node_name for info in listeners}
+
+    def _tick(self) -> None:
+        """Send each pose whose time has come, to the nearest half period."""
+        elapsed = self.get_clock().now().nanoseconds - self._begun + self._half_period
+        stamps = self._path.stamps
+        while not self.finished.done() and (stamps[self._next] - stamps[0]) / self._rate <= elapsed:
+            self._send()
+            self._advance()
+
+    def _imaged(self, image: Image) -> None:
+        stamp = Time.from_msg(image.header.stamp).nanoseconds
+        if stamp == self._path.stamps[self._next] and not self.finished.done():
+            self._advance()
+            if not self.finished.done():
+                self._send()
+
+    def _send(self) -> None:
+        i = self._next
+        pose = Pose(self._path.positions[i], self._path.orientations[i])
+        restamp = self._restamp and not self._lockstep
+        stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._path.stamps[i]))
+        self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))
+        self.health.published("tracker/pose")
+
+    def _advance(self) -> None:
+        self._next += 1
+        if self._next < len(self._path.stamps):
+            return
+        if self._loop:
+            self._next = 0
+            self._begun = self.get_clock().now().nanoseconds
+            return
+        self.health.state = "finished"
+        self.get_logger().info("the path is at its end")
+        self.finished.set_result(None)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Play the path, then end."""
+    return run_node(PathPlayer, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

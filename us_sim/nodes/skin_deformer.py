@@ -1,0 +1,70 @@
+"""Deforms the skin membrane under the probe."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import Mesh
+from visualization_msgs.msg import Marker
+
+from us_sim.assembly import membrane_of
+from us_sim.errors import UsSimError
+from us_sim.nodes.conversions import cloud_message, mesh_message, pose_from, surface_marker
+from us_sim.nodes.process import run_node
+from us_sim.nodes.scene_node import SceneNode
+
+__all__ = ["SkinDeformer", "main"]
+
+
+class SkinDeformer(SceneNode):
+    """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("skin_deformer", **kwargs)
+        self._membrane = membrane_of(self.scene)
+        surface = self._membrane.surface
+        self._triangles = surface.triangles
+        self.get_logger().info(f"preparing a membrane of {len(surface.vertices)} vertices")
+        self._membrane.warm_up()
+        self._nodes = self.stream(PointCloud2, "skin/nodes")
+        self._marker = self.stream(Marker, "skin/marker")
+        self.latched(Mesh, "skin/mesh").publish(mesh_message(surface.vertices, surface.triangles))
+        self.newest(PoseStamped, "probe/pose", self._deform)
+        self.health.state = "ready"
+        self.get_logger().info("ready")
+
+    def _deform(self, message: PoseStamped) -> None:
+        wanted = self._nodes.get_subscription_count() > 0
+        shown = self._marker.get_subscription_count() > 0
+        if not (wanted or shown):
+            return
+        stamp = message.header.stamp
+        try:
+            skin = self._membrane.deform(pose_from(message))
+        except UsSimError as error:
+            self.health.problem("pose", f"{error}; the skin stays as it was")
+            return
+        if wanted:
+            columns = [*skin.vertices.T, *skin.normals.T]
+            names = ["x", "y", "z", "normal_x", "normal_y", "normal_z"]
+            self._nodes.publish(
+                cloud_message(dict(zip(names, columns, strict=True)), stamp, "patient")
+            )
+            self.health.published("skin/nodes", stamp)
+        if shown:
+            self._marker.publish(surface_marker(skin.vertices, self._triangles, stamp, "patient"))
+            self.health.published("skin/marker")
+        self.health.state = "running"
+        self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is interrupted."""
+    return run_node(SkinDeformer, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
