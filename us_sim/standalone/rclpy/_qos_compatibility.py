@@ -5,9 +5,12 @@ make the answer a warning. The sentences are those of rmw_dds_common, since tool
 """
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from .duration import Duration
-from .qos import DurabilityPolicy, LivelinessPolicy, QoSPolicyEnum, QoSProfile, ReliabilityPolicy
+
+if TYPE_CHECKING:
+    from .qos import QoSPolicyEnum, QoSProfile
 
 __all__ = ["QoSCompatibility", "qos_check_compatible"]
 
@@ -23,7 +26,7 @@ class QoSCompatibility(IntEnum):
 
 
 def qos_check_compatible(
-    publisher_qos: QoSProfile, subscription_qos: QoSProfile
+    publisher_qos: "QoSProfile", subscription_qos: "QoSProfile"
 ) -> tuple[QoSCompatibility, str]:
     """Check whether a publisher and a subscription with these profiles can communicate.
 
@@ -37,26 +40,20 @@ def qos_check_compatible(
     return QoSCompatibility.OK, ""
 
 
-def _contradictions(publisher: QoSProfile, subscription: QoSProfile) -> list[str]:
+def _contradictions(publisher: "QoSProfile", subscription: "QoSProfile") -> list[str]:
     found = []
-    if (publisher.reliability, subscription.reliability) == (
-        ReliabilityPolicy.BEST_EFFORT,
-        ReliabilityPolicy.RELIABLE,
-    ):
+    if (publisher.reliability.name, subscription.reliability.name) == ("BEST_EFFORT", "RELIABLE"):
         found.append("Best effort publisher and reliable subscription")
-    if (publisher.durability, subscription.durability) == (
-        DurabilityPolicy.VOLATILE,
-        DurabilityPolicy.TRANSIENT_LOCAL,
-    ):
+    if (publisher.durability.name, subscription.durability.name) == ("VOLATILE", "TRANSIENT_LOCAL"):
         found.append("Volatile publisher and transient local subscription")
     if subscription.deadline != _UNSPECIFIED:
         if publisher.deadline == _UNSPECIFIED:
             found.append("Subscription has a deadline, but publisher does not")
         elif subscription.deadline < publisher.deadline:
             found.append("Subscription deadline is less than publisher deadline")
-    if (publisher.liveliness, subscription.liveliness) == (
-        LivelinessPolicy.AUTOMATIC,
-        LivelinessPolicy.MANUAL_BY_TOPIC,
+    if (publisher.liveliness.name, subscription.liveliness.name) == (
+        "AUTOMATIC",
+        "MANUAL_BY_TOPIC",
     ):
         found.append("Publisher's liveliness is automatic and subscription's is manual by topic")
     lease = subscription.liveliness_lease_duration
@@ -68,7 +65,7 @@ def _contradictions(publisher: QoSProfile, subscription: QoSProfile) -> list[str
     return found
 
 
-def _doubts(publisher: QoSProfile, subscription: QoSProfile) -> list[str]:
+def _doubts(publisher: "QoSProfile", subscription: "QoSProfile") -> list[str]:
     found = []
     offered, asked = publisher.reliability, subscription.reliability
     if _open(offered) and _open(asked):
@@ -76,9 +73,9 @@ def _doubts(publisher: QoSProfile, subscription: QoSProfile) -> list[str]:
             f"Publisher reliability is {_word(offered)} and "
             f"subscription reliability is {_word(asked)}"
         )
-    elif _open(offered) and asked == ReliabilityPolicy.RELIABLE:
+    elif _open(offered) and asked.name == "RELIABLE":
         found.append(f"Reliable subscription, but publisher is {_word(offered)}")
-    elif offered == ReliabilityPolicy.BEST_EFFORT and _open(asked):
+    elif offered.name == "BEST_EFFORT" and _open(asked):
         found.append(f"Best effort publisher, but subscription is {_word(asked)}")
 
     offered, asked = publisher.durability, subscription.durability
@@ -86,9 +83,9 @@ def _doubts(publisher: QoSProfile, subscription: QoSProfile) -> list[str]:
         found.append(  # the misspelling is rmw_dds_common's
             f"Publisher durabilty is {_word(offered)} and subscription durability is {_word(asked)}"
         )
-    elif _open(offered) and asked == DurabilityPolicy.TRANSIENT_LOCAL:
+    elif _open(offered) and asked.name == "TRANSIENT_LOCAL":
         found.append(f"Transient local subscription, but publisher is {_word(offered)}")
-    elif offered == DurabilityPolicy.VOLATILE and _open(asked):
+    elif offered.name == "VOLATILE" and _open(asked):
         found.append(f"Volatile publisher, but subscription is {_word(asked)}")
 
     offered, asked = publisher.liveliness, subscription.liveliness
@@ -97,21 +94,19 @@ def _doubts(publisher: QoSProfile, subscription: QoSProfile) -> list[str]:
             f"Publisher liveliness is {_word(offered)} and "
             f"subscription liveliness is {_word(asked)}"
         )
-    elif _open(offered) and asked == LivelinessPolicy.MANUAL_BY_TOPIC:
+    elif _open(offered) and asked.name == "MANUAL_BY_TOPIC":
         found.append(
             f"Subscription's liveliness is manual by topic, but publisher's is {_word(offered)}"
         )
-    elif offered == LivelinessPolicy.AUTOMATIC and _open(asked):
-        found.append(
-            f"Publisher's liveliness is automatic, but subscription's is {_word(asked)}"
-        )
+    elif offered.name == "AUTOMATIC" and _open(asked):
+        found.append(f"Publisher's liveliness is automatic, but subscription's is {_word(asked)}")
     return found
 
 
-def _open(policy: QoSPolicyEnum) -> bool:
+def _open(policy: "QoSPolicyEnum") -> bool:
     """Whether a policy is left to the middleware, so that nothing can be said about it."""
     return policy.name in ("SYSTEM_DEFAULT", "UNKNOWN")
 
 
-def _word(policy: QoSPolicyEnum) -> str:
+def _word(policy: "QoSPolicyEnum") -> str:
     return "unknown" if policy.name == "UNKNOWN" else policy.name.lower()

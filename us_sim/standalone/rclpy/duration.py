@@ -9,9 +9,9 @@ True
 from functools import total_ordering
 from typing import Any
 
-__all__ = ["Duration", "Infinite"]
+from .constants import S_TO_NS
 
-NANOSECONDS_PER_SECOND = 1_000_000_000
+__all__ = ["Duration", "Infinite"]
 
 
 @total_ordering
@@ -21,7 +21,7 @@ class Duration:
     __slots__ = ("_nanoseconds",)
 
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0):
-        total = int(seconds * NANOSECONDS_PER_SECOND) + int(nanoseconds)
+        total = int(seconds * S_TO_NS) + int(nanoseconds)
         if not -(2**63) <= total < 2**63:
             raise OverflowError("Total nanoseconds value is too large to store in C duration.")
         self._nanoseconds = total
@@ -34,7 +34,7 @@ class Duration:
         """This span as a `builtin_interfaces/msg/Duration`."""
         from ..messages import message_class
 
-        seconds, nanoseconds = divmod(self._nanoseconds, NANOSECONDS_PER_SECOND)
+        seconds, nanoseconds = divmod(self._nanoseconds, S_TO_NS)
         cls = message_class("builtin_interfaces/msg/Duration")
         return cls(sec=seconds, nanosec=nanoseconds)
 

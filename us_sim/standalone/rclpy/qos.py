@@ -11,6 +11,7 @@ import warnings
 from enum import Enum, IntEnum
 from typing import Any
 
+from ._qos_compatibility import QoSCompatibility, qos_check_compatible
 from .duration import Duration
 
 __all__ = [
@@ -266,9 +267,7 @@ qos_profile_best_available = QoSProfile(
     liveliness=LivelinessPolicy.BEST_AVAILABLE,
     liveliness_lease_duration=LivelinessLeaseDurationeBestAvailable,
 )
-qos_profile_action_status_default = QoSProfile(
-    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
+qos_profile_action_status_default = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class QoSPresetProfiles(Enum):
@@ -293,6 +292,3 @@ class QoSPresetProfiles(Enum):
     def get_from_short_key(cls, name: str) -> QoSProfile:
         """The profile of a short name, in any case; raises KeyError for an unknown one."""
         return cls[name.upper()].value
-
-
-from ._qos_compatibility import QoSCompatibility, qos_check_compatible  # noqa: E402

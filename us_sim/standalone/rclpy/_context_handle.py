@@ -1,0 +1,93 @@
+"""What the nodes of one context share: arguments, domain, the DDS participant, who is waiting."""
+
+import os
+import weakref
+from threading import Condition, RLock
+from typing import TYPE_CHECKING, Any
+
+from ._arguments import Arguments
+from ._rclpy_pybind11 import RCLError
+from ._wake_up import WakeUp
+
+if TYPE_CHECKING:
+    from ..transport import Participant
+
+__all__ = ["ContextHandle"]
+
+
+class ContextHandle:
+    """The state behind a Context that was initialised.
+
+    `invalidate` may be called from a signal handler: it takes no lock. Everything else may not.
+    """
+
+    def __init__(self, arguments: Arguments, domain_id: int | None) -> None:
+        self.arguments = arguments
+        self.domain_id = _domain_from_environment() if domain_id is None else domain_id
+        self.graph_changed = Condition()
+        self._valid = True
+        self._waiting: tuple[weakref.ReferenceType[WakeUp], ...] = ()
+        self._participant: Participant | None = None
+        self._nodes: list[tuple[str, str]] = []
+        self._lock = RLock()
+
+    def ok(self) -> bool:
+        return self._valid
+
+    def get_domain_id(self) -> int:
+        return self.domain_id
+
+    def invalidate(self) -> None:
+        """Mark the context as shut down and wake whoever waits on its behalf."""
+        self._valid = False
+        self.wake_all()
+
+    def wake_all(self) -> None:
+        """Wake every executor of this context; they look at everything anew."""
+        for reference in self._waiting:
+            waiting = reference()
+            if waiting is not None:
+                waiting.wake()
+
+    def register(self, waiting: WakeUp) -> None:
+        """Have something woken by `wake_all` for as long as it exists."""
+        with self._lock:  # the tuple is replaced, never changed: a signal may read it at any time
+            alive = tuple(reference for reference in self._waiting if reference() is not None)
+            self._waiting = (*alive, weakref.ref(waiting))
+
+    @property
+    def participant(self) -> "Participant":
+        """The DDS participant, made when it is first asked for."""
+        with self._lock:
+            if self._participant is None:
+                from ..transport import Participant
+
+                self._participant = Participant(self.domain_id, self.arguments.enclave)
+                self._participant.graph.on_change = self._on_graph_change
+            return self._participant
+
+    def _on_graph_change(self, *_: Any) -> None:
+        with self.graph_changed:
+            self.graph_changed.notify_all()
+
+    def close(self) -> None:
+        """Leave the network. What the nodes still hold does nothing from now on."""
+        with self._lock:
+            participant, self._participant = self._participant, None
+        if participant is not None:
+            participant.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+
+def _domain_from_environment() -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if not text:
+        return 0
+    if not text.isdecimal() or int(text) > 232:
+        raise RCLError(
+            f"failed to initialize rcl: ROS_DOMAIN_ID is '{text}' in the environment, "
+            "but it has to be a whole number from 0 to 232"
+        )
+    return int(text)

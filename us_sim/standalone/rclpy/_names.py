@@ -1,0 +1,156 @@
+"""Which names of nodes, namespaces, topics and services are allowed, and what they expand to.
+
+Every check returns None, or the sentence that rcl writes and the index of the offending character.
+
+>>> error_in_topic_name("us/7image")
+('topic name token must not start with a number', 3)
+>>> expand("~/image", "probe", "/left")
+'/left/probe/image'
+"""
+
+import re
+
+__all__ = [
+    "error_in_full_topic_name",
+    "error_in_namespace",
+    "error_in_node_name",
+    "error_in_topic_name",
+    "expand",
+]
+
+Fault = tuple[str, int] | None
+
+_LONGEST_TOPIC = 247
+_LONGEST_NAMESPACE = 245
+_LONGEST_NODE_NAME = 255
+
+
+def error_in_node_name(name: str) -> Fault:
+    """What is wrong with a node name, if anything."""
+    if not name:
+        return "node name must not be empty", 0
+    if bad := re.search(r"[^A-Za-z0-9_]", name):
+        return (
+            "node name must not contain characters other than alphanumerics or '_'",
+            bad.start(),
+        )
+    if name[0].isdigit():
+        return "node name must not start with a number", 0
+    if len(name) > _LONGEST_NODE_NAME:
+        return f"node name length should not exceed '{_LONGEST_NODE_NAME}'", _LONGEST_NODE_NAME - 1
+    return None
+
+
+def error_in_namespace(name: str) -> Fault:
+    """What is wrong with an absolute namespace, if anything."""
+    if name == "/":
+        return None
+    if error := _error_in_absolute_name(name, "namespace", ", unless only a '/'"):
+        return error
+    if len(name) > _LONGEST_NAMESPACE:
+        return f"namespace should not exceed '{_LONGEST_NAMESPACE}'", _LONGEST_NAMESPACE - 1
+    return None
+
+
+def error_in_full_topic_name(name: str) -> Fault:
+    """What is wrong with an expanded topic or service name, if anything."""
+    if error := _error_in_absolute_name(name, "topic name", ""):
+        return error
+    if len(name) > _LONGEST_TOPIC:
+        return f"topic length should not exceed '{_LONGEST_TOPIC}'", _LONGEST_TOPIC - 1
+    return None
+
+
+def _error_in_absolute_name(name: str, kind: str, exception: str) -> Fault:
+    if not name:
+        return f"{kind} must not be empty", 0
+    if name[0] != "/":
+        return f"{kind} must be absolute, it must lead with a '/'", 0
+    if name[-1] == "/":
+        return f"{kind} must not end with a '/'{exception}", len(name) - 1
+    if bad := re.search(r"[^A-Za-z0-9_/]", name):
+        return (
+            f"{kind} must not contain characters other than alphanumerics, '_', or '/'",
+            bad.start(),
+        )
+    if bad := re.search(r"/[/0-9]", name):
+        if bad.group() == "//":
+            return f"{kind} must not contain repeated '/'", bad.start() + 1
+        return f"{kind} must not have a token that starts with a number", bad.start() + 1
+    return None
+
+
+def error_in_topic_name(name: str) -> Fault:
+    """What is wrong with a topic or service name as a person writes it, if anything."""
+    if not name:
+        return "topic name must not be empty string", 0
+    if name[0].isdigit():
+        return "topic name token must not start with a number", 0
+    if name[-1] == "/":
+        return "topic name must not end with a forward slash", len(name) - 1
+    if error := _error_in_characters(name):
+        return error
+    if name[0] == "~" and len(name) > 2 and name[1] != "/":
+        return (
+            "topic name must not have a tilde '~' that is not followed by a forward slash '/'",
+            1,
+        )
+    if bad := re.search(r"/[0-9]", name):
+        return "topic name token must not start with a number", bad.start() + 1
+    return None
+
+
+def _error_in_characters(name: str) -> Fault:
+    """Unallowed characters, a misplaced tilde, and everything about {substitutions}."""
+    opened: int | None = None
+    for index, character in enumerate(name):
+        if opened is not None:
+            if character == "}":
+                opened = None
+            elif not re.match(r"[A-Za-z0-9_]", character):
+                return (
+                    "substitution name must not contain characters other than alphanumerics or '_'",
+                    index,
+                )
+            elif character.isdigit() and index == opened + 1:
+                return "substitution name must not start with a number", index
+        elif character == "{":
+            opened = index
+        elif character == "}":
+            return "topic name must not have unmatched (unbalanced) curly braces '{}'", index
+        elif character == "~" and index:
+            return "topic name must not have tilde '~' unless it is the first character", index
+        elif not re.match(r"[A-Za-z0-9_/~]", character):
+            return (
+                "topic name must not contain characters other than alphanumerics, "
+                "'_', '~', '{', or '}'",
+                index,
+            )
+    if opened is not None:
+        return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
+    return None
+
+
+def expand(name: str, node_name: str, namespace: str) -> str:
+    """The absolute name of a topic or service for a node in an absolute namespace.
+
+    Raises:
+        ValueError: the name, the node's name or the namespace is not allowed, or a
+            {substitution} is unknown.
+    """
+    for kind, error in (
+        ("topic name is invalid", error_in_topic_name(name)),
+        ("node name is invalid", error_in_node_name(node_name)),
+        ("node namespace is invalid", error_in_namespace(namespace)),
+    ):
+        if error:
+            raise ValueError(f"{kind}: {error[0]}")
+    prefix = "" if namespace == "/" else namespace
+    if name.startswith("~"):
+        name = f"{prefix}/{node_name}{name[1:]}"
+    known = {"{node}": node_name, "{ns}": namespace, "{namespace}": namespace}
+    for substitution in re.findall(r"\{[^}]*\}", name):
+        if substitution not in known:
+            raise ValueError(f"topic name is invalid: unknown substitution: {substitution}")
+        name = name.replace(substitution, known[substitution])
+    return name if name.startswith("/") else f"{prefix}/{name}"

@@ -1,0 +1,149 @@
+"""The errors that rclpy raises, with the sentences that rclpy writes.
+
+>>> str(ParameterNotDeclaredException("rate"))
+'Invalid access to undeclared parameter(s): rate'
+"""
+
+from typing import Any
+
+from ._rclpy_pybind11 import InvalidHandle
+
+__all__ = [
+    "InvalidHandle",
+    "InvalidNamespaceException",
+    "InvalidNodeNameException",
+    "InvalidParameterException",
+    "InvalidParameterTypeException",
+    "InvalidParameterValueException",
+    "InvalidServiceNameException",
+    "InvalidTopicNameException",
+    "NameValidationException",
+    "NoTypeSupportImportedException",
+    "NotInitializedException",
+    "ParameterAlreadyDeclaredException",
+    "ParameterException",
+    "ParameterImmutableException",
+    "ParameterNotDeclaredException",
+    "ParameterUninitializedException",
+    "ROSInterruptException",
+]
+
+
+class NotInitializedException(Exception):
+    """Something that needs rclpy.init() was used before it."""
+
+    def __init__(self, message: str | None = None) -> None:
+        sentence = "rclpy.init() has not been called."
+        super().__init__(f"{sentence} msg:{message}" if message else sentence)
+
+
+class NoTypeSupportImportedException(Exception):
+    """A class that is no message or service was given as one."""
+
+    def __init__(self) -> None:
+        super().__init__("no type_support imported")
+
+
+class NameValidationException(Exception):
+    """A name of a node, namespace, topic or service is not allowed."""
+
+    def __init__(self, name_type: str, name: str, error_msg: str, invalid_index: int) -> None:
+        pointer = " " * invalid_index + "^"
+        super().__init__(f"Invalid {name_type}: {error_msg}:\n  '{name}'\n   {pointer}")
+
+
+class InvalidNamespaceException(NameValidationException):
+    """A namespace is not allowed."""
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__("namespace", name, error_msg, invalid_index)
+
+
+class InvalidNodeNameException(NameValidationException):
+    """A node name is not allowed."""
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__("node name", name, error_msg, invalid_index)
+
+
+class InvalidTopicNameException(NameValidationException):
+    """A topic name is not allowed."""
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__("topic name", name, error_msg, invalid_index)
+
+
+class InvalidServiceNameException(NameValidationException):
+    """A service name is not allowed."""
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__("service name", name, error_msg, invalid_index)
+
+
+class ParameterException(Exception):
+    """Base of what can be wrong with parameters."""
+
+    def __init__(self, error_msg: str, parameters: str | list[str]) -> None:
+        super().__init__(f"{error_msg}: {parameters}")
+
+
+class ParameterNotDeclaredException(ParameterException):
+    """A parameter is read or written that was not declared."""
+
+    def __init__(self, parameters: str | list[str]) -> None:
+        super().__init__("Invalid access to undeclared parameter(s)", parameters)
+
+
+class ParameterAlreadyDeclaredException(ParameterException):
+    """A parameter is declared a second time."""
+
+    def __init__(self, parameters: str | list[str]) -> None:
+        super().__init__("Parameter(s) already declared", parameters)
+
+
+class InvalidParameterException(ParameterException):
+    """A parameter's name is not allowed."""
+
+    def __init__(self, parameter_name: str):
+        super().__init__("Invalid parameter name", parameter_name)
+
+
+class InvalidParameterTypeException(ParameterException):
+    """A parameter is given a value of another type than it was declared with."""
+
+    def __init__(self, desired_parameter: Any, expected_type: Any) -> None:
+        super().__init__(
+            f"Trying to set parameter '{desired_parameter.name}' to '{desired_parameter.value}'"
+            f" of type '{desired_parameter.type_.name}', expecting type '{expected_type}'",
+            desired_parameter.name,
+        )
+
+
+class InvalidParameterValueException(ParameterException):
+    """A parameter's value is outside its range, or a callback rejects it."""
+
+    def __init__(self, parameter: str, value: Any, reason: str) -> None:
+        super().__init__(
+            f"Invalid parameter value ({value}) for parameter. Reason: {reason}", parameter
+        )
+
+
+class ParameterImmutableException(ParameterException):
+    """A read-only parameter is undeclared or described anew."""
+
+    def __init__(self, parameter_name: str):
+        super().__init__("Attempted to modify read-only parameter", parameter_name)
+
+
+class ParameterUninitializedException(ParameterException):
+    """A parameter is read that was declared with a type but has no value yet."""
+
+    def __init__(self, parameter_name: str):
+        super().__init__(f"The parameter '{parameter_name}' is not initialized", parameter_name)
+
+
+class ROSInterruptException(Exception):
+    """An operation ended because rclpy was shut down."""
+
+    def __init__(self) -> None:
+        super().__init__("rclpy.shutdown() has been called")

@@ -1,0 +1,220 @@
+"""Parameters: a name, a type and a value.
+
+>>> Parameter("rate", value=60.0).type_.name
+'DOUBLE'
+>>> Parameter("rate", Parameter.Type.INTEGER, 60.0)
+Traceback (most recent call last):
+    ...
+ValueError: Type 'Type.INTEGER' and value '60.0' do not agree
+"""
+
+import array
+from enum import Enum
+from typing import Any
+
+from ._parameter_files import read_parameter_file
+from ._parameter_values import ParameterSyntaxError, parse_value
+
+__all__ = [
+    "PARAMETER_SEPARATOR_STRING",
+    "Parameter",
+    "get_parameter_value",
+    "parameter_dict_from_yaml_file",
+    "parameter_value_to_python",
+]
+
+PARAMETER_SEPARATOR_STRING = "."
+
+_FIELDS = {  # field of rcl_interfaces/msg/ParameterValue for each value of its type
+    1: "bool_value",
+    2: "integer_value",
+    3: "double_value",
+    4: "string_value",
+    5: "byte_array_value",
+    6: "bool_array_value",
+    7: "integer_array_value",
+    8: "double_array_value",
+    9: "string_array_value",
+}
+
+
+class _ParameterType(Enum):
+    """The types a parameter can have; the values are those of rcl_interfaces/msg/ParameterType."""
+
+    NOT_SET = 0
+    BOOL = 1
+    INTEGER = 2
+    DOUBLE = 3
+    STRING = 4
+    BYTE_ARRAY = 5
+    BOOL_ARRAY = 6
+    INTEGER_ARRAY = 7
+    DOUBLE_ARRAY = 8
+    STRING_ARRAY = 9
+
+    @classmethod
+    def from_parameter_value(cls, parameter_value: Any) -> "_ParameterType":
+        """The type of a Python value; raises TypeError when parameters cannot have it."""
+        if parameter_value is None:
+            return cls.NOT_SET
+        for python_type, scalar, _ in _PYTHON_TYPES:
+            if scalar is not None and isinstance(parameter_value, python_type):
+                return cls(scalar)
+        if isinstance(parameter_value, list | tuple | array.array):
+            for python_type, _, sequence in (_PYTHON_TYPES[-1], *_PYTHON_TYPES[:-1]):
+                if all(isinstance(item, python_type) for item in parameter_value):
+                    return cls(sequence)
+            raise TypeError(
+                f"The given value is not a list of one of the allowed types '{parameter_value}'."
+            )
+        raise TypeError(f"The given value is not one of the allowed types '{parameter_value}'.")
+
+    def check(self, parameter_value: Any) -> bool:
+        """Whether a Python value is of this type."""
+        if self.value == 0:
+            return parameter_value is None
+        for python_type, scalar, sequence in _PYTHON_TYPES:
+            if self.value == scalar:
+                return isinstance(parameter_value, python_type)
+            if self.value == sequence:
+                holders = (list, tuple, array.array) if sequence in (7, 8) else (list, tuple)
+                return isinstance(parameter_value, holders) and all(
+                    isinstance(item, python_type) and (sequence != 5 or len(item) == 1)
+                    for item in parameter_value
+                )
+        return False
+
+    def __str__(self) -> str:
+        return f"Type.{self.name}"
+
+
+# bool before int, since a bool is an int; scalar and sequence as in ParameterType
+_PYTHON_TYPES: list[tuple[type, int | None, int]] = [
+    (bool, 1, 6),
+    (int, 2, 7),
+    (float, 3, 8),
+    (str, 4, 9),
+    (bytes, None, 5),
+]
+
+
+class Parameter:
+    """A named value; without a type it has the type of its value."""
+
+    Type = _ParameterType
+
+    def __init__(self, name, type_=None, value=None):
+        if type_ is None:
+            type_ = Parameter.Type.from_parameter_value(value)
+        if not isinstance(type_, Parameter.Type):
+            raise TypeError(f"type must be an instance of '{Parameter.Type!r}'")
+        if not type_.check(value):
+            raise ValueError(f"Type '{type_}' and value '{value}' do not agree")
+        self._name = name
+        self._type = type_
+        self._value = value
+
+    @classmethod
+    def from_parameter_msg(cls, param_msg):
+        """The parameter that a `rcl_interfaces/msg/Parameter` holds."""
+        type_ = Parameter.Type(param_msg.value.type)
+        field = _FIELDS.get(param_msg.value.type)
+        return cls(
+            param_msg.name, type_, None if field is None else getattr(param_msg.value, field)
+        )
+
+    @property
+    def name(self):
+        return self._name
+
+    @property
+    def type_(self):
+        return self._type
+
+    @property
+    def value(self):
+        return self._value
+
+    def get_parameter_value(self):
+        """This value as a `rcl_interfaces/msg/ParameterValue`."""
+        message = _value_message(self._type.value)
+        if self._type.value in _FIELDS:
+            setattr(message, _FIELDS[self._type.value], self._value)
+        return message
+
+    def to_parameter_msg(self):
+        """This parameter as a `rcl_interfaces/msg/Parameter`."""
+        return _parameter_message(self._name, self.get_parameter_value())
+
+    def __repr__(self) -> str:
+        return f"Parameter({self._name!r}, {self._type}, {self._value!r})"
+
+
+def get_parameter_value(string_value: str) -> Any:
+    """The `rcl_interfaces/msg/ParameterValue` that a text means, as on a command line."""
+    try:
+        value = parse_value(string_value)
+    except ParameterSyntaxError:
+        value = string_value
+    return Parameter("", value=string_value if value is None else value).get_parameter_value()
+
+
+def parameter_value_to_python(parameter_value: Any) -> Any:
+    """The Python value that a `rcl_interfaces/msg/ParameterValue` holds."""
+    if parameter_value.type == 0:
+        return None
+    if parameter_value.type not in _FIELDS:
+        raise RuntimeError(f"unexpected parameter type {parameter_value.type}")
+    value = getattr(parameter_value, _FIELDS[parameter_value.type])
+    return list(value) if parameter_value.type >= 5 else value
+
+
+def parameter_dict_from_yaml_file(
+    parameter_file: str,
+    use_wildcard: bool = False,
+    target_nodes: list[str] | None = None,
+    namespace: str = "",
+) -> dict[str, Any]:
+    """The `rcl_interfaces/msg/Parameter`s of a parameter file by their names.
+
+    Args:
+        parameter_file: path of the YAML file.
+        use_wildcard: whether parameters under `/**` count.
+        target_nodes: names of the nodes whose parameters count; None for all.
+        namespace: put before each parameter's name.
+
+    Raises:
+        RuntimeError: the file is no parameter file, or has nothing for these nodes.
+    """
+    try:
+        found = read_parameter_file(parameter_file)
+    except ParameterSyntaxError as error:
+        raise RuntimeError(str(error)) from None
+    nodes = {node for node, _, _ in found}
+    for node in target_nodes or []:
+        if node not in nodes:
+            raise RuntimeError(
+                f"Param file does not contain parameters for {node},only for nodes: {sorted(nodes)}"
+            )
+    wanted = set(target_nodes) if target_nodes else nodes - {"/**"}
+    if use_wildcard and "/**" in nodes:
+        wanted.add("/**")
+    if not wanted:
+        raise RuntimeError("Param file does not contain selected parameters")
+    chosen = sorted((p for p in found if p[0] in wanted), key=lambda p: p[0] != "/**")
+    return {
+        namespace + name: Parameter(namespace + name, value=value).to_parameter_msg()
+        for _, name, value in chosen
+    }
+
+
+def _value_message(type_: int) -> Any:
+    from ..messages import message_class
+
+    return message_class("rcl_interfaces/msg/ParameterValue")(type=type_)
+
+
+def _parameter_message(name: str, value: Any) -> Any:
+    from ..messages import message_class
+
+    return message_class("rcl_interfaces/msg/Parameter")(name=name, value=value)

@@ -1,0 +1,185 @@
+"""Timers, whose callbacks executors call periodically, and rates, which a thread sleeps by."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from ._rclpy_pybind11 import RCLError
+from ._time_jump import ClockChange, TimeJump
+from .callback_groups import CallbackGroup
+from .clock import Clock
+from .context import Context
+from .exceptions import InvalidHandle, NotInitializedException, ROSInterruptException
+from .utilities import get_default_context
+
+__all__ = ["Rate", "Timer"]
+
+
+class Timer:
+    """Calls back each period. Periods that were missed are skipped, not caught up with."""
+
+    def __init__(
+        self,
+        callback: Callable[..., Any] | None,
+        callback_group: CallbackGroup | None,
+        timer_period_ns: int,
+        clock: Clock,
+        *,
+        context: Context | None = None,
+        autostart: bool = True,
+    ):
+        context = get_default_context() if context is None else context
+        if context.handle is None:
+            raise NotInitializedException("cannot create timer")
+        if timer_period_ns < 0:
+            raise RCLError("failed to create timer: timer period must be non-negative")
+        self._context_handle = context.handle
+        self._clock = clock
+        self._period = int(timer_period_ns)
+        self._last_call = clock._now()
+        self._next_call = self._last_call + self._period
+        self._canceled = not autostart
+        self._destroyed = False
+        self.callback = callback
+        self.callback_group = callback_group
+        self._executor_event = False
+        clock._timers.add(self)
+
+    @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    @property
+    def timer_period_ns(self) -> int:
+        self._require_existence()
+        return self._period
+
+    @timer_period_ns.setter
+    def timer_period_ns(self, value: int) -> None:
+        self._require_existence()
+        if int(value) < 0:
+            raise RCLError("failed to exchange timer period: period must be non-negative")
+        self._period = int(value)
+
+    def is_ready(self) -> bool:
+        """Whether the callback is due."""
+        self._require_existence()
+        return self._is_due()
+
+    def is_canceled(self) -> bool:
+        """Whether the timer is stopped."""
+        self._require_existence()
+        return self._canceled
+
+    def cancel(self) -> None:
+        """Stop the timer until `reset`."""
+        self._require_existence()
+        self._canceled = True
+
+    def reset(self) -> None:
+        """Start the timer, the next call being one period from now."""
+        self._require_existence()
+        self._next_call = self._clock._now() + self._period
+        self._canceled = False
+        self._context_handle.wake_all()
+
+    def time_since_last_call(self) -> int:
+        """Nanoseconds since the callback was called, or since the timer was made."""
+        self._require_existence()
+        return self._clock._now() - self._last_call
+
+    def time_until_next_call(self) -> int | None:
+        """Nanoseconds until the callback is due, negative when it is late, None when stopped."""
+        self._require_existence()
+        return None if self._canceled else self._next_call - self._clock._now()
+
+    def destroy(self) -> None:
+        """Stop the timer for good."""
+        self._destroyed = True
+        self._canceled = True
+        self._clock._timers.discard(self)
+
+    def _require_existence(self) -> None:
+        if self._destroyed:
+            raise InvalidHandle("cannot use Destroyable because destruction was requested")
+
+    def _is_due(self) -> bool:
+        return not self._canceled and self._next_call <= self._clock._now()
+
+    def _advance(self) -> None:
+        """Take note of a call: the next one is at the first period that is still to come."""
+        now = self._clock._now()
+        self._last_call = now
+        self._next_call += self._period
+        if self._next_call < now:
+            if self._period:
+                missed = -(-(now - self._next_call) // self._period)
+                self._next_call += missed * self._period
+            else:
+                self._next_call = now
+
+    def _on_time_jump(self, jump: TimeJump, before: int) -> None:
+        """Keep the rest of the period when another kind of time begins; restart it when time
+        goes back by more than a period."""
+        now = self._clock._now()
+        if jump.clock_change in (
+            ClockChange.ROS_TIME_ACTIVATED,
+            ClockChange.ROS_TIME_DEACTIVATED,
+        ):
+            self._last_call += now - before
+            self._next_call += now - before
+        elif now < self._last_call:
+            self._last_call = now
+            self._next_call = now + self._period
+        self._context_handle.wake_all()
+
+
+class Rate:
+    """Sleeps until the next period of a timer, which an executor has to run in another thread."""
+
+    def __init__(self, timer: Timer, *, context):
+        self._timer = timer
+        self._is_shutdown = False
+        self._is_destroyed = False
+        self._event = threading.Event()
+        self._lock = threading.Lock()
+        self._num_sleepers = 0
+        timer.callback = self._event.set
+        context.on_shutdown(self._on_shutdown)
+
+    def _on_shutdown(self) -> None:
+        self._is_shutdown = True
+        self.destroy()
+
+    def destroy(self) -> None:
+        """End every sleep, now and later."""
+        self._is_destroyed = True
+        self._event.set()
+
+    def sleep(self) -> None:
+        """Sleep until the timer's next period.
+
+        Raises:
+            ROSInterruptException: the context is or was shut down.
+            RuntimeError: this rate was destroyed.
+            InvalidHandle: its timer was destroyed.
+        """
+        if self._is_shutdown:
+            raise ROSInterruptException()
+        if self._is_destroyed:
+            raise RuntimeError("Rate cannot sleep because it has been destroyed")
+        if self._timer._destroyed:
+            self.destroy()
+            raise InvalidHandle("Rate cannot sleep because the timer has been destroyed")
+        with self._lock:
+            self._num_sleepers += 1
+        try:
+            self._event.wait()
+        finally:
+            with self._lock:
+                self._num_sleepers -= 1
+                if self._num_sleepers == 0:
+                    self._event.clear()
+            if self._is_shutdown:
+                self.destroy()
+                raise ROSInterruptException()
