@@ -142,7 +142,8 @@ def _play(args: argparse.Namespace) -> int:
 
 
 def _bag_info(args: argparse.Namespace) -> int:
-    from us_sim.recording.reader import describe, read_bag
+    from us_sim.recording.reader import read_bag
+    from us_sim.recording.report import describe
 
     print(describe(read_bag(args.file)))
     return 0

@@ -63,7 +63,7 @@ def _plan(
         from us_sim.recording.path import read_path
 
         topic = player.get("topic")
-        poses = len(read_path(path, topic).stamps)
+        poses = len(read_path(path, topic))
         topics = ["tracker/pose", "probe/pose", "ultrasound/image"]
         topics += ["tissue/nodes"] if scene.tissue else []
         topics += ["skin/nodes"] if scene.skin else []
@@ -78,7 +78,7 @@ def _plan(
 
 def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: Path | None) -> str:
     """What :func:`run` would start and what it would leave out, and why, one line each."""
-    simulation_nodes(scene, {k: v for k, v in parameters.items() if k in _nodes_of(scene)})
+    _plan(scene, parameters, record=record, path=path)
     rows = [
         ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
     ]
@@ -96,10 +96,6 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
     lines.append("on demand wrench, tf, markers: nothing is computed for a topic nobody subscribes")
     return "\n".join(lines)
-
-
-def _nodes_of(scene: Scene) -> set[str]:
-    return {part.node for part in scene.parts()}
 
 
 def run(
@@ -157,10 +153,10 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
         "loop": loop,
     }
     if everything:
-        count = sum(entry.count for entry in read_bag(bag).topics)
+        count = read_bag(bag).message_count
         process = NodeProcess("session_player", settings)
     else:
-        count = len(read_path(bag, topic or None).stamps)
+        count = len(read_path(bag, topic or None))
         process = NodeProcess("path_player", settings | {"topic": topic})
     group = ProcessGroup()
     monitor = _Monitored([process.node])

@@ -38,7 +38,7 @@ def render_scene(scene: Scene, path: Path | None, out: Path) -> int:
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
     prepare_volume(scene)
-    with Progress("rendering", len(read_path(path).stamps), "images") as bar:
+    with Progress("rendering", len(read_path(path)), "images") as bar:
         count = render(scene, path, out, lambda done, _: bar.update(done))
     print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
     return 0

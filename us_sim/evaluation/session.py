@@ -156,7 +156,7 @@ class Session:
 
     def _recorded(self) -> dict[str, dict[str, int]]:
         """What publishers last said they had sent by then, beside what was recorded in the end."""
-        recorded = {topic.name.lstrip("/"): topic.count for topic in self.bag.topics}
+        recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
             key.removeprefix("published "): int(value)
             for node, report in self.reports.items()

@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
+from us_sim.errors import BagError
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.pose import Pose
-from us_sim.recording.path import read_path
+from us_sim.recording.path import ProbePath, read_path
 
 __all__ = ["PathPlayer", "main"]
 
@@ -45,6 +47,7 @@ class PathPlayer(Node):
             "await_subscriber", "", "and this node subscribes to them"
         )
         self._path = read_path(path, topic or None)
+        self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
         self._begun = 0
         self.finished = Future()
@@ -58,9 +61,11 @@ class PathPlayer(Node):
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
         self._starting = self.create_timer(0.05, self._begin)
-        count = len(self._path.stamps)
-        self.pose_count = count
-        self.get_logger().info(f"{count} poses of {self._path.topic} in {path}")
+        self.pose_count = len(self._path)
+        self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
+        for remark in (self._path.note, _rejection(self._path)):
+            if remark:
+                self.get_logger().warning(remark)
 
     def _declared(
         self,
@@ -87,7 +92,7 @@ class PathPlayer(Node):
         if self._lockstep:
             self._send()
             return
-        steps = np.diff(self._path.stamps)
+        steps = np.diff(self._path.log_times)
         period = float(np.median(steps)) * 1e-9 / self._rate if len(steps) else 0.01
         self._half_period = 0.5e9 * period
         self.create_timer(max(period, 1e-4), self._tick)
@@ -103,14 +108,14 @@ class PathPlayer(Node):
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
         elapsed = self.get_clock().now().nanoseconds - self._begun + self._half_period
-        stamps = self._path.stamps
-        while not self.finished.done() and (stamps[self._next] - stamps[0]) / self._rate <= elapsed:
+        times = self._path.log_times
+        while not self.finished.done() and (times[self._next] - times[0]) / self._rate <= elapsed:
             self._send()
             self._advance()
 
     def _imaged(self, image: Image) -> None:
         stamp = Time.from_msg(image.header.stamp).nanoseconds
-        if stamp == self._path.stamps[self._next] and not self.finished.done():
+        if stamp == self._stamps[self._next] and not self.finished.done():
             self._advance()
             if not self.finished.done():
                 self._send()
@@ -119,13 +124,13 @@ class PathPlayer(Node):
         i = self._next
         pose = Pose(self._path.positions[i], self._path.orientations[i])
         restamp = self._restamp and not self._lockstep
-        stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._path.stamps[i]))
+        stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._stamps[i]))
         self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))
         self.health.published("tracker/pose")
 
     def _advance(self) -> None:
         self._next += 1
-        if self._next < len(self._path.stamps):
+        if self._next < self.pose_count:
             return
         if self._loop:
             self._next = 0
@@ -134,6 +139,27 @@ class PathPlayer(Node):
         self.health.state = "finished"
         self.get_logger().info("the path is at its end")
         self.finished.set_result(None)
+
+
+def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
+    """Stamps that tell the poses apart: their own, or else the times they were recorded at.
+
+    Raises:
+        BagError: neither rise from pose to pose.
+    """
+    for stamps in (path.stamps, path.log_times):
+        if stamps[0] > 0 and (np.diff(stamps) > 0).all():
+            return stamps
+    raise BagError(
+        f"{path.topic}: neither stamps nor log times rise from pose to pose, so lockstep cannot "
+        f"tell the poses apart; record the path again"
+    )
+
+
+def _rejection(path: ProbePath) -> str:
+    if not path.rejected:
+        return ""
+    return f"{path.rejected} poses of {path.topic} are not finite or not oriented, and left out"
 
 
 def main(args: list[str] | None = None) -> int:

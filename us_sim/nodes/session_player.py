@@ -16,7 +16,8 @@ from rclpy.task import Future
 from us_sim.errors import BagError
 from us_sim.nodes.health import Health
 from us_sim.nodes.process import run_node
-from us_sim.recording.reader import BagMessage, read_bag
+from us_sim.recording.reader import read_bag
+from us_sim.recording.topic import BagMessage, BagTopic
 
 __all__ = ["SessionPlayer", "main"]
 
@@ -42,7 +43,7 @@ class SessionPlayer(Node):
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
         for topic in self._bag.topics:
-            self._offer(topic.name, topic.type_name, latched=topic.latched)
+            self._offer(topic.name, topic.type_name, latched=_is_latched(topic))
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._begun = 0
@@ -94,6 +95,10 @@ class SessionPlayer(Node):
             return
         self.health.state = "finished"
         self.finished.set_result(None)
+
+
+def _is_latched(topic: BagTopic) -> bool:
+    return bool(topic.qos) and all(q.durability == "transient_local" for q in topic.qos)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,0 +1,91 @@
+"""The demo on a small scene: what it leaves behind, read by programs that are not ours."""
+
+import json
+
+import cv2
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+TOPICS = {
+    "/tracker/pose": "geometry_msgs/msg/PoseStamped",
+    "/probe/pose": "geometry_msgs/msg/PoseStamped",
+    "/tissue/nodes": "sensor_msgs/msg/PointCloud2",
+    "/tissue/rest": "sensor_msgs/msg/PointCloud2",
+    "/tissue/tetrahedra": "std_msgs/msg/Int32MultiArray",
+    "/probe/wrench": "geometry_msgs/msg/WrenchStamped",
+    "/skin/mesh": "shape_msgs/msg/Mesh",
+    "/skin/nodes": "sensor_msgs/msg/PointCloud2",
+    "/skin/marker": "visualization_msgs/msg/Marker",
+    "/ultrasound/image": "sensor_msgs/msg/Image",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+POSES = 90
+
+
+@pytest.fixture(scope="module")
+def summary(demo):
+    return json.loads((demo / "summary.json").read_text())
+
+
+def test_every_topic_of_the_graph_is_recorded_with_type_and_stamps(demo):
+    with AnyReader([demo]) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        assert types == TOPICS
+        stamps = []
+        for connection, _, data in reader.messages():
+            if connection.topic == "/tracker/pose":
+                header = reader.deserialize(data, connection.msgtype).header
+                assert header.frame_id == "patient"
+                stamps.append((header.stamp.sec, header.stamp.nanosec))
+    assert len(stamps) == POSES
+    assert stamps == sorted(set(stamps))
+
+
+def test_the_mcap_reader_finds_an_indexed_ros2_file(demo):
+    with (demo / "session.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary.chunk_indexes
+        names = {channel.topic for channel in summary.channels.values()}
+        assert names == set(TOPICS)
+        for channel in summary.channels.values():
+            assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
+            assert "reliability" in channel.metadata["offered_qos_profiles"]
+            assert summary.schemas[channel.schema_id].encoding == "ros2msg"
+
+
+def test_counts_latency_and_areas_are_in_the_summary(summary):
+    assert summary["poses_in"] == POSES
+    assert 0 < summary["images_out"] <= POSES
+    assert summary["dropped"] == POSES - summary["images_out"]
+    assert summary["images_per_second"] > 5
+    for topic in ("/probe/pose", "/tissue/nodes", "/ultrasound/image", "end_to_end"):
+        latency = summary["latency_ms"][topic]
+        assert 0 < latency["p50"] <= latency["p99"]
+    areas = summary["areas"]
+    assert len(areas["time_s"]) == len(areas["vein_mm2"]) == len(areas["artery_mm2"])
+    assert min(areas["vein_mm2"]) > 0
+
+
+def test_the_recorder_misses_nothing_it_was_sent(summary):
+    for topic, counts in summary["recorder"].items():
+        if topic != "diagnostics":
+            assert counts["recorded"] >= counts["published"] > 0, topic
+
+
+def test_the_contact_sheet_is_a_picture(demo):
+    picture = cv2.imread(str(demo / "contact_sheet.png"))
+    assert picture.shape[0] > 600
+    assert picture.std() > 20
+
+
+def test_a_second_demo_does_not_overwrite_the_first(demo, played_scene):
+    from conftest import us_sim
+
+    result = us_sim("demo", played_scene, "--out", demo)
+    assert result.returncode == 1
+    assert "exists already; choose another folder with --out" in result.stderr
+    assert "Traceback" not in result.stderr

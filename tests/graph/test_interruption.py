@@ -1,0 +1,56 @@
+"""Ctrl-C at any moment: every process ends within two seconds, and the recording can be read."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from us_sim.recording.reader import read_bag
+
+
+def processes_of(marker: str) -> list[int]:
+    """Processes with that text in their command line or environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if marker.encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("images", [0, 20])
+def test_ctrl_c(played_scene, tmp_path, images):
+    out = tmp_path / "out"
+    marker = f"INTERRUPTED_RUN={tmp_path}"
+    command = [sys.executable, "-m", "us_sim.cli", "demo", str(played_scene), "--out", str(out)]
+    command += ["--param", "path_player.loop=true"]
+    name, value = marker.split("=", 1)
+    demo = subprocess.Popen(command, env=os.environ | {name: value}, stderr=subprocess.PIPE)
+    recording = out / "session.mcap"
+    deadline = time.monotonic() + 100
+    while not (recording.exists() and image_count(recording) >= images):
+        assert demo.poll() is None, demo.stderr.read().decode()
+        assert time.monotonic() < deadline
+        os.sched_yield()
+    began = time.monotonic()
+    demo.send_signal(signal.SIGINT)
+    demo.wait(10)
+    assert time.monotonic() - began < 2.0
+    assert processes_of(marker) == []
+    assert demo.returncode == 130
+    assert b"Traceback" not in demo.stderr.read()
+    bag = read_bag(recording)
+    assert image_count(recording) >= images
+    assert bag.start is None or bag.end >= bag.start
+
+
+def image_count(recording: Path) -> int:
+    topics = {topic.name: topic.message_count for topic in read_bag(recording).topics}
+    return topics.get("/ultrasound/image", 0)

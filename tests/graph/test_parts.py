@@ -1,0 +1,85 @@
+"""What a scene does not name costs nothing: no process, no module, no topic."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import us_sim
+
+from us_sim.recording.reader import read_bag
+
+AT_EXIT = """
+import atexit, json, os, pathlib, sys
+
+def write():
+    names = [name for name in sys.modules if name.startswith("us_sim.")]
+    folder = pathlib.Path(os.environ["MODULES_OF_PROCESSES"])
+    (folder / f"{os.getpid()}.json").write_text(json.dumps([sys.argv[0], names]))
+
+if "MODULES_OF_PROCESSES" in os.environ:
+    atexit.register(write)
+"""
+
+
+def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str]], set[str]]:
+    """Modules of us_sim by node, and topics recorded, of a run of the scene along its path."""
+    (tmp_path / "sitecustomize.py").write_text(AT_EXIT)
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    search = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": search, "MODULES_OF_PROCESSES": str(modules)}
+    path = yaml.safe_load(scene.read_text())["path"]
+    recording = tmp_path / "session.mcap"
+    result = us_sim("run", scene, "--record", recording, "--path", path, env=environment)
+    assert result.returncode == 0, result.stderr
+    by_node = {}
+    for file in modules.glob("*.json"):
+        program, names = json.loads(file.read_text())
+        by_node[Path(program).stem] = set(names)
+    del by_node["cli"]
+    return by_node, {topic.name for topic in read_bag(recording).topics}
+
+
+def imports(modules: set[str], package: str) -> bool:
+    return any(name.startswith(f"us_sim.{package}.") for name in modules)
+
+
+@pytest.mark.parametrize("left_out", [("skin",), ("tissue",), ("skin", "tissue")])
+def test_what_a_scene_leaves_out_is_not_started_imported_or_published(
+    played_scene, left_out, tmp_path
+):
+    document = yaml.safe_load(played_scene.read_text())
+    for key in left_out:
+        del document[key]
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(yaml.safe_dump(document))
+    by_node, topics = run_and_list_modules(scene, tmp_path)
+    nodes = {"probe_tracker", "slice_interpolator", "session_recorder", "path_player"}
+    nodes |= {"tissue_deformer"} if "tissue" not in left_out else set()
+    nodes |= {"skin_deformer"} if "skin" not in left_out else set()
+    assert set(by_node) == nodes
+    for node, modules in by_node.items():
+        assert imports(modules, "tissue") == (node == "tissue_deformer"), node
+        assert imports(modules, "skin") == (node == "skin_deformer"), node
+        assert imports(modules, "slicing") == (node == "slice_interpolator"), node
+    assert "/ultrasound/image" in topics
+    for key in left_out:
+        assert not any(topic.startswith(f"/{key}/") for topic in topics)
+
+
+def test_the_dry_run_says_what_is_left_out_and_why(played_scene, tmp_path):
+    document = yaml.safe_load(played_scene.read_text())
+    del document["skin"]
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(yaml.safe_dump(document))
+    result = us_sim("run", scene, "--dry-run")
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert any(
+        line.split()[:3] == ["left", "out", "skin_deformer"]
+        and line.endswith("the scene has no `skin`: no membrane is computed")
+        for line in lines
+    )
+    assert any(line.split()[:2] == ["runs", "tissue_deformer"] for line in lines)

@@ -1,0 +1,36 @@
+"""A recording's content for a person: what `us-sim bag info` prints."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from us_sim.recording.reader import Bag
+
+__all__ = ["describe"]
+
+
+def describe(bag: Bag) -> str:
+    """Path, times, and a line for each topic with its type, count, rate and offered quality."""
+    summary = bag.summary()
+    seconds = summary["duration"] * 1e-9
+    lines = [f"file      {summary['path']}"]
+    if not summary["complete"]:
+        lines.append(f"note      {summary['note']}")
+    if summary["start"] is not None:
+        start = datetime.fromtimestamp(summary["start"] * 1e-9, tz=UTC)
+        lines.append(f"start     {start.isoformat(timespec='milliseconds')}")
+    lines += [f"duration  {seconds:.3f} s", f"messages  {summary['message_count']}", ""]
+    table = [("topic", "type", "count", "Hz", "quality of service")]
+    for topic in summary["topics"]:
+        count = topic["message_count"]
+        rate = f"{(count - 1) / seconds:.1f}" if seconds and count > 1 else "-"
+        quality = "; ".join(dict.fromkeys(topic["qos"])) or "-"
+        encoding = "" if topic["encoding"] == "cdr" else f" ({topic['encoding']})"
+        table.append((topic["name"], topic["type"] + encoding, str(count), rate, quality))
+    widths = [max(len(row[i]) for row in table) for i in range(4)]
+    for name, kind, count, rate, quality in table:
+        lines.append(
+            f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  "
+            f"{rate:>{widths[3]}}  {quality}"
+        )
+    return "\n".join(lines)
