@@ -1,0 +1,1 @@
+"""Ultrasound volumes: the type, file readers, and procedural phantoms with labels."""

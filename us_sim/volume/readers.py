@@ -1,0 +1,134 @@
+"""Volume files into frame ``patient``: MetaImage, NRRD and NIfTI, through SimpleITK.
+
+>>> import tempfile, SimpleITK
+>>> from us_sim.volume.readers import read_volume
+>>> image = SimpleITK.Image([30, 20, 10], SimpleITK.sitkUInt8)
+>>> image.SetSpacing([0.5, 0.5, 1.0]); image.SetOrigin([-7.0, 0.0, 3.0])  # mm
+>>> with tempfile.TemporaryDirectory() as folder:
+...     SimpleITK.WriteImage(image, f"{folder}/sweep.nrrd")
+...     volume = read_volume(f"{folder}/sweep.nrrd")
+>>> volume.shape, volume.index_to_patient[0].tolist()
+((30, 20, 10), [0.0005, 0.0, 0.0, -0.007])
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.stored_size import check_stored_size
+from us_sim.volume.volume import Volume
+
+__all__ = ["read_volume"]
+
+_METRES = 1e-3  # these formats hold millimetres
+
+
+def read_volume(path: str | os.PathLike[str]) -> Volume:
+    """A scalar three-dimensional image file as a volume without labels.
+
+    Frame ``patient`` is the file's own: DICOM's left-posterior-superior axes, in metres. Spacing,
+    origin and direction matrix are all respected. uint8 is taken as it is; every other type is
+    mapped linearly so that its smallest finite value becomes 0 and its largest 255 (a constant
+    image becomes 0, and so does NaN, which some programs write where nothing was scanned).
+
+    Raises:
+        VolumeError: the file is missing or no image, holds fewer or more bytes than its header
+            says, is not a scalar three-dimensional image of two voxels or more along each axis,
+            or has a spacing or direction that places no volume.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise VolumeError(f"{path}: there is no such file")
+    if not path.is_file():
+        raise VolumeError(f"{path}: is not a file; give one MHA, NRRD or NIfTI volume")
+    check_stored_size(path)
+    header = sitk.ImageFileReader()
+    header.SetFileName(str(path))
+    try:
+        header.ReadImageInformation()
+    except RuntimeError as error:
+        raise VolumeError(
+            f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume"
+        ) from error
+    if any(key.startswith("Seq_Frame") for key in header.GetMetaDataKeys()):
+        raise VolumeError(
+            f"{path}: is a sequence of tracked frames, not a volume; reconstruct a volume from it"
+        )
+    index_to_patient = _placement(path, header)
+    try:
+        image = header.Execute()
+    except RuntimeError as error:
+        raise VolumeError(
+            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
+            f"this machine's memory; copy or export it again"
+        ) from error
+    stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
+    return Volume(_grey_values(path, stored), index_to_patient)
+
+
+def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
+    """(4, 4) m, from the header alone, so that nothing unusable is read."""
+    dimension, size = header.GetDimension(), header.GetSize()
+    if dimension != 3:
+        raise VolumeError(f"{path}: is {dimension}-dimensional; a volume has three dimensions")
+    if min(size) < 2:
+        raise VolumeError(
+            f"{path}: has {' × '.join(map(str, size))} voxels; a volume needs two or more along "
+            f"each axis"
+        )
+    pixel = sitk.GetPixelIDValueAsString(header.GetPixelID())
+    if header.GetNumberOfComponents() != 1 or "complex" in pixel:
+        raise VolumeError(
+            f"{path}: holds {header.GetNumberOfComponents()} numbers per voxel ({pixel}); "
+            f"convert it to one grey value"
+        )
+    spacing = np.array(header.GetSpacing())
+    # MetaImage turns a spacing that is not a number into 0 before it comes here.
+    if not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
+        raise VolumeError(
+            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; every "
+            f"spacing must be a number above zero"
+        )
+    direction = np.array(header.GetDirection()).reshape(3, 3)
+    origin = np.array(header.GetOrigin())
+    if not (np.isfinite(direction).all() and np.isfinite(origin).all()):
+        raise VolumeError(f"{path}: has an origin or a direction matrix that is not finite")
+    if abs(np.linalg.det(direction)) < 1e-6:
+        raise VolumeError(f"{path}: has a singular direction matrix, so its axes span no volume")
+    placement = np.eye(4)
+    placement[:3, :3] = direction * spacing * _METRES
+    placement[:3, 3] = origin * _METRES
+    return placement
+
+
+def _grey_values(path: Path, stored: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Stored values (k, j, i) of any scalar type as (i, j, k) uint8."""
+    grey = np.empty(stored.shape[::-1], dtype=np.uint8)
+    if stored.dtype == np.uint8:
+        grey[:] = stored.transpose(2, 1, 0)
+        return grey
+    ranges = [_finite_range(plane) for plane in stored]
+    low = min(lower for lower, _ in ranges)
+    high = max(upper for _, upper in ranges)
+    if low > high:
+        raise VolumeError(f"{path}: holds no finite value")
+    # Plane by plane: a whole volume in float64 would take eight times the memory of the file's.
+    for k, plane in enumerate(stored):
+        # Halves, since the whole range of a float64 image may exceed what float64 can hold.
+        height = plane.astype(np.float64) / 2 - low / 2
+        share = height / (high / 2 - low / 2) if high > low else np.zeros_like(height)
+        share = np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+        grey[:, :, k] = np.floor(share * 255.0 + 0.5).T
+    return grey
+
+
+def _finite_range(plane: NDArray[np.generic]) -> tuple[float, float]:
+    values = plane.astype(np.float64)
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (np.inf, -np.inf)

@@ -1,0 +1,116 @@
+"""A volume of grey values placed in frame ``patient``, with labels when it has been segmented.
+
+>>> import numpy as np
+>>> from us_sim.volume.volume import Volume
+>>> placed = np.diag([0.5e-3, 0.5e-3, 1e-3, 1.0])
+>>> volume = Volume(np.zeros((40, 20, 30), np.uint8), placed, labels=None, label_names={})
+>>> volume.patient_to_index @ [0.01, 0.005, 0.002, 1.0]
+array([20., 10.,  2.,  1.])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+
+__all__ = ["Volume"]
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Grey values on a regular grid; the centre of voxel (i, j, k) lies at that whole index.
+
+    The arrays are kept as read-only views, without a copy where they are already C-contiguous,
+    so several processes can share one memory-mapped volume.
+
+    Args:
+        intensities: (i, j, k) uint8, axis 0 along the grid's x.
+        index_to_patient: (4, 4) affine, m, from voxel indices to frame ``patient``; it may be
+            oblique or mirrored.
+        labels: (i, j, k) uint8, what each voxel is, or None.
+        label_names: what the labels' numbers mean; 0 needs no name.
+
+    Raises:
+        VolumeError: an array is not three-dimensional uint8, the two shapes differ, an axis has
+            fewer than two voxels, or the affine is not finite or not invertible.
+    """
+
+    intensities: NDArray[np.uint8]  # (i, j, k)
+    index_to_patient: NDArray[np.float64]  # (4, 4), m
+    labels: NDArray[np.uint8] | None = None  # (i, j, k)
+    label_names: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "intensities", _voxels(self.intensities, "intensities"))
+        if self.labels is not None:
+            object.__setattr__(self, "labels", _voxels(self.labels, "labels"))
+            if self.labels.shape != self.intensities.shape:
+                raise VolumeError(
+                    f"the labels {self.labels.shape} and the intensities {self.intensities.shape} "
+                    f"of a volume must have the same shape"
+                )
+        object.__setattr__(self, "index_to_patient", _affine(self.index_to_patient))
+        object.__setattr__(self, "label_names", dict(self.label_names))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """The number of voxels along each axis."""
+        i, j, k = self.intensities.shape
+        return i, j, k
+
+    @cached_property
+    def patient_to_index(self) -> NDArray[np.float64]:
+        """(4, 4) affine from frame ``patient``, m, to voxel indices."""
+        inverse: NDArray[np.float64] = np.linalg.inv(self.index_to_patient)
+        inverse.flags.writeable = False
+        return inverse
+
+    @cached_property
+    def extent(self) -> NDArray[np.float64]:
+        """(2, 3) m, lower and upper corner of the box in ``patient`` around all voxels' faces."""
+        faces = np.stack([np.full(3, -0.5), np.array(self.shape) - 0.5])
+        corners = np.stack(np.meshgrid(*faces.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        placed = corners @ self.index_to_patient[:3, :3].T + self.index_to_patient[:3, 3]
+        extent = np.stack([placed.min(axis=0), placed.max(axis=0)])
+        extent.flags.writeable = False
+        return extent
+
+
+def _voxels(array: NDArray[np.uint8], what: str) -> NDArray[np.uint8]:
+    array = np.asarray(array)
+    if array.ndim != 3 or array.dtype != np.uint8:
+        raise VolumeError(
+            f"the {what} of a volume must be a three-dimensional uint8 array, "
+            f"not {array.ndim}-dimensional {array.dtype}"
+        )
+    if min(array.shape) < 2:
+        raise VolumeError(
+            f"the {what} have shape {array.shape}; a volume needs two voxels or more along "
+            f"each axis"
+        )
+    view = np.ascontiguousarray(array).view()
+    view.flags.writeable = False
+    return view
+
+
+def _affine(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.array(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise VolumeError("index_to_patient must be a finite 4×4 matrix")
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise VolumeError("the last row of index_to_patient must be 0 0 0 1")
+    steps = np.linalg.norm(matrix[:3, :3], axis=0)
+    # Relative to the voxel's size, since a determinant in cubic metres is always tiny.
+    if not steps.all() or abs(np.linalg.det(matrix[:3, :3] / steps)) < 1e-6:
+        raise VolumeError(
+            "index_to_patient is singular: a voxel has no size along an axis, or its axes lie in "
+            "one plane"
+        )
+    matrix.flags.writeable = False
+    return matrix
