@@ -77,6 +77,16 @@ class TissueModel:
         return self.contact_nodes[~self.fixed[self.contact_nodes]]
 
     @cached_property
+    def contact_spacing(self) -> float:
+        """m, median length of the mesh edges between contact nodes; 0 when there are none."""
+        reachable = np.zeros(len(self.mesh.nodes), dtype=bool)
+        reachable[self.contact_nodes] = True
+        ends = self.mesh.nodes[self.mesh.edges[reachable[self.mesh.edges].all(axis=1)]]
+        if len(ends) == 0:
+            return 0.0
+        return float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
+
+    @cached_property
     def lumped_mass(self) -> NDArray[np.float64]:
         """(N,) kg, a quarter of each tetrahedron's mass at each of its nodes."""
         quarter = self.materials.density * self.mesh.volumes / 4

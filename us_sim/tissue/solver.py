@@ -1,0 +1,174 @@
+"""The interface of all tissue solvers, and how one is made by its name.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.tissue.box import face_nodes
+>>> from us_sim.tissue.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solver import create_solver
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> solver = create_solver("fem_cg", model)
+>>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
+>>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
+True
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from importlib import import_module
+from typing import Any, ClassVar
+
+import numpy as np
+
+from us_sim.collider import Sphere
+from us_sim.errors import SolverError
+from us_sim.pose import Pose
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.materials import Material, uniform_material
+from us_sim.tissue.mesh import box_mesh
+from us_sim.tissue.model import TissueModel
+
+__all__ = ["SOLVERS", "TissueSolver", "create_solver"]
+
+#: Where each solver is found; a solver that is not asked for is not imported.
+SOLVERS = {
+    "fem_cg": ("us_sim.tissue.fem_cg", "FemCg"),
+    "msds": ("us_sim.tissue.msds", "Msds"),
+}
+
+
+class TissueSolver(ABC):
+    """Deforms one tissue, frame by frame.
+
+    A solver never returns a number that is not finite: should a frame come out so, the last good
+    state stays and the deformation's ``action`` says it.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, model: TissueModel) -> None:
+        self.model = model
+        self._pose: Pose | None = None
+        self._settled = True
+        self._last = self._resting()
+
+    def deform(self, probe_pose: Pose | None) -> Deformation:
+        """One frame: move the probe and let the tissue follow.
+
+        With a probe that has not moved and a tissue that has settled, nothing is computed.
+
+        Args:
+            probe_pose: in frame ``patient``, or None when no probe is near.
+        """
+        if self._settled and _same(probe_pose, self._pose):
+            return self._last
+        good, settled = self.state, self._settled
+        deformation = self._advance(probe_pose)
+        finite = np.isfinite(deformation.residual) and all(
+            np.isfinite(array).all()
+            for array in (deformation.nodes, deformation.force, deformation.torque)
+        )
+        if finite:
+            self._pose = probe_pose
+        else:
+            self._restore(good)
+            self._settled = settled
+            deformation = replace(
+                self._last, action="the frame was not finite, so the last good state was kept"
+            )
+        self._last = deformation
+        return deformation
+
+    def reset(self) -> None:
+        """Back to the undeformed tissue, with no probe near."""
+        self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
+        self._pose = None
+        self._settled = True
+        self._last = self._resting()
+
+    def take_over(self, state: TissueState) -> None:
+        """Go on from where another solver of the same model is.
+
+        Raises:
+            SolverError: the state has another number of nodes, is not finite, or moves a fixed one.
+        """
+        shape = self.model.mesh.nodes.shape
+        if state.displacement.shape != shape or state.velocity.shape != shape:
+            raise SolverError(
+                f"the state to take over has {len(state.displacement)} nodes, the mesh "
+                f"{shape[0]}: hand over a state of the same mesh"
+            )
+        if not (np.isfinite(state.displacement).all() and np.isfinite(state.velocity).all()):
+            raise SolverError("the state to take over is not finite: reset the solver instead")
+        if state.displacement[self.model.fixed].any():
+            raise SolverError("the state to take over moves fixed nodes: it is of another model")
+        self._restore(state)
+        self._pose = None
+        self._settled = not (state.displacement.any() or state.velocity.any())
+        self._last = replace(self._resting(), nodes=self.model.mesh.nodes + state.displacement)
+
+    def warm_up(self) -> None:
+        """Compile the kernels on a tissue of one cell; this solver's own state is not touched."""
+        mesh = box_mesh([-0.01, 0.01], [-0.01, 0.01], [0.0, 0.01])
+        model = TissueModel(
+            mesh,
+            uniform_material(mesh, Material(10e3, 0.3, 1000.0)),
+            mesh.nodes[:, 2] > 0.005,
+            Sphere(0.03),
+            np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
+        )
+        solver = type(self)(model)
+        solver.deform(Pose(position=np.array([0.0, 0.0, 0.005])))
+        solver.deform(None)
+
+    @property
+    @abstractmethod
+    def state(self) -> TissueState:
+        """A copy of where the tissue is."""
+
+    @abstractmethod
+    def _advance(self, pose: Pose | None) -> Deformation:
+        """One frame; sets ``_settled``. ``_pose`` is still the frame before's."""
+
+    @abstractmethod
+    def _restore(self, state: TissueState) -> None:
+        """Put the tissue where a state says."""
+
+    def _resting(self) -> Deformation:
+        return Deformation(
+            self.model.mesh.nodes.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), 0.0
+        )
+
+
+def create_solver(name: str, model: TissueModel, **settings: Any) -> TissueSolver:
+    """A solver by the name that scenes and reports use.
+
+    Raises:
+        SolverError: no such solver or setting, a setting out of range, or a model it cannot solve.
+    """
+    if name not in SOLVERS:
+        raise SolverError(f"there is no tissue solver {name!r}: name one of {', '.join(SOLVERS)}")
+    module, class_name = SOLVERS[name]
+    solver = getattr(import_module(module), class_name)
+    known = [p for p in inspect.signature(solver).parameters if p != "model"]
+    for setting in settings:
+        if setting not in known:
+            raise SolverError(
+                f"solver {name} has no setting {setting!r}: its settings are {', '.join(known)}"
+            )
+    return solver(model, **settings)
+
+
+def _same(a: Pose | None, b: Pose | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
