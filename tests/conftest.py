@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
+
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

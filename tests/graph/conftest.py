@@ -1,28 +1,15 @@
 """Whole runs of the command, in processes of their own."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import us_sim
 
 from us_sim.recording.path import ProbePath, write_path
 
 RATE_HZ = 60.0
-
-
-def us_sim(*args: object, **kwargs: object) -> subprocess.CompletedProcess[str]:
-    """`us-sim ARGS` to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "us_sim.cli", *map(str, args)],
-        capture_output=True,
-        text=True,
-        timeout=150,
-        check=False,
-        **kwargs,
-    )
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,6 +4,7 @@ import json
 
 import cv2
 import pytest
+from command import us_sim
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -83,8 +84,6 @@ def test_the_contact_sheet_is_a_picture(demo):
 
 
 def test_a_second_demo_does_not_overwrite_the_first(demo, played_scene):
-    from conftest import us_sim
-
     result = us_sim("demo", played_scene, "--out", demo)
     assert result.returncode == 1
     assert "exists already; choose another folder with --out" in result.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import us_sim
+from command import us_sim
 
 from us_sim.recording.reader import read_bag
 

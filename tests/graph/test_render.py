@@ -1,7 +1,7 @@
 """Lockstep: one image for every pose, and the same bytes on every run."""
 
 import pytest
-from conftest import us_sim
+from command import us_sim
 
 from us_sim.recording.reader import read_bag
 

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from conftest import pose_at
+from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from tf2_msgs.msg import TFMessage
@@ -83,7 +83,7 @@ def test_the_transform_is_sent_to_who_asks(bench, tracker):
 
 
 def test_diagnostics_say_what_was_refused(bench, tracker):
-    node, poses, publisher = tracker
+    node, _, publisher = tracker
     reports = bench.collect(DiagnosticArray, "diagnostics")
     publisher.publish(pose_at(math.nan, 8))
     publisher.publish(pose_at(0.002, 9))

@@ -1,7 +1,7 @@
 """The skin node: rest mesh latched, vertices with normals, a marker for who asks."""
 
 import numpy as np
-from conftest import pose_at
+from bench import pose_at
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import pose_at
+from bench import pose_at
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
@@ -50,7 +50,7 @@ def slicer(bench, small_scene):
 
 def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_scene):
     _, mesh, images, poses, nodes = slicer
-    moved = (mesh.nodes + [0.0, 0.0, 0.002]).astype(np.float32).astype(np.float64)
+    moved = (mesh.nodes + np.array([0.0, 0.0, 0.002])).astype(np.float32).astype(np.float64)
     poses.publish(pose_at(0.003, 1))
     poses.publish(pose_at(0.001, 2))
     nodes.publish(cloud(moved, pose_at(0.0, 1)))

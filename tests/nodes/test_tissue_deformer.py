@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import pose_at
+from bench import pose_at
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
@@ -34,7 +34,8 @@ def press(bench, publisher, nodes, depth, second):
     return vectors_from(nodes[-1])
 
 
-def test_the_mesh_is_latched_for_who_comes_late(bench, deformer, small_scene):
+@pytest.mark.usefixtures("deformer")
+def test_the_mesh_is_latched_for_who_comes_late(bench, small_scene):
     rest = bench.collect(PointCloud2, "tissue/rest", latched=True)
     tetrahedra = bench.collect(Int32MultiArray, "tissue/tetrahedra", latched=True)
     bench.spin_until(lambda: rest and tetrahedra)
