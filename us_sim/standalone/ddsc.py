@@ -1,0 +1,263 @@
+"""The part of Eclipse Cyclone DDS's C interface that is needed to exchange serialized samples.
+
+The C library comes with the PyPI package `cyclonedds`. Its Python classes are not used: they hold
+the interpreter's lock while a write blocks, describe every type by XTypes (which Jazzy does not
+send and need not agree with), and turn each sample into objects. Calls through ctypes release the
+lock.
+
+>>> from us_sim.standalone.ddsc import lib
+>>> lib.dds_time() > 0
+True
+"""
+
+from __future__ import annotations
+
+import ctypes as ct
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import UsSimError
+
+__all__ = [
+    "ANY_STATE",
+    "INFINITY",
+    "BuiltinEndpoint",
+    "BuiltinParticipant",
+    "DdsError",
+    "IoVector",
+    "RawSampleInfo",
+    "check",
+    "guid_of",
+    "lib",
+    "topic_descriptor",
+]
+
+INFINITY = 2**63 - 1
+ANY_STATE = 0x7F
+ALIVE = 16
+SAMPLE_OF_DATA = 2  # enum ddsi_serdata_kind
+
+RETURN_TIMEOUT = -10
+RETURN_ALREADY_DELETED = -9
+RETURN_BAD_PARAMETER = -3
+
+BUILTIN_PARTICIPANT = 0x7FFF0001
+BUILTIN_PUBLICATION = 0x7FFF0003
+BUILTIN_SUBSCRIPTION = 0x7FFF0004
+
+Entity = ct.c_int32
+InstanceHandle = ct.c_uint64
+Pointer = ct.c_void_p
+
+
+class DdsError(UsSimError):
+    """The transport refuses what it was asked for."""
+
+
+class RawSampleInfo(ct.Structure):
+    """dds_sample_info_t"""
+
+    _fields_ = (
+        ("sample_state", ct.c_uint),
+        ("view_state", ct.c_uint),
+        ("instance_state", ct.c_uint),
+        ("valid_data", ct.c_bool),
+        ("source_timestamp", ct.c_int64),
+        ("instance_handle", InstanceHandle),
+        ("publication_handle", InstanceHandle),
+        ("disposed_generation_count", ct.c_uint32),
+        ("no_writers_generation_count", ct.c_uint32),
+        ("sample_rank", ct.c_uint32),
+        ("generation_rank", ct.c_uint32),
+        ("absolute_generation_rank", ct.c_uint32),
+    )
+
+
+class IoVector(ct.Structure):
+    """ddsrt_iovec_t"""
+
+    _fields_ = (("base", Pointer), ("length", ct.c_size_t))
+
+
+class BuiltinParticipant(ct.Structure):
+    """dds_builtintopic_participant_t"""
+
+    _fields_ = (("key", ct.c_uint8 * 16), ("qos", Pointer))
+
+
+class BuiltinEndpoint(ct.Structure):
+    """dds_builtintopic_endpoint_t"""
+
+    _fields_ = (
+        ("key", ct.c_uint8 * 16),
+        ("participant_key", ct.c_uint8 * 16),
+        ("participant_handle", InstanceHandle),
+        ("topic_name", ct.c_char_p),
+        ("type_name", ct.c_char_p),
+        ("qos", Pointer),
+    )
+
+
+class _SerializedType(ct.Structure):
+    _fields_ = (("data", Pointer), ("size", ct.c_uint32))
+
+
+class _TopicDescriptor(ct.Structure):
+    """dds_topic_descriptor_t"""
+
+    _fields_ = (
+        ("size", ct.c_uint32),
+        ("align", ct.c_uint32),
+        ("flags", ct.c_uint32),
+        ("key_count", ct.c_uint32),
+        ("type_name", ct.c_char_p),
+        ("keys", Pointer),
+        ("operation_count", ct.c_uint32),
+        ("operations", ct.POINTER(ct.c_uint32)),
+        ("meta", ct.c_char_p),
+        ("type_information", _SerializedType),
+        ("type_mapping", _SerializedType),
+        ("data_representation", ct.c_uint32),
+    )
+
+
+_OPERATION_OF_ONE_OCTET = (1 << 24) | (1 << 16)  # DDS_OP_ADR | DDS_OP_TYPE_1BY, then its offset
+_XCDR1_ONLY = (1 << 8, 1 << 0)  # DDS_TOPIC_RESTRICT_DATA_REPRESENTATION and the flag for XCDR1
+
+
+def topic_descriptor(type_name: str) -> Any:
+    """A description that lets any CDR of at least one byte through, under the given type name.
+
+    ROS 2 matches endpoints by the names of topic and type and sends no XTypes information; so a
+    type of one octet will do, and whatever follows the octet travels along untouched.
+    """
+    operations = (ct.c_uint32 * 3)(_OPERATION_OF_ONE_OCTET, 0, 0)
+    return _TopicDescriptor(
+        size=1,
+        align=1,
+        flags=0,
+        type_name=type_name.encode(),
+        operation_count=2,
+        operations=operations,
+        meta=b"",
+    )
+
+
+def _declare(result: Any, name: str, *arguments: Any) -> None:
+    function = getattr(lib, name)
+    function.restype = result
+    function.argtypes = arguments
+
+
+def _library_path() -> str:
+    """The C library in the `cyclonedds` package, without importing that (0.2 s)."""
+    package = importlib.util.find_spec("cyclonedds")
+    if package is None or package.origin is None:
+        raise DdsError("the package cyclonedds is not installed; run pip install cyclonedds")
+    folder = Path(package.origin).parent
+    for place in (folder.parent / "cyclonedds.libs", folder / ".dylibs"):
+        for library in sorted(place.glob("*ddsc[.-]*")):
+            return str(library)
+    from cyclonedds.internal import DDS  # built from source, it knows where its library is
+
+    return DDS._dll_handle._name
+
+
+lib: Any = ct.CDLL(_library_path())
+_INT, _BOOL, _OUT = ct.c_int32, ct.c_bool, ct.c_void_p
+_DURATION = ct.c_int64
+
+_declare(ct.c_int64, "dds_time")
+_declare(ct.c_char_p, "dds_strretcode", _INT)
+_declare(None, "dds_free", Pointer)
+
+_declare(_INT, "dds_create_domain", ct.c_uint32, ct.c_char_p)
+_declare(_INT, "dds_create_participant", ct.c_uint32, Pointer, Pointer)
+_declare(_INT, "dds_create_topic", Entity, Pointer, ct.c_char_p, Pointer, Pointer)
+_declare(_INT, "dds_create_reader", Entity, Entity, Pointer, Pointer)
+_declare(_INT, "dds_create_writer", Entity, Entity, Pointer, Pointer)
+_declare(_INT, "dds_delete", Entity)
+_declare(_INT, "dds_get_guid", Entity, _OUT)
+_declare(_INT, "dds_get_instance_handle", Entity, _OUT)
+_declare(_INT, "dds_get_entity_sertype", Entity, _OUT)
+
+_declare(_INT, "dds_create_waitset", Entity)
+_declare(_INT, "dds_create_guardcondition", Entity)
+_declare(_INT, "dds_set_guardcondition", Entity, _BOOL)
+_declare(_INT, "dds_waitset_attach", Entity, Entity, ct.c_ssize_t)
+_declare(_INT, "dds_waitset_wait", Entity, _OUT, ct.c_size_t, _DURATION)
+_declare(_INT, "dds_set_status_mask", Entity, ct.c_uint32)
+_declare(_INT, "dds_take_status", Entity, _OUT, ct.c_uint32)
+
+_declare(Pointer, "ddsi_serdata_from_ser_iov", Pointer, ct.c_int, ct.c_size_t, _OUT, ct.c_size_t)
+_declare(ct.c_uint32, "ddsi_serdata_size", Pointer)
+_declare(Pointer, "ddsi_serdata_to_ser_ref", Pointer, ct.c_size_t, ct.c_size_t, _OUT)
+_declare(None, "ddsi_serdata_to_ser_unref", Pointer, _OUT)
+_declare(None, "ddsi_serdata_unref", Pointer)
+_declare(_INT, "dds_writecdr", Entity, Pointer)
+_declare(_INT, "dds_takecdr", Entity, _OUT, ct.c_uint32, _OUT, ct.c_uint32)
+_declare(_INT, "dds_take", Entity, _OUT, _OUT, ct.c_size_t, ct.c_uint32)
+_declare(_INT, "dds_return_loan", Entity, _OUT, ct.c_int32)
+_declare(_INT, "dds_wait_for_acks", Entity, _DURATION)
+_declare(_INT, "dds_assert_liveliness", Entity)
+
+_declare(_INT, "dds_get_matched_subscriptions", Entity, _OUT, ct.c_size_t)
+_declare(_INT, "dds_get_matched_publications", Entity, _OUT, ct.c_size_t)
+for _side in ("publication", "subscription"):
+    _declare(ct.POINTER(BuiltinEndpoint), f"dds_get_matched_{_side}_data", Entity, InstanceHandle)
+    _declare(_INT, f"dds_get_{_side}_matched_status", Entity, _OUT)
+_declare(None, "dds_builtintopic_free_endpoint", ct.POINTER(BuiltinEndpoint))
+for _status in (
+    "liveliness_changed",
+    "liveliness_lost",
+    "offered_deadline_missed",
+    "offered_incompatible_qos",
+    "requested_deadline_missed",
+    "requested_incompatible_qos",
+    "sample_lost",
+):
+    _declare(_INT, f"dds_get_{_status}_status", Entity, _OUT)
+
+_declare(Pointer, "dds_create_qos")
+_declare(None, "dds_delete_qos", Pointer)
+_declare(None, "dds_qset_data_representation", Pointer, ct.c_uint32, _OUT)
+_declare(None, "dds_qset_deadline", Pointer, _DURATION)
+_declare(None, "dds_qset_durability", Pointer, ct.c_int)
+_declare(
+    None,
+    "dds_qset_durability_service",
+    Pointer,
+    _DURATION,
+    ct.c_int,
+    *(ct.c_int32,) * 4,
+)
+_declare(None, "dds_qset_history", Pointer, ct.c_int, ct.c_int32)
+_declare(None, "dds_qset_ignorelocal", Pointer, ct.c_int)
+_declare(None, "dds_qset_lifespan", Pointer, _DURATION)
+_declare(None, "dds_qset_liveliness", Pointer, ct.c_int, _DURATION)
+_declare(None, "dds_qset_reliability", Pointer, ct.c_int, _DURATION)
+_declare(None, "dds_qset_userdata", Pointer, ct.c_char_p, ct.c_size_t)
+_declare(None, "dds_qset_writer_data_lifecycle", Pointer, _BOOL)
+_declare(_BOOL, "dds_qget_deadline", Pointer, _OUT)
+_declare(_BOOL, "dds_qget_durability", Pointer, _OUT)
+_declare(_BOOL, "dds_qget_history", Pointer, _OUT, _OUT)
+_declare(_BOOL, "dds_qget_lifespan", Pointer, _OUT)
+_declare(_BOOL, "dds_qget_liveliness", Pointer, _OUT, _OUT)
+_declare(_BOOL, "dds_qget_reliability", Pointer, _OUT, _OUT)
+_declare(_BOOL, "dds_qget_userdata", Pointer, _OUT, _OUT)
+
+
+def check(returned: int, sentence: str) -> int:
+    """What a C function returned, or a DdsError with this sentence if it was an error."""
+    if returned < 0:
+        reason = lib.dds_strretcode(returned).decode()
+        raise DdsError(f"{sentence} (Cyclone DDS says: {reason})")
+    return returned
+
+
+def guid_of(entity: int) -> bytes:
+    """The sixteen bytes that identify an entity on the network."""
+    guid = (ct.c_uint8 * 16)()
+    check(lib.dds_get_guid(entity, guid), "an endpoint that was closed has no identity")
+    return bytes(guid)

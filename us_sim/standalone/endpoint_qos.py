@@ -1,0 +1,207 @@
+"""Quality of service between rclpy's policies and Cyclone DDS's.
+
+Durations are nanoseconds; 0 stands for "not specified", which is infinite, as in rmw.
+
+>>> from us_sim.standalone.endpoint_qos import EndpointQos
+>>> latched = EndpointQos(depth=1, durability=EndpointQos.TRANSIENT_LOCAL)
+>>> latched.reliability == EndpointQos.RELIABLE
+True
+"""
+
+from __future__ import annotations
+
+import ctypes as ct
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from us_sim.standalone.ddsc import INFINITY, DdsError, lib
+
+__all__ = ["EndpointQos", "dds_qos", "participant_qos", "qos_of_profile", "read_qos", "user_data"]
+
+_UNSPECIFIED = (0, INFINITY)
+_BEST_AVAILABLE_DURATION = 2**63 - 2
+_LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds would block for ever
+
+
+@dataclass(frozen=True)
+class EndpointQos:
+    """The policies of one endpoint, with the numbers that rclpy's enumerations have."""
+
+    RELIABLE: ClassVar[int] = 1
+    BEST_EFFORT: ClassVar[int] = 2
+    TRANSIENT_LOCAL: ClassVar[int] = 1
+    VOLATILE: ClassVar[int] = 2
+    KEEP_LAST: ClassVar[int] = 1
+    KEEP_ALL: ClassVar[int] = 2
+    AUTOMATIC: ClassVar[int] = 1
+    MANUAL_BY_TOPIC: ClassVar[int] = 3
+
+    reliability: int = RELIABLE
+    durability: int = VOLATILE
+    history: int = KEEP_LAST
+    depth: int = 10
+    deadline: int = 0  # ns
+    lifespan: int = 0  # ns
+    liveliness: int = AUTOMATIC
+    liveliness_lease_duration: int = 0  # ns
+
+
+_BEST_AVAILABLE = 4
+_BEST_AVAILABLE_LIVELINESS = 5
+_DDS_DURABILITY = (EndpointQos.VOLATILE, EndpointQos.TRANSIENT_LOCAL)
+_DDS_LIVELINESS = (EndpointQos.AUTOMATIC, 2, EndpointQos.MANUAL_BY_TOPIC)
+
+
+def qos_of_profile(profile: Any, is_writer: bool, opposite: Iterable[EndpointQos]) -> EndpointQos:
+    """The policies to ask for, given rclpy's profile (or anything with its attributes).
+
+    SYSTEM_DEFAULT is reliable, volatile, keep last 1 and automatic; BEST_AVAILABLE is chosen from
+    the ``opposite`` endpoints that are known on the topic, as rmw_dds_common does.
+
+    Raises:
+        DdsError: a policy is UNKNOWN, or the depth is negative.
+    """
+    opposite = tuple(opposite)
+    depth = int(profile.depth)
+    if depth < 0:
+        raise DdsError(f"a history depth of {depth} cannot be kept; give at least 1")
+
+    def policy(name: str, default: int, known: tuple[int, ...], best: int) -> int:
+        value = int(getattr(profile, name))
+        if value == 0:
+            return default
+        if value == (_BEST_AVAILABLE_LIVELINESS if name == "liveliness" else _BEST_AVAILABLE):
+            return best
+        if value not in known:
+            raise DdsError(f"the {name} policy {value} is unknown; choose one for this endpoint")
+        return value
+
+    def duration(name: str) -> int:
+        value = getattr(profile, name)
+        value = int(getattr(value, "nanoseconds", value))
+        if value == _BEST_AVAILABLE_DURATION:
+            values = [getattr(qos, name) for qos in opposite if getattr(qos, name)]
+            return (min if is_writer else max)(values, default=0)
+        return 0 if value in _UNSPECIFIED else value
+
+    all_reliable = all(qos.reliability == EndpointQos.RELIABLE for qos in opposite)
+    all_latched = all(qos.durability == EndpointQos.TRANSIENT_LOCAL for qos in opposite)
+    manual = [qos.liveliness == EndpointQos.MANUAL_BY_TOPIC for qos in opposite]
+    is_manual = any(manual) if is_writer else all(manual)
+    return EndpointQos(
+        reliability=policy(
+            "reliability",
+            EndpointQos.RELIABLE,
+            (EndpointQos.RELIABLE, EndpointQos.BEST_EFFORT),
+            EndpointQos.RELIABLE if is_writer or all_reliable else EndpointQos.BEST_EFFORT,
+        ),
+        durability=policy(
+            "durability",
+            EndpointQos.VOLATILE,
+            _DDS_DURABILITY,
+            EndpointQos.TRANSIENT_LOCAL if is_writer or all_latched else EndpointQos.VOLATILE,
+        ),
+        history=policy(
+            "history",
+            EndpointQos.KEEP_LAST,
+            (EndpointQos.KEEP_LAST, EndpointQos.KEEP_ALL),
+            EndpointQos.KEEP_LAST,
+        ),
+        depth=depth or 1,
+        deadline=duration("deadline"),
+        lifespan=duration("lifespan"),
+        liveliness=policy(
+            "liveliness",
+            EndpointQos.AUTOMATIC,
+            (EndpointQos.AUTOMATIC, EndpointQos.MANUAL_BY_TOPIC),
+            EndpointQos.MANUAL_BY_TOPIC if is_manual else EndpointQos.AUTOMATIC,
+        ),
+        liveliness_lease_duration=duration("liveliness_lease_duration"),
+    )
+
+
+@contextmanager
+def dds_qos(qos: EndpointQos, data: str, ignore_own: bool = False) -> Iterator[int]:
+    """A dds_qos_t with these policies and USER_DATA, deleted at the end."""
+    handle = lib.dds_create_qos()
+    try:
+        is_latched = qos.durability == EndpointQos.TRANSIENT_LOCAL
+        keeps_all = qos.history == EndpointQos.KEEP_ALL
+        history = (1, -1) if keeps_all else (0, qos.depth)
+        lib.dds_qset_writer_data_lifecycle(handle, False)
+        lib.dds_qset_history(handle, *history)
+        lib.dds_qset_reliability(
+            handle, int(qos.reliability == EndpointQos.RELIABLE), _LONGEST_BLOCK
+        )
+        lib.dds_qset_durability(handle, int(is_latched))
+        if is_latched:
+            lib.dds_qset_durability_service(handle, 0, *history, -1, -1, -1)
+        if qos.lifespan:
+            lib.dds_qset_lifespan(handle, qos.lifespan)
+        if qos.deadline:
+            lib.dds_qset_deadline(handle, qos.deadline)
+        lib.dds_qset_liveliness(
+            handle,
+            _DDS_LIVELINESS.index(qos.liveliness),
+            qos.liveliness_lease_duration or INFINITY,
+        )
+        lib.dds_qset_data_representation(handle, 1, (ct.c_int16 * 1)(0))
+        lib.dds_qset_ignorelocal(handle, int(ignore_own))
+        lib.dds_qset_userdata(handle, data.encode(), len(data.encode()))
+        yield handle
+    finally:
+        lib.dds_delete_qos(handle)
+
+
+@contextmanager
+def participant_qos(data: str) -> Iterator[int]:
+    """A dds_qos_t with nothing but USER_DATA, deleted at the end."""
+    handle = lib.dds_create_qos()
+    try:
+        lib.dds_qset_userdata(handle, data.encode(), len(data.encode()))
+        yield handle
+    finally:
+        lib.dds_delete_qos(handle)
+
+
+def read_qos(handle: int | None) -> EndpointQos:
+    """The policies in a dds_qos_t."""
+    kind, depth = ct.c_int(), ct.c_int32()
+    duration = ct.c_int64()
+    qos = EndpointQos()
+    if not handle:
+        return qos
+    if lib.dds_qget_reliability(handle, ct.byref(kind), None):
+        qos = replace(qos, reliability=EndpointQos.RELIABLE if kind.value else 2)
+    if lib.dds_qget_durability(handle, ct.byref(kind)):
+        qos = replace(qos, durability=_DDS_DURABILITY[min(kind.value, 1)])
+    if lib.dds_qget_history(handle, ct.byref(kind), ct.byref(depth)):
+        keeps_all = kind.value == 1
+        qos = replace(qos, history=1 + keeps_all, depth=0 if keeps_all else depth.value)
+    if lib.dds_qget_liveliness(handle, ct.byref(kind), ct.byref(duration)):
+        lease = _specified(duration.value)
+        qos = replace(qos, liveliness=_DDS_LIVELINESS[kind.value], liveliness_lease_duration=lease)
+    if lib.dds_qget_deadline(handle, ct.byref(duration)):
+        qos = replace(qos, deadline=_specified(duration.value))
+    if lib.dds_qget_lifespan(handle, ct.byref(duration)):
+        qos = replace(qos, lifespan=_specified(duration.value))
+    return qos
+
+
+def user_data(handle: int | None) -> dict[str, str]:
+    """The ``key=value;`` pairs in a dds_qos_t's USER_DATA."""
+    value, size = ct.c_void_p(), ct.c_size_t()
+    if not handle or not lib.dds_qget_userdata(handle, ct.byref(value), ct.byref(size)):
+        return {}
+    if not value.value:
+        return {}
+    text = ct.string_at(value.value, size.value).decode("utf-8", "replace")
+    lib.dds_free(value)
+    pairs = (part.partition("=") for part in text.split(";") if "=" in part)
+    return {key: content for key, _, content in pairs}
+
+
+def _specified(duration: int) -> int:
+    return 0 if duration in _UNSPECIFIED else duration

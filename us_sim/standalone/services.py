@@ -1,0 +1,186 @@
+"""Requests and responses as rmw_cyclonedds maps services to DDS topics.
+
+A request carries, after the CDR header, the client's number (64 bits) and a sequence number
+(64 bits), which the response repeats. Both endpoints of a server, or of a client, share an id in
+their USER_DATA, so that a client knows when both directions are connected.
+"""
+
+from __future__ import annotations
+
+import ctypes as ct
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+from us_sim.standalone.ddsc import check, lib
+from us_sim.standalone.interfaces import type_hash
+from us_sim.standalone.transport import Participant
+
+__all__ = ["RequestHeader", "ServiceClient", "ServiceServer"]
+
+_HEADER = struct.Struct("<Qq")
+_LONGEST_WAIT = 0.1  # s, for a client's reader to be discovered, as rmw_cyclonedds waits
+
+_endpoint_numbers = count(1)
+_request_numbers = count(1)
+
+
+@dataclass(frozen=True)
+class RequestHeader:
+    """Which request of which client, and when.
+
+    Attributes:
+        client: the client's number.
+        sequence: the request's number.
+        publication_handle: this process's number for the writer of the request or response.
+        source_timestamp, received_timestamp: ns since 1970.
+    """
+
+    client: int
+    sequence: int
+    publication_handle: int
+    source_timestamp: int
+    received_timestamp: int
+
+
+class _ServiceEndpoint:
+    """A writer of one direction and a reader of the other."""
+
+    def __init__(
+        self, participant: Participant, service: str, type_name: str, qos: Any, is_server: bool
+    ) -> None:
+        package, folder, name = type_name.split("/")
+        number = next(_endpoint_numbers)
+        identity = participant.gid[:12] + number.to_bytes(4, "big")
+        key = "serviceid" if is_server else "clientid"
+        self._id = ".".join(f"{byte:x}" for byte in identity)
+
+        def arguments(prefix: str, suffix: str, part: str) -> tuple[str, str, Any, str]:
+            return (
+                f"{prefix}{service}{suffix}",
+                f"{package}::{folder}::dds_::{name}_{part}_",
+                qos,
+                f"{key}={self._id};typehash={type_hash(f'{type_name}_{part}')};",
+            )
+
+        request = arguments("rq", "Request", "Request")
+        response = arguments("rr", "Reply", "Response")
+        self._writer = participant.create_writer(*(response if is_server else request))
+        self._reader = participant.create_reader(*(request if is_server else response))
+
+    @property
+    def on_data(self) -> Callable[[], None] | None:
+        """Called from another thread when a request or response may be waiting."""
+        return self._reader.on_data
+
+    @on_data.setter
+    def on_data(self, callback: Callable[[], None] | None) -> None:
+        self._reader.on_data = callback
+
+    @property
+    def reader_gid(self) -> bytes:
+        return self._reader.gid
+
+    @property
+    def writer_gid(self) -> bytes:
+        return self._writer.gid
+
+    def close(self) -> None:
+        """Leave both topics."""
+        self._reader.close()
+        self._writer.close()
+
+    def _take(self) -> tuple[bytes, RequestHeader] | None:
+        while (sample := self._reader.take()) is not None:
+            data, info = sample
+            if len(data) < 4 + _HEADER.size:
+                continue
+            client, sequence = _HEADER.unpack_from(data, 4)
+            header = RequestHeader(
+                client,
+                sequence,
+                info.publication_handle,
+                info.source_timestamp,
+                info.received_timestamp,
+            )
+            return data[:4] + data[4 + _HEADER.size :], header
+        return None
+
+    def _send(self, data: bytes, client: int, sequence: int) -> bool:
+        return self._writer.write_parts(
+            data[:4] + _HEADER.pack(client, sequence), memoryview(data)[4:]
+        )
+
+
+class ServiceServer(_ServiceEndpoint):
+    """Takes requests for a service and sends the responses."""
+
+    def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
+        """Offer a service.
+
+        Args:
+            service: the full ROS name, ``/node/get_parameters``.
+            type_name: ``rcl_interfaces/srv/GetParameters``.
+            qos: rclpy's QoSProfile or an EndpointQos.
+        """
+        super().__init__(participant, service, type_name, qos, is_server=True)
+
+    def take_request(self) -> tuple[bytes, RequestHeader] | None:
+        """The next request, serialized, and what its response needs; None if there is none."""
+        return self._take()
+
+    def send_response(self, data: bytes, header: RequestHeader) -> bool:
+        """Answer a request; False if the client's reader was not there within 0.1 s."""
+        deadline = time.monotonic() + _LONGEST_WAIT
+        while not self._client_listens(header.publication_handle):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.002)
+        return self._send(data, header.client, header.sequence)
+
+    def _client_listens(self, request_writer: int) -> bool:
+        """Whether the response would be received, or there is nobody left to receive it."""
+        client = self._reader.user_data_of(request_writer)
+        if client is None or "clientid" not in client:
+            return True
+        readers = self._writer.matched_user_data()
+        return any(reader.get("clientid") == client["clientid"] for reader in readers)
+
+
+class ServiceClient(_ServiceEndpoint):
+    """Sends requests to a service and takes the responses to its own."""
+
+    def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
+        """Prepare to call a service; arguments as for `ServiceServer`."""
+        super().__init__(participant, service, type_name, qos, is_server=False)
+        handle = ct.c_uint64()
+        check(
+            lib.dds_get_instance_handle(self._writer._handle, ct.byref(handle)),
+            f"no client can be made for {service!r}",
+        )
+        self._number = handle.value
+
+    def service_is_ready(self) -> bool:
+        """Whether a server is connected in both directions."""
+        readers = self._writer.matched_user_data()
+        writers = self._reader.matched_user_data()
+        servers = {reader["serviceid"] for reader in readers if "serviceid" in reader}
+        if not servers:
+            return bool(readers and writers)
+        return any(writer.get("serviceid") in servers for writer in writers)
+
+    def send_request(self, data: bytes) -> int:
+        """Send a serialized request; returns its sequence number."""
+        sequence = next(_request_numbers)
+        self._send(data, self._number, sequence)
+        return sequence
+
+    def take_response(self) -> tuple[bytes, RequestHeader] | None:
+        """The next response to one of this client's requests; None if there is none."""
+        while (response := self._take()) is not None:
+            if response[1].client == self._number:
+                return response
+        return None
