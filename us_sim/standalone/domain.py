@@ -30,8 +30,8 @@ _MOST_PARTICIPANTS = 64
 _UNACKNOWLEDGED = "32 MB"
 _SOCKET_BUFFER = "8 MB"
 
-# How long each writer that is closed waits for a reader that acknowledges nothing; Cyclone's own 1 s
-# for each would keep a process from ending after a peer hung or was killed.
+# How long a writer that is closed waits for a reader that acknowledges nothing. Cyclone's own 1 s
+# for each writer would keep a process from ending after a peer hung or was killed.
 _LINGER = "100 ms"
 
 
@@ -80,7 +80,8 @@ class DiscoveryRange:
             general += "<AllowMulticast>false</AllowMulticast>"
         if self.name == "OFF":
             # Nobody else has this tag, so nobody is found even on the same host.
-            discovery += f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
+            tag = f"ros_discovery_off_{os.getpid()}"
+            discovery += f"<ParticipantIndex>none</ParticipantIndex><Tag>{tag}</Tag>"
         elif self.name != "SYSTEM_DEFAULT":
             discovery += (
                 "<ParticipantIndex>auto</ParticipantIndex>"

@@ -156,7 +156,7 @@ class Writer(_Endpoint):
             whole[0] = whole[0][:3] + bytes([padding]) + whole[0][4:]
             whole.append(bytes(padding))
         vectors = (IoVector * len(whole))(
-            *(IoVector(ct.cast(part, ct.c_void_p), len(part)) for part in whole)
+            *(IoVector(ct.cast(ct.c_char_p(part), ct.c_void_p), len(part)) for part in whole)
         )
         if self._closed:
             raise DdsError("the writer is closed, so nothing can be published with it")
