@@ -37,6 +37,7 @@ __all__ = ["MAGIC", "McapFile"]
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of compression name
 
 # What the parsers raise when the bytes are not what they should be.
@@ -103,17 +104,17 @@ class McapFile:
             if channel.topic in topics
         }
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
+        # Of messages with the same log time the one that is earlier in the file comes first.
         pending: list[tuple[int, int, int, BagMessage]] = []
         with self._path.open("rb") as stream:
-            for number, run in enumerate(self._runs):
-                while pending and pending[0][0] <= run.start:
+            for run in self._runs:
+                while pending and pending[0][0] < run.start:
                     yield heapq.heappop(pending)[-1]
                 for index, content in enumerate(self._run_messages(stream, run)):
-                    channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
+                    channel, log_time, publish_time, data = content
                     if channel in wanted:
-                        data = bytes(content[_MESSAGE.size :])
-                        message = BagMessage(*wanted[channel], log_time, publish_time, data)
-                        heapq.heappush(pending, (log_time, number, index, message))
+                        message = BagMessage(*wanted[channel], log_time, publish_time, bytes(data))
+                        heapq.heappush(pending, (log_time, run.offset, index, message))
         while pending:
             yield heapq.heappop(pending)[-1]
 
@@ -186,11 +187,15 @@ class McapFile:
         if first is not None:
             self._runs.append(_Run(first, offset, length))
 
-    def _run_messages(self, stream: BinaryIO, run: _Run) -> Iterator[memoryview]:
+    def _run_messages(
+        self, stream: BinaryIO, run: _Run
+    ) -> Iterator[tuple[int, int, int, memoryview]]:
+        """Channel, log time, publish time and data of each message of a run."""
         try:
             for opcode, content in _records(stream, run.offset, run.length, self._label):
                 if opcode == Opcode.MESSAGE:
-                    yield content
+                    channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
+                    yield channel, log_time, publish_time, content[_MESSAGE.size :]
         except _DAMAGE as error:
             raise BagError(
                 f"{self._label} is damaged in its chunk at byte {run.offset}: {error}"
@@ -204,7 +209,9 @@ class McapFile:
                 name=channel.topic,
                 type_name=_type_name(schema),
                 message_count=self._counts[id],
-                qos=qos_from_yaml(channel.metadata.get("offered_qos_profiles")),
+                qos=qos_from_yaml(
+                    channel.metadata.get("offered_qos_profiles"), f"{self._label}, {channel.topic}"
+                ),
                 type_hash=channel.metadata.get("topic_type_hash", ""),
                 encoding=channel.message_encoding,
                 schema=_schema_text(schema),
@@ -215,23 +222,32 @@ class McapFile:
 
 
 def _summary(stream: BinaryIO) -> Summary | None:
-    """The summary of a file that has one with statistics and an index of its messages."""
-    try:
-        stream.seek(-len(MAGIC), 2)
-        if stream.read() != MAGIC:
+    """The summary of a file that has a sound one, with statistics and an index of its messages."""
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - _FOOTER.size - len(MAGIC)))
+    tail = stream.read()
+    if len(tail) != _FOOTER.size + len(MAGIC) or not tail.endswith(MAGIC):
+        return None
+    _, _, start, _, crc = _FOOTER.unpack_from(tail)
+    if not 0 < start < size:
+        return None
+    if crc:
+        stream.seek(start)
+        # The checksum covers the summary and the footer up to the checksum itself.
+        if zlib.crc32(stream.read(size - start - len(MAGIC) - 4)) != crc:
             return None
-        stream.seek(0)
+    stream.seek(0)
+    try:
         summary = SeekingReader(stream).get_summary()
-    except (*_DAMAGE, OSError):
+    except _DAMAGE:
         return None
     if summary is None or summary.statistics is None:
         return None
-    statistics = summary.statistics
-    indexed = len(summary.chunk_indexes) == statistics.chunk_count
-    if not indexed or (statistics.message_count and not summary.chunk_indexes):
-        return None
+    statistics, chunks = summary.statistics, summary.chunk_indexes
+    indexed = len(chunks) == statistics.chunk_count and (chunks or not statistics.message_count)
+    within = all(chunk.chunk_start_offset + chunk.chunk_length <= start for chunk in chunks)
     described = summary.channels.keys() >= statistics.channel_message_counts.keys()
-    return summary if described else None
+    return summary if indexed and within and described else None
 
 
 def _records(
@@ -260,6 +276,8 @@ def _chunk_records(content: memoryview, *, whole: bool, label: str) -> memoryvie
     """The records in a chunk, decompressed; of a chunk that is cut, those before the cut."""
     _, _, size, crc, name_length = _CHUNK.unpack_from(content)
     begin = _CHUNK.size + name_length + 8
+    if begin > len(content):
+        raise ValueError("its header is cut")
     compression = bytes(content[_CHUNK.size : _CHUNK.size + name_length]).decode()
     packed = content[begin:]
     if compression == "":

@@ -111,7 +111,9 @@ def read_metadata(file: Path) -> BagMetadata:
             )
         return BagMetadata(
             files=tuple(FileEntry(str(path)) for path in information["relative_file_paths"] or ()),
-            topics=tuple(map(_topic_entry, information["topics_with_message_count"] or ())),
+            topics=tuple(
+                _topic_entry(item, file) for item in information["topics_with_message_count"] or ()
+            ),
             start=int(information["starting_time"]["nanoseconds_since_epoch"]),
             duration=int(information["duration"]["nanoseconds"]),
             message_count=int(information["message_count"]),
@@ -130,12 +132,12 @@ def read_metadata(file: Path) -> BagMetadata:
         raise BagError(f"{file} is not the metadata of a bag: {reason}") from None
 
 
-def _topic_entry(item: Mapping) -> TopicEntry:
+def _topic_entry(item: Mapping, file: Path) -> TopicEntry:
     topic = item["topic_metadata"]
     return TopicEntry(
         name=str(topic["name"]),
         type_name=str(topic["type"]),
-        qos=qos_from_yaml(topic.get("offered_qos_profiles")),
+        qos=qos_from_yaml(topic.get("offered_qos_profiles"), f"{file}, {topic['name']}"),
         type_hash=str(topic.get("type_description_hash") or ""),
         message_count=int(item["message_count"]),
         encoding=str(topic["serialization_format"]),

@@ -126,22 +126,29 @@ def qos_to_yaml(profiles: Sequence[QosProfile]) -> str:
     return "\n".join(items)
 
 
-def qos_from_yaml(document: object) -> tuple[QosProfile, ...]:
+def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:
     """The profiles of a bag of any version: YAML text, or the list that it parses to.
+
+    Args:
+        document: the text or the list; nothing at all stands for no profiles.
+        where: what errors begin with.
 
     Raises:
         BagError: the text is not YAML, or not a list of profiles.
     """
-    if isinstance(document, str):
-        try:
+    try:
+        if isinstance(document, str):
             document = yaml.safe_load(document)
-        except yaml.YAMLError as error:
-            raise BagError(f"offered_qos_profiles is not YAML: {_first_line(error)}") from None
-    if document is None or document == "":
-        return ()
-    if not isinstance(document, list):
-        raise BagError("offered_qos_profiles is not a list of profiles")
-    return tuple(QosProfile.of(item) for item in document)
+        if document is None or document == "":
+            return ()
+        if not isinstance(document, list):
+            raise BagError("this is not a list of QoS profiles")
+        return tuple(QosProfile.of(item) for item in document)
+    except yaml.YAMLError as error:
+        reason = str(error).splitlines()[0]
+        raise BagError(f"{where}: the QoS profiles are not YAML: {reason}") from None
+    except BagError as error:
+        raise BagError(f"{where}: {error}") from None
 
 
 def _policy_name(policy: str, value: Any) -> str:
@@ -167,7 +174,3 @@ def _nanoseconds(duration: str, value: Any) -> int:
 
 def _duration_lines(name: str, nanoseconds: int) -> list[str]:
     return [f"{name}:", f"  sec: {nanoseconds // 10**9}", f"  nsec: {nanoseconds % 10**9}"]
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import zstandard
+from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata
@@ -125,15 +126,7 @@ class Bag:
                 f"{self.path} holds {topic.name} in the encoding {topic.encoding!r}: only cdr, "
                 f"what ROS 2 writes, can be read"
             )
-        if topic.schema is not None:
-            store = definitions(topic.type_name, topic.schema)
-        else:
-            store = jazzy_definitions()
-            if topic.type_name not in store.fielddefs:
-                raise BagError(
-                    f"{self.path} holds {topic.name} of type {topic.type_name} without its "
-                    f"definition: record it again with MCAP, which carries definitions"
-                )
+        store = self._definitions(topic)
         try:
             return store.deserialize_cdr(message.data, topic.type_name)
         except Exception as error:
@@ -166,6 +159,21 @@ class Bag:
                 for topic in sorted(self.topics, key=lambda topic: topic.name)
             ],
         }
+
+    def _definitions(self, topic: BagTopic) -> Typestore:
+        """The definition of a topic's type: the bag's own, else that of Jazzy."""
+        if topic.schema is not None:
+            try:
+                return definitions(topic.type_name, topic.schema)
+            except BagError as error:
+                raise BagError(f"{self.path}, {topic.name}: {error}") from None
+        store = jazzy_definitions()
+        if topic.type_name not in store.fielddefs:
+            raise BagError(
+                f"{self.path} holds {topic.name} of type {topic.type_name} without its "
+                f"definition: record it again with MCAP, which carries definitions"
+            )
+        return store
 
 
 def read_bag(path: str | Path) -> Bag:

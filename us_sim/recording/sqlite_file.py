@@ -36,7 +36,7 @@ class SqliteFile:
         self._label = label or str(path)
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                self.topics = tuple(_topics(database))
+                self.topics = tuple(_topics(database, self._label))
                 self.start, self.end = database.execute(
                     "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
                 ).fetchone()
@@ -64,7 +64,7 @@ class SqliteFile:
             raise BagError(f"{self._label} is damaged: {error}") from None
 
 
-def _topics(database: sqlite3.Connection) -> Iterator[BagTopic]:
+def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
     """Topics of a file of any schema version; the columns tell what it carries."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(topics)")}
     qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
@@ -87,7 +87,7 @@ def _topics(database: sqlite3.Connection) -> Iterator[BagTopic]:
             name=name,
             type_name=normalized_type(type_name),
             message_count=count,
-            qos=qos_from_yaml(profiles),
+            qos=qos_from_yaml(profiles, f"{label}, {name}"),
             type_hash=digest or "",
             encoding=encoding,
             schema=schemas.get(type_name),

@@ -1,0 +1,172 @@
+"""Probe paths: the poses that real bags and our own hold, and every reason to have none."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from us_sim.errors import BagError
+from us_sim.recording.path import POSE_STAMPED, ProbePath, read_path, write_path
+from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
+
+EPOCH = 1_700_000_000_000_000_000
+HI = bytes.fromhex("00010000 03000000 686900")
+
+
+def path_of(positions, orientations=None, **fields):
+    positions = np.asarray(positions, dtype=float)
+    if orientations is None:
+        orientations = np.tile([0.0, 0, 0, 1], (len(positions), 1))
+    stamps = EPOCH + 10**7 * np.arange(len(positions))
+    return ProbePath("/tracker/pose", "patient", stamps, positions, orientations, **fields)
+
+
+@pytest.mark.parametrize("name", ["mcap", "chunkzstd", "zstd", "sqlite3"])
+def test_real_bags_hold_the_path_that_was_published(shared_data, name):
+    path = read_path(shared_data / f"ros2-jazzy/bags/probe_path_{name}")
+    assert (path.topic, path.frame_id, path.rejected, path.note) == (
+        "/tracker/pose",
+        "patient",
+        0,
+        "",
+    )
+    assert len(path) in (273, 275)
+    x, y, z = path.positions.T
+    # The recorder missed the first poses, so the first z says with which k the bag begins.
+    k = round(z[0] * 60 * 2 / 0.02) + np.arange(len(path))
+    t = np.minimum(k / 60, 4.0)
+    np.testing.assert_allclose(z, np.minimum(0.01 * t, 0.02), atol=1e-12)
+    np.testing.assert_allclose(x, np.clip(0.02 * (t - 2), 0, 0.04), atol=1e-12)
+    np.testing.assert_array_equal(y, 0)
+    angle = 2 * np.degrees(np.arctan2(path.orientations[:, 0], path.orientations[:, 3]))
+    np.testing.assert_allclose(angle, 10 * np.sin(np.pi * k / 60 / 2), atol=1e-9)
+    assert np.diff(path.stamps).mean() == pytest.approx(1e9 / 60, rel=0.01)
+    assert path.duration == pytest.approx(len(path) / 60, abs=0.1)
+
+
+finite = st.floats(-1e3, 1e3)
+poses = st.integers(1, 20).flatmap(
+    lambda count: st.tuples(
+        arrays.arrays(np.int64, count, elements=st.integers(0, 2**31 * 10**9 - 1)),
+        arrays.arrays(np.float64, (count, 3), elements=finite),
+        arrays.arrays(np.float64, (count, 4), elements=st.floats(0.01, 1)),
+    )
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(poses, st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9))
+def test_round_trip_to_the_bit_with_stamps_that_go_back(tmp_path_factory, poses, frame_id):
+    stamps, positions, orientations = poses
+    log_times = EPOCH + np.arange(len(stamps))
+    path = ProbePath("/a/pose", frame_id, stamps, positions, orientations, log_times)
+    file = tmp_path_factory.mktemp("path") / "path.mcap"
+    write_path(file, path)
+    read = read_path(file)
+    assert (read.topic, read.frame_id) == ("/a/pose", frame_id)
+    for array in ("stamps", "positions", "orientations", "log_times"):
+        np.testing.assert_array_equal(getattr(read, array), getattr(path, array))
+
+
+def test_a_written_pose_is_what_rclpy_serializes(shared_data, tmp_path):
+    path = ProbePath(
+        "/tracker/pose",
+        "patient",
+        np.array([1732147200_123456789]),
+        np.array([[0.012, -0.034, 0.056]]),
+        np.array([[0.5, -0.5, 0.5, 0.5]]),
+    )
+    write_path(tmp_path / "path.mcap", path)
+    (message,) = read_bag(tmp_path).messages()
+    sample = (shared_data / "ros2-jazzy/messages.json").read_text().split('"cdr_hex": "')[1]
+    assert message.data.hex() == sample.split('"')[0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_poses_that_are_not_finite_are_left_out_and_counted(tmp_path, bad):
+    positions = np.zeros((10, 3))
+    positions[3:5, 1] = bad
+    write_path(tmp_path / "path.mcap", path_of(positions))
+    path = read_path(tmp_path)
+    assert (len(path), path.rejected) == (8, 2)
+    assert path.stamps.tolist() == [EPOCH + 10**7 * k for k in (0, 1, 2, 5, 6, 7, 8, 9)]
+    assert path.note.startswith("2 of the 10 poses on /tracker/pose are not finite")
+    assert path.note.endswith("the first being number 4")
+
+
+def test_poses_without_orientation_are_left_out_and_counted(tmp_path):
+    orientations = np.tile([0.0, 0, 0, 1], (4, 1))
+    orientations[0] = 0
+    write_path(tmp_path / "path.mcap", path_of(np.zeros((4, 3)), orientations))
+    assert (len(read_path(tmp_path)), read_path(tmp_path).rejected) == (3, 1)
+
+
+def test_no_usable_pose_at_all(tmp_path):
+    write_path(tmp_path / "path.mcap", path_of(np.full((3, 3), np.nan)))
+    with pytest.raises(BagError, match="no usable pose: 3 of the 3 poses"):
+        read_path(tmp_path)
+
+
+def test_a_path_that_was_cut_is_played_as_far_as_it_goes(tmp_path):
+    file = tmp_path / "path.mcap"
+    write_path(file, path_of(np.random.default_rng(0).normal(size=(500, 3))))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    path = read_path(file)
+    assert 100 < len(path) < 500
+    assert f"{len(path)} messages over" in path.note
+
+
+def test_which_topic(tmp_path):
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.add_topic("/note", "std_msgs/msg/String")
+        bag.write("/note", HI, EPOCH)
+        bag.flush()
+        with pytest.raises(BagError, match=r"no topic of .*PoseStamped; it has /note \(std_msgs"):
+            read_path(tmp_path / "bag.mcap")
+        for topic in ("/tracker/pose", "/probe/pose"):
+            bag.add_topic(topic, POSE_STAMPED)
+    with pytest.raises(BagError, match="several topics: name one of /probe/pose, /tracker/pose"):
+        read_path(tmp_path)
+    with pytest.raises(BagError, match="/note as std_msgs/msg/String: a path needs geometry_msgs"):
+        read_path(tmp_path, "note")
+    with pytest.raises(BagError, match="no topic /haptic/pose; it has /note, /probe/pose"):
+        read_path(tmp_path, "/haptic/pose")
+    with pytest.raises(BagError, match="holds no pose on /probe/pose; it is silent"):
+        read_path(tmp_path, "probe/pose")
+
+
+def test_another_encoding(shared_data, tmp_path):
+    wrong = shared_data / "mcap-rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test"
+    with pytest.raises(BagError, match="no topic of geometry_msgs/msg/PoseStamped"):
+        read_path(wrong)
+    file = tmp_path / "path.mcap"
+    write_path(file, path_of(np.zeros((3, 3))))
+    with BagWriter(tmp_path / "xcdr2.mcap", sidecar=False) as bag:
+        bag.add_topic("/tracker/pose", POSE_STAMPED)
+        for message in read_bag(file).messages():
+            bag.write("/tracker/pose", b"\0\7" + message.data[2:], message.log_time)
+    with pytest.raises(BagError, match="that is no geometry_msgs/msg/PoseStamped"):
+        read_path(tmp_path / "xcdr2.mcap")
+
+
+def test_several_frames_are_refused(tmp_path):
+    for k, frame in enumerate(["patient", "camera_optical"]):
+        one = path_of(np.zeros((2, 3)))
+        path = ProbePath("/tracker/pose", frame, one.stamps, one.positions, one.orientations)
+        write_path(tmp_path / f"path_{k}.mcap", path, sidecar=False)
+    with pytest.raises(BagError, match="frames patient, camera_optical: a path has one frame"):
+        read_path(tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["missing.mcap", "empty.mcap"])
+def test_no_bag(tmp_path, missing):
+    (tmp_path / "empty.mcap").touch()
+    with pytest.raises(BagError, match=missing):
+        read_path(tmp_path / missing)
+
+
+def test_arrays_of_different_lengths():
+    with pytest.raises(BagError, match="a path of 2 stamps"):
+        ProbePath("/p", "patient", np.arange(2), np.zeros((3, 3)), np.zeros((2, 4)))

@@ -1,0 +1,426 @@
+"""Reading bags: real ones against rosbags and mcap, cut ones, damaged ones, no bags at all."""
+
+import shutil
+import sqlite3
+
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import MessageIndex
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from us_sim.errors import BagError
+from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
+
+STRING = "std_msgs/msg/String"
+EPOCH = 1_700_000_000_000_000_000
+HI = bytes.fromhex("00010000 03000000 686900")
+
+
+def write_session(path, compression="none", chunk_size=2000, count=200):
+    with BagWriter(path, compression=compression, chunk_size=chunk_size) as bag:
+        for topic in ("/a", "/b"):
+            bag.add_topic(topic, STRING)
+        for k in range(count):
+            bag.write("/b" if k % 5 == 0 else "/a", HI + bytes([k]), EPOCH + k * 10**7, EPOCH + k)
+    return path
+
+
+def contents_by_mcap(file):
+    """Topic, log time, publish time and bytes of each message, as the mcap package reads them."""
+    with file.open("rb") as stream:
+        return [
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(stream).iter_messages()
+        ]
+
+
+@pytest.mark.parametrize("name", ["mcap", "chunkzstd", "zstd", "sqlite3"])
+def test_real_bags_as_rosbags_reads_them(shared_data, name):
+    folder = shared_data / f"ros2-jazzy/bags/probe_path_{name}"
+    bag = read_bag(folder)
+    with AnyReader([folder]) as reader:
+        expected = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
+        assert (bag.start, bag.end + 1) == (reader.start_time, reader.end_time)
+        for connection in reader.connections:
+            topic = bag.topic(connection.topic)
+            assert topic.type_name == connection.msgtype
+            assert topic.type_hash == connection.digest
+            assert topic.message_count == connection.msgcount
+            assert [q.depth for q in topic.qos] == [
+                q.depth for q in connection.ext.offered_qos_profiles
+            ]
+    read = [(m.topic, m.log_time, m.data) for m in bag.messages()]
+    assert read == expected
+    assert len(read) == bag.message_count == bag.metadata.message_count
+    assert bag.complete
+
+
+def test_real_publish_times_as_mcap_reads_them(shared_data):
+    file = shared_data / "ros2-jazzy/bags/probe_path_mcap/probe_path_mcap_0.mcap"
+    expected = contents_by_mcap(file)
+    assert [(m.topic, *m[2:]) for m in read_bag(file).messages()] == expected
+
+
+def test_real_images_are_what_was_published(shared_data):
+    bag = read_bag(shared_data / "ros2-jazzy/bags/probe_path_sqlite3")
+    images = [bag.deserialize(message) for message in bag.messages(["camera/image_raw"])]
+    assert len(images) == 68
+    for image in images:
+        pixels = image.data.reshape(image.height, image.width).astype(int)
+        assert pixels.shape == (48, 64)
+        rows, columns = range(48), range(64)
+        first = pixels[0, 0]
+        assert all(
+            pixels[row, column] == (first + row + column) % 256
+            for row in rows
+            for column in columns
+        )
+
+
+def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared_data):
+    root = shared_data / "mcap-rosbag2"
+    folders = {file.parent for file in root.rglob("metadata.yaml")} - set(root.rglob("empty_bag"))
+    files = set(root.rglob("*.mcap"))
+    assert (len(folders), len(files)) == (10, 20)
+    for path in sorted(folders | files):
+        bag = read_bag(path)
+        read = [(m.topic, m.log_time, m.data) for m in bag.messages()]
+        assert len(read) == bag.message_count > 0
+        assert [time for _, time, _ in read] == sorted(time for _, time, _ in read)
+        if "wrong_rmw" in str(path):
+            with pytest.raises(BagError, match="encoding 'wrong_format': only cdr"):
+                bag.deserialize(next(bag.messages()))
+            continue
+        parts = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+        expected = [content for part in parts for content in contents_by_mcap(part)]
+        assert sorted(read) == sorted(content[:2] + content[3:] for content in expected), path
+        if path.is_file():
+            with Reader(path) as reader:
+                by_rosbags = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
+            assert sorted(read) == sorted(by_rosbags)
+        for message in bag.messages():
+            if message.type_name.endswith("_Event"):
+                with pytest.raises(BagError, match="_Event cannot be understood"):
+                    bag.deserialize(message)
+            else:
+                bag.deserialize(message)
+
+
+def test_known_contents_of_rosbag2s_own_tests(shared_data):
+    root = shared_data / "mcap-rosbag2"
+    talker = read_bag(root / "rosbag2_py/test/resources/mcap/talker")
+    words = [talker.deserialize(message).data for message in talker.messages(["/topic"])]
+    assert words == [f"Hello, world! {k}" for k in range(10)]
+    seek = read_bag(root / "rosbag2_transport/test/resources/mcap/test_bag_for_seek")
+    assert [topic.type_name for topic in seek.topics] == ["test_msgs/msg/BasicTypes"]
+    assert [seek.deserialize(m).int32_value for m in seek.messages()] == [1, 2, 3, 4, 5]
+    with pytest.raises(BagError, match=r"empty_bag_0.db3, which is not there"):
+        read_bag(root / "ros2bag/test/resources/empty_bag")
+    with pytest.raises(BagError, match=r"several bags.*only_services.mcap, only_topics.mcap"):
+        read_bag(root / "rosbag2_cpp/test/rosbag2_cpp/bags")
+
+
+def test_files_of_a_split_bag_are_read_in_their_order_without_metadata(shared_data, tmp_path):
+    folder = shared_data / "mcap-rosbag2/rosbag2_py/test/resources/mcap/reindex_test_bags"
+    split = read_bag(folder / "multiple_files")
+    assert split.message_count == 1324 + 1324 + 529
+    for old, new in [(0, 9), (1, 10), (2, 11)]:
+        shutil.copy(
+            folder / f"multiple_files/multiple_files_{old}.mcap", tmp_path / f"b_{new}.mcap"
+        )
+    assert list(read_bag(tmp_path).messages()) == list(split.messages())
+
+
+def test_the_real_recorder_killed_left_nothing(shared_data):
+    with pytest.raises(BagError, match="is empty: its recorder was ended before"):
+        read_bag(shared_data / "ros2-jazzy/bags/probe_path_killed")
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """Whole files by their compression."""
+    folder = tmp_path_factory.mktemp("sessions")
+    return {c: write_session(folder / c / "session.mcap", c) for c in ("none", "zstd")}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data(), st.sampled_from(["none", "zstd"]))
+def test_a_file_cut_anywhere_gives_what_was_before_the_cut(
+    tmp_path_factory, sessions, data, compression
+):
+    content = sessions[compression].read_bytes()
+    cut = data.draw(st.integers(1, len(content) - 1))
+    file = tmp_path_factory.mktemp("cut") / "session.mcap"
+    file.write_bytes(content[:cut])
+    if cut < 8:
+        with pytest.raises(BagError, match="is not a bag"):
+            read_bag(file)
+        return
+    bag = read_bag(file)
+    read = list(bag.messages())
+    assert read == list(read_bag(sessions[compression]).messages())[: len(read)]
+    assert bag.message_count == len(read)
+    assert not bag.complete
+    assert f"{len(read)} messages over" in bag.note
+
+
+def test_a_cut_in_the_header_of_a_chunk(tmp_path, sessions):
+    content = sessions["zstd"].read_bytes()
+    packed = content.index(b"\x28\xb5\x2f\xfd", content.index(b"\x28\xb5\x2f\xfd") + 1)
+    file = tmp_path / "session.mcap"
+    for cut in range(packed - 60, packed + 10):
+        file.write_bytes(content[:cut])
+        bag = read_bag(file)
+        assert not bag.complete
+        assert len(list(bag.messages())) == bag.message_count > 20
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_a_file_cut_before_its_last_chunk_loses_only_that(tmp_path, sessions, compression):
+    whole = sessions[compression]
+    with whole.open("rb") as stream:
+        last = make_reader(stream).get_summary().chunk_indexes[-1]
+    file = tmp_path / "session.mcap"
+    file.write_bytes(whole.read_bytes()[: last.chunk_start_offset])
+    read = list(read_bag(file).messages())
+    messages = list(read_bag(whole).messages())
+    assert read == [m for m in messages if m.log_time < last.message_start_time]
+
+
+def test_a_real_bag_that_was_cut(shared_data, tmp_path):
+    real = shared_data / "ros2-jazzy/bags/probe_path_mcap/probe_path_mcap_0.mcap"
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(real.read_bytes()[:180_000])
+    bag = read_bag(file)
+    read = list(bag.messages())
+    whole = list(read_bag(real).messages())
+    with real.open("rb") as stream:
+        (chunk,) = make_reader(stream).get_summary().chunk_indexes
+        stream.seek(0)
+        indexes = [
+            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, MessageIndex)
+        ]
+    # Before a chunk's records: opcode and length, times, size and CRC, no name, their length.
+    available = 180_000 - chunk.chunk_start_offset - 9 - 28 - 4 - 8
+    begun = sum(offset < available for index in indexes for _, offset in index.records)
+    assert begun - len(read) in (0, 1)
+    assert set(read) <= set(whole)
+    assert "breaks off at byte" in bag.note
+
+
+def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
+    content = sessions["none"].read_bytes()
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content[: len(content) // 3] + bytes(5000))
+    bag = read_bag(file)
+    read = list(bag.messages())
+    assert not bag.complete
+    assert 10 < len(read) < 100
+    assert read == list(read_bag(sessions["none"]).messages())[: len(read)]
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_a_flipped_bit_is_noticed(tmp_path, sessions, compression):
+    content = bytearray(sessions[compression].read_bytes())
+    first_chunk = content.index(HI if compression == "none" else b"\x28\xb5\x2f\xfd")
+    content[first_chunk + 60] ^= 4
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content)
+    with pytest.raises(BagError, match="is damaged in its chunk at byte"):
+        list(read_bag(file).messages())
+
+
+@pytest.fixture(scope="module")
+def damageable(shared_data, sessions):
+    """Files by kind; the real recorder's chunks have no checksum."""
+    real = shared_data / "ros2-jazzy/bags/probe_path_mcap/probe_path_mcap_0.mcap"
+    return {"real": real, **sessions}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data(), st.sampled_from(["none", "zstd", "real"]))
+def test_no_damage_leads_to_anything_but_a_sentence(tmp_path_factory, damageable, data, kind):
+    content = bytearray(damageable[kind].read_bytes())
+    for _ in range(data.draw(st.integers(1, 5))):
+        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file = tmp_path_factory.mktemp("damaged") / "session.mcap"
+    file.write_bytes(content)
+    refusal = ""
+    try:
+        list(read_bag(file).messages())
+    except BagError as error:
+        refusal = str(error)
+    assert not refusal or refusal.startswith(str(file))
+
+
+def test_a_damaged_summary_is_done_without(tmp_path, sessions):
+    content = bytearray(sessions["zstd"].read_bytes())
+    with sessions["zstd"].open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    offset = chunks[1].chunk_start_offset.to_bytes(8, "little")
+    content[content.rindex(offset)] ^= 1
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content)
+    bag = read_bag(file)
+    assert bag.complete
+    assert list(bag.messages()) == list(read_bag(sessions["zstd"]).messages())
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("summary", [True, False])
+def test_files_by_other_writers(tmp_path, chunked, summary):
+    file = tmp_path / "other.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(
+            stream,
+            compression=CompressionType.LZ4,
+            use_chunking=chunked,
+            use_statistics=summary,
+            repeat_channels=summary,
+        )
+        writer.start(profile="ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data\n")
+        channel = writer.register_channel("/note", "cdr", schema)
+        for k in (2, 0, 1):
+            writer.add_message(channel, EPOCH + k, HI, EPOCH)
+        writer.finish()
+    bag = read_bag(file)
+    assert bag.complete
+    assert [m.log_time - EPOCH for m in bag.messages()] == [0, 1, 2]
+    assert bag.topic("note").qos == ()
+    assert bag.deserialize(next(bag.messages())).data == "hi"
+
+
+def test_messages_compressed_one_by_one(tmp_path):
+    write_session(tmp_path / "plain.mcap")
+    plain = list(read_bag(tmp_path / "plain.mcap").messages())
+    with BagWriter(tmp_path / "packed") as packed:
+        for topic in ("/a", "/b"):
+            packed.add_topic(topic, STRING)
+        for message in plain:
+            data = zstandard.compress(message.data)
+            packed.write(message.topic, data, message.log_time, message.publish_time)
+    metadata = tmp_path / "packed/metadata.yaml"
+    metadata.write_text(
+        metadata.read_text()
+        .replace('compression_format: ""', "compression_format: zstd")
+        .replace('compression_mode: ""', "compression_mode: message")
+    )
+    assert list(read_bag(tmp_path / "packed").messages()) == plain
+
+
+def test_a_compressed_file_leaves_nothing_behind(tmp_path, monkeypatch):
+    write_session(tmp_path / "bag.mcap")
+    packed = tmp_path / "bag.mcap.zstd"
+    packed.write_bytes(zstandard.compress((tmp_path / "bag.mcap").read_bytes()))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(scratch))
+    bag = read_bag(packed)
+    assert bag.message_count == 200
+    assert len(list(scratch.iterdir())) == 1
+    del bag
+    assert not list(scratch.iterdir())
+    packed.write_bytes(packed.read_bytes()[:100])
+    with pytest.raises(BagError, match=r"bag.mcap.zstd (cannot be decompressed|is empty|is not)"):
+        read_bag(packed)
+
+
+def test_old_sqlite_without_qos_or_definitions(tmp_path):
+    file = tmp_path / "old.db3"
+    with sqlite3.connect(file) as database:
+        database.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+            " serialization_format TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+            " data BLOB);"
+            f"INSERT INTO topics VALUES (1, '/note', '{STRING}', 'cdr'),"
+            " (2, '/thing', 'my_msgs/msg/Thing', 'cdr');"
+        )
+        database.executemany(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
+            [(1, EPOCH + 1, HI), (2, EPOCH, HI)],
+        )
+    database.close()
+    bag = read_bag(file)
+    thing, note = bag.messages()
+    assert bag.deserialize(note).data == "hi"
+    with pytest.raises(BagError, match="my_msgs/msg/Thing without its definition"):
+        bag.deserialize(thing)
+
+
+def test_sqlite_that_is_no_bag_or_damaged(shared_data, tmp_path):
+    other = tmp_path / "other.db3"
+    with sqlite3.connect(other) as database:
+        database.execute("CREATE TABLE things(id)")
+    database.close()
+    with pytest.raises(BagError, match="cannot be read as a rosbag2 database"):
+        read_bag(other)
+    real = shared_data / "ros2-jazzy/bags/probe_path_sqlite3/probe_path_sqlite3_0.db3"
+    cut = tmp_path / "cut.db3"
+    cut.write_bytes(real.read_bytes()[:100_000])
+    with pytest.raises(BagError, match=r"damaged|cannot be read as a rosbag2 database"):
+        list(read_bag(cut).messages())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is empty"),
+        (b"\x89MCAP", "is not a bag: it is neither MCAP nor SQLite"),
+        (b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
+        (b"hello, world, this is a text", "is not a bag"),
+    ],
+)
+def test_files_that_are_no_bags(tmp_path, content, message):
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content)
+    with pytest.raises(BagError, match=message) as caught:
+        read_bag(file)
+    assert str(file) in str(caught.value)
+
+
+def test_places_without_a_bag(tmp_path):
+    with pytest.raises(BagError, match="there is no bag at"):
+        read_bag(tmp_path / "missing.mcap")
+    with pytest.raises(BagError, match="holds no bag"):
+        read_bag(tmp_path)
+
+
+def test_what_does_not_fit_its_type(tmp_path):
+    with BagWriter(tmp_path / "bag.mcap") as writer:
+        writer.add_topic("/note", STRING)
+        writer.write("/note", b"\0\1\0\0\xff\xff\0\0hi\0", EPOCH)
+        writer.write("/note", b"", EPOCH + 1)
+    bag = read_bag(tmp_path)
+    for message in bag.messages():
+        with pytest.raises(BagError, match=f"at {message.log_time} ns that is no {STRING}"):
+            bag.deserialize(message)
+    with pytest.raises(BagError, match="has no topic /other; it has /note"):
+        next(bag.messages(["/other"]))
+
+
+def test_a_topic_of_two_types_is_refused(tmp_path):
+    for k, type_name in enumerate([STRING, "geometry_msgs/msg/PoseStamped"]):
+        with BagWriter(tmp_path / f"bag_{k}.mcap", sidecar=False) as bag:
+            bag.add_topic("/note", type_name)
+    with pytest.raises(BagError, match="a topic has one type"):
+        read_bag(tmp_path)
+
+
+def test_summary(tmp_path):
+    write_session(tmp_path / "session.mcap")
+    summary = read_bag(tmp_path / "session.mcap").summary()
+    assert summary["message_count"] == 200
+    assert summary["duration"] == 199 * 10**7
+    assert [(t["name"], t["type"], t["message_count"]) for t in summary["topics"]] == [
+        ("/a", STRING, 160),
+        ("/b", STRING, 40),
+    ]

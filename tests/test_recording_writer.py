@@ -1,0 +1,279 @@
+"""The recorder: the same bags as the real rosbag2, and nothing lost but the last second."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Metadata
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from us_sim.errors import BagError
+from us_sim.recording import writer
+from us_sim.recording.qos import QosProfile
+from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
+
+STRING = "std_msgs/msg/String"
+EPOCH = 1_700_000_000_000_000_000
+HI = bytes.fromhex("00010000 03000000 686900")
+
+
+def text(content):
+    """A std_msgs/String of ASCII text as CDR."""
+    return b"\0\1\0\0" + (len(content) + 1).to_bytes(4, "little") + content.encode() + b"\0"
+
+
+def mcap_content(file):
+    """Header, channels, schemas and rosbag2 metadata records of an MCAP file."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream)
+        header, summary = reader.get_header(), reader.get_summary()
+    with file.open("rb") as stream:
+        records = [r for r in StreamReader(stream).records if isinstance(r, Metadata)]
+    channels = {
+        c.topic: (c.message_encoding, c.metadata, summary.schemas[c.schema_id].name)
+        for c in summary.channels.values()
+    }
+    schemas = {s.name: (s.encoding, s.data) for s in summary.schemas.values()}
+    return header, channels, schemas, records
+
+
+@pytest.mark.parametrize("name", ["probe_path_mcap", "probe_path_chunkzstd"])
+def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
+    folder = shared_data / "ros2-jazzy/bags" / name
+    real = read_bag(folder)
+    with BagWriter(tmp_path / name) as ours:
+        for entry in real.metadata.topics:
+            schema = real.topic(entry.name).schema
+            ours.add_topic(entry.name, entry.type_name, entry.qos, schema=schema)
+        for message in real.messages():
+            ours.write(message.topic, message.data, message.log_time, message.publish_time)
+    file = tmp_path / name / f"{name}_0.mcap"
+    real_header, *expected = mcap_content(folder / file.name)
+    header, *written = mcap_content(file)
+    assert header.profile == real_header.profile == "ros2"
+    assert written == expected
+    assert (file.parent / "metadata.yaml").read_text() == (folder / "metadata.yaml").read_text()
+    assert list(read_bag(file).messages()) == list(real.messages())
+
+
+@pytest.mark.parametrize("name", ["probe_path_sqlite3", "probe_path_zstd"])
+def test_a_real_bag_of_another_storage_keeps_its_topics(shared_data, tmp_path, name):
+    real = read_bag(shared_data / "ros2-jazzy/bags" / name)
+    with BagWriter(tmp_path / "copy.mcap", compression="zstd") as ours:
+        for topic in real.topics:
+            ours.add_topic(topic.name, topic.type_name, topic.qos, schema=topic.schema)
+        for message in real.messages():
+            ours.write(message.topic, message.data, message.log_time, message.publish_time)
+    copy = read_bag(tmp_path)
+    assert copy.topics == real.topics
+    assert list(copy.messages()) == list(real.messages())
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
+    file = tmp_path / "session.mcap"
+    latched = QosProfile(depth=1, durability="transient_local")
+    with BagWriter(file, compression=compression, custom_data={"scene": "upper_arm"}) as bag:
+        bag.add_topic("/a", STRING, [QosProfile()])
+        bag.add_topic("/b", STRING, [latched, QosProfile(reliability="best_effort")])
+        bag.add_topic("/silent", "geometry_msgs/msg/PoseStamped")
+        for k in range(300):
+            topic = "/a" if k % 3 else "/b"
+            bag.write(topic, text(f"{k}"), EPOCH + k * 10**8, EPOCH + k)
+    with AnyReader([tmp_path]) as reader:
+        assert reader.message_count == 300
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert counts == {"/a": 200, "/b": 100, "/silent": 0}
+        contents = [
+            reader.deserialize(data, connection.msgtype).data
+            for connection, _, data in reader.messages()
+        ]
+    assert contents == [f"{k}" for k in range(300)]
+    with Reader(file) as reader:
+        assert (reader.start_time, reader.end_time) == (EPOCH, EPOCH + 299 * 10**8 + 1)
+        (b,) = (c for c in reader.connections if c.topic == "/b")
+        assert [int(profile.depth) for profile in b.ext.offered_qos_profiles] == [1, 10]
+    with file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_summary().statistics.chunk_count == 30
+        times = [(m.log_time, m.publish_time) for _, _, m in reader.iter_messages()]
+    assert times == [(EPOCH + k * 10**8, EPOCH + k) for k in range(300)]
+    assert read_bag(tmp_path).metadata.custom_data == {"scene": "upper_arm"}
+
+
+message_lists = st.lists(
+    st.tuples(
+        st.sampled_from(["/a", "/b", "/c"]),
+        st.binary(max_size=40),
+        st.integers(0, 2**62),
+        st.integers(0, 2**62),
+    ),
+    max_size=40,
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(message_lists, st.integers(1, 200), st.sampled_from(["none", "zstd"]))
+def test_round_trip_in_the_order_of_log_times(tmp_path_factory, messages, chunk_size, compression):
+    file = tmp_path_factory.mktemp("round") / "bag.mcap"
+    with BagWriter(file, chunk_size=chunk_size, compression=compression) as bag:
+        for topic in ("/a", "/b", "/c"):
+            bag.add_topic(topic, STRING)
+        for message in messages:
+            bag.write(*message)
+    read = read_bag(file)
+    expected = sorted(messages, key=lambda message: message[2])
+    got = [(m.topic, m.data, m.log_time, m.publish_time) for m in read.messages()]
+    assert got == expected
+    assert read.complete
+    assert read.start == (expected[0][2] if expected else None)
+    assert read.end == (expected[-1][2] if expected else None)
+
+
+KILLED_RECORDER = """
+import os, signal, sys
+from us_sim.recording.writer import BagWriter
+bag = BagWriter(sys.argv[1], compression=sys.argv[2])
+bag.add_topic("/note", "std_msgs/msg/String")
+for k in range(240):
+    bag.write("/note", bytes.fromhex("00010000 03000000 686900"), 10**18 + k * 10**9 // 60)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_kill_9_loses_less_than_a_second(tmp_path, compression):
+    project = Path(writer.__file__).parents[2]
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED_RECORDER, str(tmp_path / "session.mcap"), compression],
+        env={**os.environ, "PYTHONPATH": str(project)},
+        timeout=60,
+    )
+    assert killed.returncode == -signal.SIGKILL
+    bag = read_bag(tmp_path)
+    times = [message.log_time for message in bag.messages()]
+    assert times == [10**18 + k * 10**9 // 60 for k in range(len(times))]
+    assert 10**18 + 239 * 10**9 // 60 - times[-1] < 10**9
+    assert not bag.complete
+    assert f"{len(times)} messages over" in bag.note
+
+
+def test_flush_makes_everything_readable_before_the_bag_is_closed(tmp_path):
+    bag = BagWriter(tmp_path / "session.mcap")
+    bag.add_topic("/note", STRING)
+    bag.write("/note", HI, EPOCH)
+    assert read_bag(tmp_path / "session.mcap").message_count == 0
+    bag.flush()
+    half = read_bag(tmp_path / "session.mcap")
+    assert [half.deserialize(message).data for message in half.messages()] == ["hi"]
+    bag.close()
+    assert read_bag(tmp_path).complete
+
+
+def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):
+    bag = BagWriter(tmp_path / "session.mcap", chunk_size=20_000)
+    bag.add_topic("/note", STRING)
+
+    def record_until_full():
+        for k in range(1000):
+            bag.write("/note", text("x" * 1000), EPOCH + k * 10**8)
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(BagError, match=r"cannot be written \(File too large\)") as caught:
+            record_until_full()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    # Records of 1040 bytes, flushed every second: 91 of them fit into 100 kB, 101 would not.
+    assert "first 91 messages are kept" in str(caught.value)
+    with pytest.raises(BagError, match="cannot be written"):
+        bag.write("/note", HI, EPOCH)
+    bag.close()
+    read = read_bag(tmp_path / "session.mcap")
+    assert not read.complete
+    assert read.message_count >= 91
+    assert not (tmp_path / "metadata.yaml").exists()
+
+
+def test_an_empty_bag_is_a_bag(tmp_path):
+    with BagWriter(tmp_path / "quiet") as bag:
+        bag.add_topic("/note", STRING)
+    read = read_bag(tmp_path / "quiet")
+    assert read.complete
+    assert (read.start, read.end, list(read.messages())) == (None, None, [])
+    assert [topic.name for topic in read.topics] == ["/note"]
+    with AnyReader([tmp_path / "quiet"]) as reader:
+        assert reader.message_count == 0
+
+
+def test_a_topic_may_be_added_again_but_not_change_its_type(tmp_path):
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.add_topic("/note", STRING)
+        bag.add_topic("/note", STRING)
+        assert bag.topics == ("/note",)
+        with pytest.raises(BagError, match="recorded as std_msgs/msg/String"):
+            bag.add_topic("/note", "geometry_msgs/msg/PoseStamped")
+
+
+def test_several_bags_in_one_folder_without_a_sidecar(tmp_path):
+    for name in ("one", "two"):
+        with BagWriter(tmp_path / f"{name}.mcap", sidecar=False) as bag:
+            bag.add_topic("/note", STRING)
+            bag.write("/note", text(name), EPOCH)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["one.mcap", "two.mcap"]
+
+
+def test_nothing_is_overwritten(tmp_path):
+    with BagWriter(tmp_path / "first.mcap"):
+        pass
+    with pytest.raises(BagError, match=r"first.mcap exists already"):
+        BagWriter(tmp_path / "first.mcap")
+    with pytest.raises(BagError, match=r"belongs to another recording.*second/second.mcap"):
+        BagWriter(tmp_path / "second.mcap")
+    with pytest.raises(BagError, match="not empty"):
+        BagWriter(tmp_path)
+    with BagWriter(tmp_path / "second/second.mcap"):
+        pass
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file/session.mcap", Path("/proc/session.mcap")):
+        with pytest.raises(BagError, match="cannot be made"):
+            BagWriter(path)
+
+
+def test_misuse(tmp_path):
+    with pytest.raises(BagError, match="compressed with 'lz5'"):
+        BagWriter(tmp_path / "bag.mcap", compression="lz5")
+    bag = BagWriter(tmp_path / "bag.mcap")
+    with pytest.raises(BagError, match="'' is not a topic name"):
+        bag.add_topic("", STRING)
+    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown"):
+        bag.add_topic("/thing", "my_msgs/msg/Unheard")
+    with pytest.raises(BagError, match="/note was not added"):
+        bag.write("/note", HI, EPOCH)
+    bag.add_topic("/note", STRING)
+    with pytest.raises(BagError, match="before 1970"):
+        bag.write("/note", HI, -1)
+    bag.close()
+    bag.close()
+    for late in (
+        lambda: bag.write("/note", HI, EPOCH),
+        bag.flush,
+        lambda: bag.add_topic("/b", STRING),
+    ):
+        with pytest.raises(BagError, match="is closed"):
+            late()
