@@ -91,12 +91,12 @@ def _nodes(scene: Scene, path: Path, out: Path) -> list[tuple[str, str, dict[str
     if scene.volume.file:
         common["volume"] = scene.volume.file
     classes = {part.node: _class_name(part.node) for part in scene.parts() if part.needed}
-    recorder = {
+    recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
         "compression": "zstd",
         "exclude": ["/diagnostics"],
     }
-    player = {
+    player: dict[str, object] = {
         "path": str(path),
         "lockstep": True,
         "await_topics": [
