@@ -90,8 +90,10 @@ def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
     parts, part = connected_components(graph, directed=False)
     for i in range(parts):
         held = mesh.nodes[fixed & (part == i)]
-        spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False) if len(held) > 2 else []
-        if len(spread) < 2 or spread[1] <= 1e-9 * spread[0]:
+        spread = np.zeros(3)
+        if len(held) > 2:
+            spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False)
+        if spread[1] <= 1e-9 * spread[0]:
             raise SolverError(
                 f"the tissue can move as a whole: the part of the mesh around node "
                 f"{np.flatnonzero(part == i)[0]} has {len(held)} fixed nodes; fix at least three "

@@ -30,11 +30,11 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 
 from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
+from us_sim.tissue.conjugate_gradients import conjugate_gradients, product_rows
 from us_sim.tissue.contact import wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity import free_stiffness, require_held, stiffness
@@ -52,7 +52,7 @@ class FemCg(TissueSolver):
 
     The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
     probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
-    of the contact forces; after a release, over the last contact forces there were.
+    of the contact forces; after a release, over the largest there were.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -114,7 +114,8 @@ class FemCg(TissueSolver):
         self._displacement[:] = state.displacement[self._free]
         self._contact.clear()
         self._renew_equations()
-        self._load = 0.0
+        # N, norm of the contact forces that the residual refers to, and the largest since rest.
+        self._reference = self._heaviest = 0.0
         self._taken_over = bool(self._displacement.any())
 
     def _renew_equations(self) -> None:
@@ -133,6 +134,9 @@ class FemCg(TissueSolver):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         contact, displacement = self._contact, self._displacement
+        untouched = self._settled and not contact.touched.any()
+        if untouched and contact.consistent(pose, displacement[self._touchable]):
+            return self._resting()
         if self._taken_over and pose is not None:
             contact.adopt(pose, displacement[self._touchable])
             self._renew_equations()
@@ -143,7 +147,7 @@ class FemCg(TissueSolver):
                 displacement[self._touchable] = surface
                 self._renew_equations()
             anew = self._slope < 0.0
-            self._slope, before, self._norm = _conjugate_gradients(
+            self._slope, before, self._norm = conjugate_gradients(
                 *self._matrix,
                 self._preconditioner,
                 self._touched,
@@ -155,29 +159,32 @@ class FemCg(TissueSolver):
                 self._slope,
                 self._norm,
                 iterations,
-                0.5 * self._tolerance * self._load,
+                0.5 * self._tolerance * self._reference,
             )
             if anew:
                 self._refine_at = _REFINEMENT * before
-            contact.weigh(_product_rows(*self._matrix, displacement, self._touchable))
-            self._load = float(np.linalg.norm(np.maximum(contact.push, 0.0))) or self._load
+            contact.weigh(product_rows(*self._matrix, displacement, self._touchable))
+            load = float(np.linalg.norm(np.maximum(contact.push, 0.0)))
+            self._heaviest = max(self._heaviest, load)
+            self._reference = load or self._heaviest
         return self._outcome(pose)
 
     def _outcome(self, pose: Pose | None) -> Deformation:
         contact, displacement = self._contact, self._displacement
         everywhere = np.arange(len(self._free), dtype=self._touchable.dtype)
-        unbalanced = _product_rows(*self._matrix, displacement, everywhere)
+        unbalanced = product_rows(*self._matrix, displacement, everywhere)
         push = np.maximum(contact.push, 0.0)[:, None] * contact.normal
         unbalanced[self._touchable] -= push
         imbalance = float(np.linalg.norm(unbalanced))
-        self._load = self._load or imbalance
-        residual = imbalance / self._load if self._load else 0.0
+        self._reference = self._reference or imbalance
+        residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
         self._settled = balanced and contact.consistent(pose, displacement[self._touchable])
         if self._settled and not contact.touched.any():
             # Without a load the exact solution is the rest state.
             displacement[:] = 0.0
-            residual = 0.0
+            self._heaviest = self._reference = residual = 0.0
+            self._slope = -1.0
         elif not balanced and self._slope == 0.0:
             # The updated residual has drifted from the true one.
             self._slope = -1.0
@@ -188,134 +195,3 @@ class FemCg(TissueSolver):
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[pushed], push[contact.push > 0])
         return Deformation(nodes, pushed, force, torque, residual)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _product_rows(start, columns, blocks, vector, rows):
-    """(len(rows), 3) those block rows of the matrix times vector (N, 3)."""
-    product = np.empty((len(rows), 3))
-    for k in range(len(rows)):
-        x = y = z = 0.0
-        for b in range(start[rows[k]], start[rows[k] + 1]):
-            v0 = vector[columns[b], 0]
-            v1 = vector[columns[b], 1]
-            v2 = vector[columns[b], 2]
-            x += blocks[b, 0, 0] * v0 + blocks[b, 0, 1] * v1 + blocks[b, 0, 2] * v2
-            y += blocks[b, 1, 0] * v0 + blocks[b, 1, 1] * v1 + blocks[b, 1, 2] * v2
-            z += blocks[b, 2, 0] * v0 + blocks[b, 2, 1] * v1 + blocks[b, 2, 2] * v2
-        product[k, 0] = x
-        product[k, 1] = y
-        product[k, 2] = z
-    return product
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _project(vector, touched, normal):
-    """Take the component along normal (T, 3) out of vector (N, 3) at the touched (T,) nodes."""
-    for t in range(len(touched)):
-        i = touched[t]
-        along = (
-            vector[i, 0] * normal[t, 0] + vector[i, 1] * normal[t, 1] + vector[i, 2] * normal[t, 2]
-        )
-        for axis in range(3):
-            vector[i, axis] -= along * normal[t, axis]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _multiply(start, columns, blocks, vector, product):
-    """product (N, 3) = matrix in 3x3 blocks times vector (N, 3); returns vector . product."""
-    energy = 0.0
-    for i in range(len(vector)):
-        x = y = z = 0.0
-        for b in range(start[i], start[i + 1]):
-            j = columns[b]
-            v0 = vector[j, 0]
-            v1 = vector[j, 1]
-            v2 = vector[j, 2]
-            x += blocks[b, 0, 0] * v0 + blocks[b, 0, 1] * v1 + blocks[b, 0, 2] * v2
-            y += blocks[b, 1, 0] * v0 + blocks[b, 1, 1] * v1 + blocks[b, 1, 2] * v2
-            z += blocks[b, 2, 0] * v0 + blocks[b, 2, 1] * v1 + blocks[b, 2, 2] * v2
-        product[i, 0] = x
-        product[i, 1] = y
-        product[i, 2] = z
-        energy += x * vector[i, 0] + y * vector[i, 1] + z * vector[i, 2]
-    return energy
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _precondition(preconditioner, residual, scaled):
-    """scaled (N, 3) = preconditioner (N, 3, 3) times residual (N, 3); returns r.z and r.r."""
-    slope = 0.0
-    square = 0.0
-    for i in range(len(residual)):
-        x = residual[i, 0]
-        y = residual[i, 1]
-        z = residual[i, 2]
-        m = preconditioner[i]
-        a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
-        b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
-        c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
-        scaled[i, 0] = a
-        scaled[i, 1] = b
-        scaled[i, 2] = c
-        slope += a * x + b * y + c * z
-        square += x * x + y * y + z * z
-    return slope, square
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _conjugate_gradients(
-    start,
-    columns,
-    blocks,
-    preconditioner,
-    touched,
-    normal,
-    displacement,
-    residual,
-    direction,
-    product,
-    slope,
-    norm,
-    iterations,
-    target,
-):
-    """Improve displacement (N, 3) by at most ``iterations``, until |residual| <= target.
-
-    Goes on with residual and direction when ``slope`` is positive, begins anew when it is negative,
-    and does nothing when it is 0; ``norm`` is then |residual|.
-
-    Returns:
-        The slope to go on with (0 when converged), and |residual| before and after.
-    """
-    if slope < 0.0:
-        _multiply(start, columns, blocks, displacement, residual)
-        for i in range(len(residual)):
-            for axis in range(3):
-                residual[i, axis] = -residual[i, axis]
-        _project(residual, touched, normal)
-        slope, square = _precondition(preconditioner, residual, direction)
-        norm = math.sqrt(square)
-    before = norm
-    if norm <= target or slope == 0.0:
-        return 0.0, before, norm
-    for _ in range(iterations):
-        energy = _multiply(start, columns, blocks, direction, product)
-        if not energy > 0.0:
-            return -1.0, before, norm
-        _project(product, touched, normal)
-        step = slope / energy
-        for i in range(len(displacement)):
-            for axis in range(3):
-                displacement[i, axis] += step * direction[i, axis]
-                residual[i, axis] -= step * product[i, axis]
-        last = slope
-        slope, square = _precondition(preconditioner, residual, product)
-        norm = math.sqrt(square)
-        if norm <= target:
-            return 0.0, before, norm
-        turn = slope / last
-        for i in range(len(direction)):
-            for axis in range(3):
-                direction[i, axis] = product[i, axis] + turn * direction[i, axis]
-    return slope, before, norm

@@ -90,6 +90,6 @@ class TissueModel:
     def lumped_mass(self) -> NDArray[np.float64]:
         """(N,) kg, a quarter of each tetrahedron's mass at each of its nodes."""
         quarter = self.materials.density * self.mesh.volumes / 4
-        return np.bincount(
-            self.mesh.tetrahedra.ravel(), np.repeat(quarter, 4), len(self.mesh.nodes)
-        )
+        mass = np.zeros(len(self.mesh.nodes))
+        np.add.at(mass, self.mesh.tetrahedra, quarter[:, None])
+        return mass

@@ -45,12 +45,15 @@ SOLVERS = {
     "msds": ("us_sim.tissue.msds", "Msds"),
 }
 
+# A node that moved by this many times the mesh's longest side has left the tissue.
+_FARTHEST = 10.0
+
 
 class TissueSolver(ABC):
     """Deforms one tissue, frame by frame.
 
-    A solver never returns a number that is not finite: should a frame come out so, the last good
-    state stays and the deformation's ``action`` says it.
+    A solver never returns a number that is not finite, nor nodes that flew off: should a frame come
+    out so, the last good state stays and the deformation's ``action`` says it.
     """
 
     name: ClassVar[str]
@@ -73,17 +76,14 @@ class TissueSolver(ABC):
             return self._last
         good, settled = self.state, self._settled
         deformation = self._advance(probe_pose)
-        finite = np.isfinite(deformation.residual) and all(
-            np.isfinite(array).all()
-            for array in (deformation.nodes, deformation.force, deformation.torque)
-        )
-        if finite:
+        if self._is_plausible(deformation):
             self._pose = probe_pose
         else:
             self._restore(good)
             self._settled = settled
             deformation = replace(
-                self._last, action="the frame was not finite, so the last good state was kept"
+                self._last,
+                action="the frame came out not finite or far away, so the last good state was kept",
             )
         self._last = deformation
         return deformation
@@ -142,6 +142,15 @@ class TissueSolver(ABC):
     @abstractmethod
     def _restore(self, state: TissueState) -> None:
         """Put the tissue where a state says."""
+
+    def _is_plausible(self, deformation: Deformation) -> bool:
+        mesh = self.model.mesh
+        reach = _FARTHEST * np.ptp(mesh.nodes, axis=0).max()
+        numbers = (deformation.force, deformation.torque, deformation.residual)
+        # A comparison with NaN is false.
+        return bool(np.abs(deformation.nodes - mesh.nodes).max() <= reach) and all(
+            bool(np.isfinite(number).all()) for number in numbers
+        )
 
     def _resting(self) -> Deformation:
         return Deformation(

@@ -1,0 +1,274 @@
+"""The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.tissue.box import face_nodes
+>>> from us_sim.tissue.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.msds import Msds
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> solver = Msds(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
+masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.errors import SolverError
+from us_sim.pose import Pose
+from us_sim.tissue.contact import only_forward, push_out
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solver import TissueSolver
+from us_sim.tissue.springs import springs_of, stabilised
+from us_sim.tissue.symplectic_euler import advance_frame
+
+__all__ = ["Msds"]
+
+# Frames that a released tissue is given to untangle by itself.
+_PATIENCE = 10
+
+# m. A released tissue that has settled this near its rest state is put there.
+_NEARLY_RESTING = 1e-4
+
+
+class Msds(TissueSolver):
+    """Point masses joined by Voigt elements (the paper's eqs. 1 to 5).
+
+    With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
+    so either each mass is raised to what the asked step needs or each step is divided. Both follow
+    the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
+    turn and stretch.
+
+    The probe moves from the last pose to the new one over the frame. A node that would enter it
+    loses its velocity towards it, which is the measured push, and is put onto its surface.
+
+    The residual is the norm of the unbalanced elastic forces over the norm of the contact forces
+    (after a release, over the largest there were): how far the springs are from rest, not from
+    their own motion.
+
+    Args:
+        model: may be free; then the whole tissue moves away when pushed.
+        steps: in a frame.
+        time_step: s.
+        stiffness_factor: m, spring constant over Young's modulus.
+        damping_factor: s, damping constant over spring constant.
+        stabilisation: ``mass_scaling`` or ``substeps``.
+        maximum_substeps: of one step; more are refused.
+        rest_tolerance: m, motion in a frame below which the tissue counts as settled.
+
+    Raises:
+        SolverError: a setting is out of range, or too many sub-steps would be needed.
+    """
+
+    name: ClassVar[str] = "msds"
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        steps: int = 20,
+        time_step: float = 0.01,
+        stiffness_factor: float = 0.002,
+        damping_factor: float = 0.1,
+        stabilisation: str = "mass_scaling",
+        maximum_substeps: int = 100,
+        rest_tolerance: float = 1e-6,
+    ) -> None:
+        for setting, count in (("steps", steps), ("maximum_substeps", maximum_substeps)):
+            if not (isinstance(count, int) and 1 <= count <= 10_000):
+                raise SolverError(f"msds.{setting} is {count!r}: give an integer from 1 to 10000")
+        for setting, value in (
+            ("time_step", time_step),
+            ("stiffness_factor", stiffness_factor),
+            ("rest_tolerance", rest_tolerance),
+        ):
+            if not (math.isfinite(value) and value > 0):
+                raise SolverError(f"msds.{setting} is {value!r}: give a number above zero")
+        if not (math.isfinite(damping_factor) and damping_factor >= 0):
+            raise SolverError(f"msds.damping_factor is {damping_factor!r}: give 0 or more")
+        if stabilisation not in ("mass_scaling", "substeps"):
+            raise SolverError(
+                f"msds.stabilisation is {stabilisation!r}: choose mass_scaling or substeps"
+            )
+        super().__init__(model)
+        self._steps = steps
+        self._rest_tolerance = rest_tolerance
+        springs = springs_of(model.mesh, model.materials, stiffness_factor, damping_factor)
+        self._springs = springs.without(model.fixed)
+        self.mass, self._substeps, self._action = stabilised(
+            model, self._springs, time_step, damping_factor, stabilisation, maximum_substeps
+        )  # mass: (N,) kg, as simulated
+        self._time_step = time_step / self._substeps
+        self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
+        self._forward = only_forward(model.collider, model.contact_spacing)
+
+        self._positions = model.mesh.nodes.copy()
+        self._velocity = np.zeros_like(self._positions)
+        self._force = np.zeros_like(self._positions)
+        self._normal = np.zeros((len(model.movable_contact_nodes), 3))
+        self._restore(self.state)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is and how fast it moves."""
+        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
+
+    def _restore(self, state: TissueState) -> None:
+        self._positions[:] = self.model.mesh.nodes + state.displacement
+        self._velocity[:] = state.velocity
+        self._velocity[self.model.fixed] = 0.0
+        self._touched = np.zeros(len(self._normal), dtype=bool)
+        self._heaviest = 0.0  # N, largest norm of contact forces since the tissue was at rest
+        self._frames_free = 0
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        if self._settled and not self._touched.any() and not self._entered(pose):
+            return self._outcome(pose, np.zeros(3), np.zeros(3))
+        rotations, origins = self._path(pose)
+        wrench = np.zeros((2, 3))
+        self._touched[:] = False
+        advance_frame(
+            self._springs.edges,
+            self._springs.stiffness,
+            self._springs.damping,
+            self._springs.rest_length,
+            self._inverse_mass,
+            self._positions,
+            self._velocity,
+            self._force,
+            self._time_step,
+            self._substeps,
+            self._steps,
+            self.model.collider.offset_box,
+            self._forward,
+            rotations,
+            origins,
+            self.model.movable_contact_nodes,
+            self._touched,
+            self._normal,
+            wrench,
+        )
+        return self._outcome(pose, wrench[0], wrench[1])
+
+    def _gap(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return push_out(
+            self.model.collider,
+            pose,
+            self._positions[self.model.movable_contact_nodes],
+            self.model.contact_spacing,
+        )
+
+    def _entered(self, pose: Pose | None) -> bool:
+        return pose is not None and bool((self._gap(pose)[0] < 0).any())
+
+    def _path(self, pose: Pose | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotations (S, 3, 3) and origins (S, 3) m of the probe at each step; S = 0 without one."""
+        if pose is None:
+            return np.empty((0, 3, 3)), np.empty((0, 3))
+        before = self._pose or self._lifted(pose)
+        way = np.arange(1, self._steps + 1)[:, None] / self._steps
+        origins = before.position + way * (pose.position - before.position)
+        if np.array_equal(before.orientation, pose.orientation):
+            rotations = np.repeat(pose.rotation[None], self._steps, axis=0)
+        else:
+            towards = pose.orientation * (1 if pose.orientation @ before.orientation >= 0 else -1)
+            turns = (1 - way) * before.orientation + way * towards
+            rotations = np.array([Pose(orientation=turn).rotation for turn in turns])
+        return rotations, origins
+
+    def _lifted(self, pose: Pose) -> Pose:
+        """Where a probe that was not there before has come from: straight up, until it is clear."""
+        gap, _ = self._gap(pose)
+        depth = max(0.0, -float(gap.min(initial=0.0)))
+        return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
+
+    def _outcome(
+        self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
+    ) -> Deformation:
+        movable = self.model.movable_contact_nodes
+        still = np.zeros_like(self._velocity)
+        action = self._put_back_if_tangled()
+        unbalanced = self._springs.forces(self._positions, still)
+        unbalanced[self.model.fixed] = 0.0
+        along = np.einsum("ij,ij->i", unbalanced[movable], self._normal)
+        push = np.where(self._touched, np.maximum(-along, 0.0), 0.0)
+        unbalanced[movable] += push[:, None] * self._normal
+        imbalance = float(np.linalg.norm(unbalanced))
+        load = float(np.linalg.norm(push))
+        self._heaviest = max(self._heaviest, load)
+        reference = load or self._heaviest or imbalance
+        residual = imbalance / reference if reference else 0.0
+
+        frame = self._steps * self._substeps * self._time_step
+        speed = np.abs(self._velocity).max()
+        acceleration = np.abs(unbalanced * self._inverse_mass[:, None]).max()
+        self._settled = bool(
+            max(speed * frame, acceleration * frame**2) < self._rest_tolerance
+            and not self._entered(pose)
+        )
+        if self._settled:
+            self._velocity[:] = 0.0
+            displaced = np.abs(self._positions - self.model.mesh.nodes).max()
+            if not self._touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
+                self._positions[:] = self.model.mesh.nodes
+                self._heaviest = residual = 0.0
+        return Deformation(
+            self._positions.copy(), movable[self._touched], force, torque, residual, action
+        )
+
+    def _put_back_if_tangled(self) -> str:
+        """What was done about tetrahedra turned inside out, after what was done for stability.
+
+        Springs know lengths and not volumes: pressed beyond the mesh's spacing, a node can pass
+        through a face and then rests on the wrong side. Under the probe that is only said; once it
+        is gone, the undeformed tissue is known to be the state of rest.
+        """
+        self._frames_free = 0 if self._touched.any() else self._frames_free + 1
+        inverted = _count_inverted(self._positions, self.model.mesh.tetrahedra)
+        if inverted == 0:
+            return self._action
+        said = [self._action] if self._action else []
+        if self._frames_free < _PATIENCE or not self.model.fixed.any():
+            return "; ".join([*said, f"{inverted} tetrahedra are inside out"])
+        self._positions[:] = self.model.mesh.nodes
+        self._velocity[:] = 0.0
+        return "; ".join(
+            [*said, f"{inverted} tetrahedra stayed inside out, so the tissue was put back to rest"]
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_inverted(nodes, tetrahedra):
+    """How many tetrahedra (M, 4) have no positive volume."""
+    count = 0
+    for t in range(len(tetrahedra)):
+        a = tetrahedra[t, 0]
+        b = tetrahedra[t, 1]
+        c = tetrahedra[t, 2]
+        d = tetrahedra[t, 3]
+        bx = nodes[b, 0] - nodes[a, 0]
+        by = nodes[b, 1] - nodes[a, 1]
+        bz = nodes[b, 2] - nodes[a, 2]
+        cx = nodes[c, 0] - nodes[a, 0]
+        cy = nodes[c, 1] - nodes[a, 1]
+        cz = nodes[c, 2] - nodes[a, 2]
+        dx = nodes[d, 0] - nodes[a, 0]
+        dy = nodes[d, 1] - nodes[a, 1]
+        dz = nodes[d, 2] - nodes[a, 2]
+        volume = bx * (cy * dz - cz * dy) + by * (cz * dx - cx * dz) + bz * (cx * dy - cy * dx)
+        if volume <= 0.0:
+            count += 1
+    return count
