@@ -51,7 +51,8 @@ setup(
     install_requires=[
         "cyclonedds>=11.0",
         "matplotlib>=3.6",
-        "mcap>=1.2",
+        "lz4>=4",
+        "mcap>=1.5",
         "numba>=0.59",
         "numpy>=1.26",
         "opencv-python-headless>=4.8",
@@ -62,6 +63,7 @@ setup(
         "SimpleITK>=2.3",
         "threadpoolctl>=3",
         "tqdm>=4.65",
+        "zstandard>=0.22",
     ],
     extras_require={
         "meshes": ["meshio>=5.3"],

@@ -125,16 +125,28 @@ def test_which_topic(tmp_path):
         bag.flush()
         with pytest.raises(BagError, match=r"no topic of .*PoseStamped; it has /note \(std_msgs"):
             read_path(tmp_path / "bag.mcap")
-        for topic in ("/tracker/pose", "/probe/pose"):
+        for topic in ("/haptic/pose", "/probe/pose"):
             bag.add_topic(topic, POSE_STAMPED)
-    with pytest.raises(BagError, match="several topics: name one of /probe/pose, /tracker/pose"):
+    with pytest.raises(BagError, match="several topics: name one of /haptic/pose, /probe/pose"):
         read_path(tmp_path)
     with pytest.raises(BagError, match="/note as std_msgs/msg/String: a path needs geometry_msgs"):
         read_path(tmp_path, "note")
-    with pytest.raises(BagError, match="no topic /haptic/pose; it has /note, /probe/pose"):
-        read_path(tmp_path, "/haptic/pose")
+    with pytest.raises(BagError, match="no topic /moon/pose; it has /haptic/pose, /note"):
+        read_path(tmp_path, "/moon/pose")
     with pytest.raises(BagError, match="holds no pose on /probe/pose; it is silent"):
         read_path(tmp_path, "probe/pose")
+
+
+def test_of_a_sessions_poses_the_trackers_are_the_path(tmp_path):
+    recorded = path_of(np.zeros((3, 3)))
+    with BagWriter(tmp_path / "session.mcap") as bag:
+        for topic, count in (("/probe/pose", 2), (recorded.topic, 3)):
+            write_path(tmp_path / topic[1:6] / "one.mcap", path_of(np.zeros((count, 3))))
+            bag.add_topic(topic, POSE_STAMPED)
+            for message in read_bag(tmp_path / topic[1:6]).messages():
+                bag.write(topic, message.data, message.log_time, message.publish_time)
+    assert recorded.topic == "/tracker/pose"
+    assert len(read_path(tmp_path / "session.mcap")) == 3
 
 
 def test_another_encoding(shared_data, tmp_path):

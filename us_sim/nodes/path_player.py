@@ -63,9 +63,8 @@ class PathPlayer(Node):
         self._starting = self.create_timer(0.05, self._begin)
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
-        for remark in (self._path.note, _rejection(self._path)):
-            if remark:
-                self.get_logger().warning(remark)
+        if self._path.note:
+            self.get_logger().warning(self._path.note)
 
     def _declared(
         self,
@@ -154,12 +153,6 @@ def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
         f"{path.topic}: neither stamps nor log times rise from pose to pose, so lockstep cannot "
         f"tell the poses apart; record the path again"
     )
-
-
-def _rejection(path: ProbePath) -> str:
-    if not path.rejected:
-        return ""
-    return f"{path.rejected} poses of {path.topic} are not finite or not oriented, and left out"
 
 
 def main(args: list[str] | None = None) -> int:

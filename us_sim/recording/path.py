@@ -78,8 +78,8 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
 
     Args:
         path: any bag that ``read_bag`` reads.
-        topic: its name, with or without the leading slash; the bag's only PoseStamped topic when
-            not given.
+        topic: its name, with or without the leading slash; when not given, the bag's only
+            PoseStamped topic, or among several the one named ``tracker/pose``.
 
     Raises:
         BagError: there is no such bag or topic, several come into question, the topic is of
@@ -133,7 +133,7 @@ def _serialized(
 
 
 def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
-    """The topic asked for, or the bag's only one with poses."""
+    """The topic asked for, or the bag's only one with poses, or a session's tracker poses."""
     if name is not None:
         topic = bag.topic(name)
         if topic.type_name != POSE_STAMPED:
@@ -142,8 +142,10 @@ def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
             )
         return topic
     poses = [topic for topic in bag.topics if topic.type_name == POSE_STAMPED]
-    if len(poses) == 1:
-        return poses[0]
+    tracked = [topic for topic in poses if topic.name.endswith("/tracker/pose")]
+    for candidates in (poses, tracked):
+        if len(candidates) == 1:
+            return candidates[0]
     if poses:
         names = ", ".join(sorted(topic.name for topic in poses))
         raise BagError(f"{bag.path} holds poses on several topics: name one of {names}")
