@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes as ct
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from itertools import count
 
@@ -17,19 +18,23 @@ from us_sim.standalone.ddsc import INFINITY, check, lib
 
 __all__ = ["Dispatcher"]
 
-_STOP = 0
+_WAKE_UP = 0
 _AT_ONCE = 64
 
 
 class Dispatcher:
-    """Calls the handlers of entities whose status changed, from its own thread."""
+    """Calls the handlers of entities whose status changed, always from its own thread."""
 
     def __init__(self, participant: int) -> None:
         """Start waiting; ``participant`` is the C handle of the DDS participant."""
         self._waitset = check(lib.dds_create_waitset(participant), "no wait set can be made")
-        self._stop = check(lib.dds_create_guardcondition(participant), "no condition can be made")
-        lib.dds_waitset_attach(self._waitset, self._stop, _STOP)
-        self._tokens = count(_STOP + 1)
+        self._wake_up = check(
+            lib.dds_create_guardcondition(participant), "no condition can be made"
+        )
+        lib.dds_waitset_attach(self._waitset, self._wake_up, _WAKE_UP)
+        self._closed = False
+        self._soon: deque[Callable[[], None]] = deque()
+        self._tokens = count(_WAKE_UP + 1)
         self._handlers: dict[int, Callable[[], None]] = {}
         self._thread = threading.Thread(target=self._run, name="us_sim DDS", daemon=True)
         self._thread.start()
@@ -46,26 +51,38 @@ class Dispatcher:
         """Call this token's handler no more (deleting the entity ends the waiting for it)."""
         self._handlers.pop(token, None)
 
+    def call_soon(self, handler: Callable[[], None]) -> None:
+        """Call ``handler`` once."""
+        self._soon.append(handler)
+        lib.dds_set_guardcondition(self._wake_up, True)
+
     def close(self) -> None:
-        """End the thread, and wait for the handler it is in unless that one is the caller."""
-        self._handlers.clear()
-        lib.dds_set_guardcondition(self._stop, True)
+        """End the thread, giving the handler that it may be in a second to finish."""
+        self._closed = True
+        lib.dds_set_guardcondition(self._wake_up, True)
         if threading.current_thread() is not self._thread:
-            self._thread.join()
+            # Not for ever: the handler may wait for a lock that the caller holds.
+            self._thread.join(timeout=1.0)
 
     def _run(self) -> None:
         tokens = (ct.c_ssize_t * _AT_ONCE)()
-        while True:
+        was_set = ct.c_bool()
+        while not self._closed:
             triggered = lib.dds_waitset_wait(self._waitset, tokens, _AT_ONCE, INFINITY)
             if triggered < 0:
                 return
             for token in tokens[: min(triggered, _AT_ONCE)]:
-                if token == _STOP:
-                    return
-                handler = self._handlers.get(token)
-                if handler is None:
+                if token != _WAKE_UP:
+                    self._call(self._handlers.get(token))
                     continue
-                try:
-                    handler()
-                except Exception:
-                    logging.getLogger(__name__).exception("a callback of the transport failed")
+                lib.dds_take_guardcondition(self._wake_up, ct.byref(was_set))
+                while self._soon:
+                    self._call(self._soon.popleft())
+
+    def _call(self, handler: Callable[[], None] | None) -> None:
+        if handler is None or self._closed:
+            return
+        try:
+            handler()
+        except Exception:
+            logging.getLogger(__name__).exception("a callback of the transport failed")

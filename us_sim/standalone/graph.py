@@ -111,7 +111,7 @@ class Graph:
 
     def endpoints(self, topic: str | None = None) -> list[GraphEndpoint]:
         """All endpoints, or those on one DDS topic."""
-        self._refresh()
+        self._refresh_early()
         with self._lock:
             return [
                 endpoint
@@ -121,7 +121,7 @@ class Graph:
 
     def nodes(self) -> list[GraphNode]:
         """All nodes: this participant's first, then the others'."""
-        self._refresh()
+        self._refresh_early()
         with self._lock:
             others = [
                 replace(node, enclave=self._enclaves[gid])
@@ -141,18 +141,26 @@ class Graph:
                 for node in nodes
             )
             self._writer.write(serialize(_to_message(self._participant.gid, self._announced)))
-        self._notify()
+        self._participant._dispatcher.call_soon(self._notify)
 
     def close(self) -> None:
-        """Learn nothing more."""
+        """Learn nothing more, and forget everything."""
         with self._lock:
             self._closed = True
             self.on_change = None
+            self._announced = ()
+            for known in (self._endpoints, self._enclaves, self._nodes):
+                known.clear()
 
     def _something_came(self) -> None:
         # Reading leaves nothing to trigger on, so the status needs no separate reset.
         if self._refresh():
             self._notify()
+
+    def _refresh_early(self) -> None:
+        """Take in what the dispatcher has not seen yet, and have ``on_change`` told of it."""
+        if self._refresh():
+            self._participant._dispatcher.call_soon(self._notify)
 
     def _notify(self) -> None:
         callback = self.on_change

@@ -61,8 +61,8 @@ def service_class(name: str) -> type[Service]:
     Raises:
         InterfaceError: there is no such service.
     """
-    package, folder, short_name = name.split("/")
-    if folder != "srv" or short_name not in service_names(package):
+    package, _, short_name = name.rpartition("/srv/")
+    if short_name not in service_names(package):
         raise InterfaceError(
             f"there is no service {name!r} without ROS 2; there are rcl_interfaces' and std_srvs'"
         )

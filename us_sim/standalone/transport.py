@@ -70,8 +70,20 @@ class _Endpoint:
         self._closed = False
         self.qos = qos
         self.gid = guid_of(handle)  # 16 bytes
-        self.on_event: Callable[[EndpointEvent], None] | None = None
+        self._on_event: Callable[[EndpointEvent], None] | None = None
         self._token = participant._dispatcher.attach(handle, self._mask(), self._status_changed)
+
+    @property
+    def on_event(self) -> Callable[[EndpointEvent], None] | None:
+        """Called with each `EndpointEvent`, also with those from before it was set."""
+        return self._on_event
+
+    @on_event.setter
+    def on_event(self, callback: Callable[[EndpointEvent], None] | None) -> None:
+        self._on_event = callback
+        if not self._closed:
+            check(lib.dds_set_status_mask(self._handle, self._mask()), "the endpoint is closed")
+            self._participant._dispatcher.call_soon(self._status_changed)
 
     def matched_count(self) -> int:
         """How many endpoints are connected to this one."""
@@ -107,7 +119,8 @@ class _Endpoint:
             lib.dds_builtintopic_free_endpoint(endpoint)
 
     def _mask(self) -> int:
-        return status_mask(self._side)
+        # Statuses that nobody asks for are left alone, so that who asks later still learns of them.
+        return 0 if self._on_event is None else status_mask(self._side)
 
     def _status_changed(self) -> None:
         status = ct.c_uint32()
@@ -116,15 +129,16 @@ class _Endpoint:
         self._notify(status.value)
 
     def _notify(self, status: int) -> None:
-        if self.on_event is not None:
+        callback = self._on_event
+        if callback is not None:
             for event in read_events(self._handle, self._side, status):
-                self.on_event(event)
+                callback(event)
 
 
 class Writer(_Endpoint):
     """Publishes serialized samples.
 
-    ``on_event`` may be set to a function of an `EndpointEvent`; it is called from another thread.
+    ``on_event`` may be set to a function of an `EndpointEvent`, which another thread calls.
     """
 
     _side = "subscription"
@@ -196,19 +210,18 @@ class Reader(_Endpoint):
 
     def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
         self._on_data: Callable[[], None] | None = None
-        self._missed_data = False
         super().__init__(participant, handle, qos)
 
     @property
     def on_data(self) -> Callable[[], None] | None:
+        """Called when data may be waiting, and once after it was set."""
         return self._on_data
 
     @on_data.setter
     def on_data(self, callback: Callable[[], None] | None) -> None:
         self._on_data = callback
-        if callback is not None and self._missed_data:
-            self._missed_data = False
-            callback()
+        if callback is not None:
+            self._participant._dispatcher.call_soon(callback)
 
     def take(self) -> tuple[bytes, SampleInfo] | None:
         """The oldest sample that is waiting, removed from the reader; None if there is none."""
@@ -235,11 +248,9 @@ class Reader(_Endpoint):
         return super()._mask() | _DATA_AVAILABLE
 
     def _notify(self, status: int) -> None:
-        if status & _DATA_AVAILABLE:
-            if self._on_data is None:
-                self._missed_data = True
-            else:
-                self._on_data()
+        callback = self._on_data
+        if status & _DATA_AVAILABLE and callback is not None:
+            callback()
         super()._notify(status)
 
 
@@ -329,7 +340,7 @@ class Participant:
                 return
             self._closed = True
         _open_participants.discard(self)
-        self._dispatcher.close()
+        self._silence()
         self.graph.close()
         for endpoint in list(self._endpoints):
             endpoint._closed = True
@@ -341,6 +352,13 @@ class Participant:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _silence(self) -> None:
+        """Receive nothing more and end the thread that calls back."""
+        for endpoint in list(self._endpoints):
+            if isinstance(endpoint, Reader):
+                endpoint._closed = True
+        self._dispatcher.close()
 
     def _resolve(self, dds_topic: str, qos: Any, is_writer: bool) -> EndpointQos:
         if self._closed:
@@ -377,7 +395,10 @@ _open_participants: weakref.WeakSet[Participant] = weakref.WeakSet()
 @atexit.register
 def _leave_all_domains() -> None:
     """Tell the others at once, instead of letting their leases on us run out (10 s)."""
-    for participant in list(_open_participants):
+    participants = list(_open_participants)
+    for participant in participants:
+        participant._silence()  # before any is gone, as callbacks may use all of them
+    for participant in participants:
         participant.close()
 
 

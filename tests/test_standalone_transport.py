@@ -1,0 +1,533 @@
+"""Serialized samples, graph and services over DDS, between participants and between processes."""
+
+import array
+import doctest
+import importlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+
+import pytest
+
+from us_sim.standalone.domain import DiscoveryRange
+from us_sim.standalone.endpoint_qos import EndpointQos, qos_of_profile
+from us_sim.standalone.graph import GraphNode
+from us_sim.standalone.messages import deserialize, message_class, serialize, service_class
+from us_sim.standalone.services import ServiceClient, ServiceServer
+from us_sim.standalone.transport import DdsError, Participant
+
+LOCALHOST = DiscoveryRange("LOCALHOST")
+IMAGE = "sensor_msgs::msg::dds_::Image_"
+STRING = "std_msgs::msg::dds_::String_"
+RELIABLE = EndpointQos(depth=10)
+LATCHED = EndpointQos(depth=1, durability=EndpointQos.TRANSIENT_LOCAL)
+BEST_EFFORT = EndpointQos(depth=1, reliability=EndpointQos.BEST_EFFORT)
+HELLO = serialize(message_class("std_msgs/msg/String")(data="hello"))
+
+
+class Doorbell:
+    """Rung by the transport's thread; a test waits on it until something holds."""
+
+    def __init__(self) -> None:
+        self._rung = threading.Event()
+
+    def ring(self, *_: object) -> None:
+        self._rung.set()
+
+    def wait_until(self, condition: Callable[[], object], timeout: float = 10.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            remaining = deadline - time.monotonic()
+            assert remaining > 0, "what was waited for did not happen"
+            self._rung.wait(remaining)
+            self._rung.clear()
+
+
+@pytest.fixture(scope="module")
+def domain() -> int:
+    return random.Random().randint(1, 100)
+
+
+@pytest.fixture
+def participant(domain: int) -> Iterator[Participant]:
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def neighbour(domain: int) -> Iterator[Participant]:
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def bell() -> Doorbell:
+    return Doorbell()
+
+
+class Child:
+    """Another process that runs ``script`` with the domain as its argument."""
+
+    def __init__(self, script: str, domain: int) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", script, str(domain)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+        )
+
+    def __enter__(self) -> "Child":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.send_signal(signal.SIGCONT)
+        self.process.kill()
+        self.process.communicate()
+
+
+ECHO = """
+import sys, threading
+from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.messages import deserialize, message_class, serialize
+from us_sim.standalone.transport import Participant
+Image, dds_type = message_class("sensor_msgs/msg/Image"), "sensor_msgs::msg::dds_::Image_"
+participant = Participant(int(sys.argv[1]))
+writer = participant.create_writer("rt/pong", dds_type, EndpointQos())
+reader = participant.create_reader("rt/ping", dds_type, EndpointQos())
+came = threading.Event()
+reader.on_data = came.set
+while came.wait():
+    came.clear()
+    while (sample := reader.take()) is not None:
+        writer.write(serialize(deserialize(sample[0], Image)))
+"""
+
+
+def connected_pair(participant, bell, qos=RELIABLE, dds_type=IMAGE):
+    writer = participant.create_writer("rt/ping", dds_type, qos)
+    reader = participant.create_reader("rt/pong", dds_type, qos)
+    writer.on_event = reader.on_event = reader.on_data = bell.ring
+    bell.wait_until(lambda: writer.matched_count() and reader.matched_count())
+    return writer, reader
+
+
+def take_one(reader, bell):
+    taken = []
+    bell.wait_until(lambda: taken.append(reader.take()) or taken[-1] is not None)
+    return taken[-1]
+
+
+def test_an_image_goes_to_another_process_and_back_within_two_milliseconds(
+    participant, domain, bell
+):
+    Image = message_class("sensor_msgs/msg/Image")
+    image = Image(height=512, width=512, encoding="mono8", step=512)
+    image.data = array.array("B", os.urandom(512 * 512))
+    seconds = []
+    with Child(ECHO, domain):
+        writer, reader = connected_pair(participant, bell)
+        for _ in range(60):
+            start = time.perf_counter()
+            assert writer.write(serialize(image))
+            back = deserialize(take_one(reader, bell)[0], Image)
+            seconds.append(time.perf_counter() - start)
+            assert back.data == image.data
+    assert sorted(seconds)[len(seconds) // 2] < 2e-3
+
+
+def test_messages_of_all_sizes_arrive_as_they_were_sent(participant, domain, bell):
+    Image = message_class("sensor_msgs/msg/Image")
+    with Child(ECHO, domain):
+        writer, reader = connected_pair(participant, bell)
+        for size in (0, 1, 2, 3, 4, 1343, 1345, 65_499, 65_537, 1_048_576, 3_000_001):
+            data = serialize(Image(encoding="x" * (size % 5), data=os.urandom(size)))
+            writer.write(data)
+            received, info = take_one(reader, bell)
+            assert received == data
+            assert 0 < info.source_timestamp <= info.received_timestamp
+
+
+def test_a_latched_sample_reaches_who_comes_later(participant, neighbour, bell):
+    writer = participant.create_writer("rt/latched", STRING, LATCHED)
+    writer.write(serialize(message_class("std_msgs/msg/String")(data="old")))
+    writer.write(HELLO)
+    reader = neighbour.create_reader("rt/latched", STRING, LATCHED)
+    volatile = neighbour.create_reader("rt/latched", STRING, RELIABLE)
+    reader.on_data = volatile.on_event = bell.ring
+    assert take_one(reader, bell)[0] == HELLO
+    assert reader.take() is None
+    bell.wait_until(volatile.matched_count)
+    assert volatile.take() is None
+
+
+def test_data_that_came_before_the_callback_is_announced_to_it(participant, bell):
+    reader = participant.create_reader("rt/early", STRING, RELIABLE)
+    participant.create_writer("rt/early", STRING, RELIABLE).write(HELLO)
+    taken = []
+
+    def take():
+        taken.append(reader.take())
+        bell.ring()
+
+    reader.on_data = take
+    bell.wait_until(lambda: taken)
+    assert taken[0][0] == HELLO
+
+
+def test_a_participant_can_leave_out_its_own_samples(participant, neighbour, bell):
+    writer = participant.create_writer("rt/own", STRING, RELIABLE)
+    own = participant.create_reader("rt/own", STRING, RELIABLE, ignore_own=True)
+    other = neighbour.create_reader("rt/own", STRING, RELIABLE)
+    other.on_data = bell.ring
+    writer.write(HELLO)
+    assert take_one(other, bell)[0] == HELLO
+    assert own.take() is None
+
+
+def test_keep_last_keeps_the_newest(participant):
+    reader = participant.create_reader("rt/newest", STRING, EndpointQos(depth=2))
+    writer = participant.create_writer("rt/newest", STRING, RELIABLE)
+    for letter in "abc":
+        writer.write(b"\0\1\0\0" + letter.encode() * 4)
+    assert [reader.take()[0][4:], reader.take()[0][4:]] == [b"bbbb", b"cccc"]
+    assert reader.take() is None
+    assert writer.wait_for_acked(1.0)
+
+
+def test_incompatible_quality_of_service_is_reported_to_both(participant, neighbour, bell):
+    events = []
+
+    def remember(event):
+        events.append(event)
+        bell.ring()
+
+    writer = participant.create_writer("rt/quality", STRING, BEST_EFFORT)
+    reader = neighbour.create_reader("rt/quality", STRING, RELIABLE)
+    writer.on_event = reader.on_event = remember
+    late = neighbour.create_reader("rt/quality", STRING, LATCHED)
+    late.on_event = remember
+    bell.wait_until(lambda: len(events) >= 2)
+    assert {event.kind for event in events} == {"incompatible_qos"}
+    assert all(event.policy in ("RELIABILITY", "DURABILITY") for event in events)
+    assert writer.matched_count() == reader.matched_count() == late.matched_count() == 0
+
+
+def test_matches_are_reported_and_counted(participant, neighbour, bell):
+    events = []
+    writer = participant.create_writer("rt/matched", STRING, RELIABLE)
+    writer.on_event = lambda event: (events.append(event), bell.ring())
+    reader = neighbour.create_reader("rt/matched", STRING, BEST_EFFORT, "typehash=abc;")
+    bell.wait_until(lambda: len(events) == 1)
+    assert writer.matched_user_data() == [{"typehash": "abc"}]
+    reader.close()
+    bell.wait_until(lambda: len(events) == 2)
+    assert [(event.kind, event.current_count, event.current_count_change) for event in events] == [
+        ("matched", 1, 1),
+        ("matched", 0, -1),
+    ]
+    assert writer.matched_count() == 0
+
+
+LISTENER = """
+import sys
+from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.graph import GraphNode
+from us_sim.standalone.transport import Participant
+participant = Participant(int(sys.argv[1]))
+reader = participant.create_reader(
+    "rt/ping", "sensor_msgs::msg::dds_::Image_", EndpointQos(), "typehash=RIHS01_12;"
+)
+participant.graph.announce([GraphNode("/us", "listener", (reader.gid,))])
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_graph_shows_nodes_and_endpoints_of_other_processes(participant, domain, bell):
+    graph = participant.graph
+    graph.on_change = bell.ring
+    writer = participant.create_writer("rt/ping", IMAGE, LATCHED)
+    graph.announce([GraphNode("/", "here", writer_gids=(writer.gid,))])
+    with Child(LISTENER, domain):
+        bell.wait_until(lambda: len(graph.nodes()) == 2 and len(graph.endpoints("rt/ping")) == 2)
+        here, there = graph.nodes()
+        assert (here.namespace, here.name, here.participant) == ("/", "here", participant.gid)
+        assert (there.namespace, there.name, there.enclave) == ("/us", "listener", "/")
+        endpoints = {endpoint.is_writer: endpoint for endpoint in graph.endpoints("rt/ping")}
+        assert endpoints[True].gid == writer.gid
+        assert endpoints[True].qos == LATCHED
+        assert endpoints[False].gid == there.reader_gids[0]
+        assert endpoints[False].participant == there.participant
+        assert endpoints[False].type_name == IMAGE
+        assert endpoints[False].qos == RELIABLE
+        assert endpoints[False].user_data == {"typehash": "RIHS01_12"}
+
+
+ANNOUNCER_THAT_ENDS = LISTENER.replace("sys.stdin.read()", "")
+
+
+def test_who_ends_is_gone_from_the_graph_at_once(participant, domain, bell):
+    participant.graph.on_change = bell.ring
+    child = Child(ANNOUNCER_THAT_ENDS, domain)
+    assert child.process.wait(10) == 0
+    bell.wait_until(
+        lambda: not participant.graph.nodes() and not participant.graph.endpoints("rt/ping"), 2.0
+    )
+    assert child.process.communicate() == ("ready\n", "")
+
+
+BUSY_UNTIL_THE_END = """
+import sys, threading, time
+from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.transport import Participant
+first, second = Participant(int(sys.argv[1])), Participant(int(sys.argv[1]))
+topic = ("rt/busy", "std_msgs::msg::dds_::String_", EndpointQos())
+writer, reader = first.create_writer(*topic), second.create_reader(*topic)
+received = []
+def take():
+    while reader.take() is not None:
+        received.append(1)
+        writer.write(bytes.fromhex("00010000 00000000"))
+reader.on_data = take
+writer.write(bytes.fromhex("00010000 00000000"))
+while len(received) < 20:
+    time.sleep(0.001)
+print(time.time(), flush=True)
+"""
+
+
+def test_a_process_ends_quickly_and_silently_with_traffic_going_on(domain):
+    child = Child(BUSY_UNTIL_THE_END, domain)
+    output, errors = child.process.communicate(timeout=20)
+    assert time.time() - float(output) < 0.3
+    assert errors == ""
+    assert child.process.returncode == 0
+
+
+def test_a_suspended_reader_does_not_block_a_keep_last_writer(participant, domain, bell):
+    with Child(LISTENER, domain) as child:
+        writer = participant.create_writer("rt/ping", IMAGE, RELIABLE)
+        writer.on_event = bell.ring
+        bell.wait_until(writer.matched_count)
+        child.process.send_signal(signal.SIGSTOP)
+        longest = 0.0
+        for _ in range(100):
+            start = time.perf_counter()
+            assert writer.write(b"\0\1\0\0" + bytes(262_144))
+            longest = max(longest, time.perf_counter() - start)
+        assert longest < 0.1
+        start = time.perf_counter()
+        writer.close()
+        assert time.perf_counter() - start < 0.5
+
+
+def test_a_service_answers_its_client(participant, neighbour, bell):
+    SetBool = service_class("std_srvs/srv/SetBool")
+    client = ServiceClient(neighbour, "/node/set", "std_srvs/srv/SetBool", RELIABLE)
+    other = ServiceClient(neighbour, "/node/set", "std_srvs/srv/SetBool", RELIABLE)
+    assert not client.service_is_ready()
+    server = ServiceServer(participant, "/node/set", "std_srvs/srv/SetBool", RELIABLE)
+    neighbour.graph.on_change = client.on_data = bell.ring
+    bell.wait_until(client.service_is_ready)
+
+    def answer():
+        while (taken := server.take_request()) is not None:
+            request = deserialize(taken[0], SetBool.Request)
+            response = SetBool.Response(success=not request.data, message="ünïcode")
+            assert server.send_response(serialize(response), taken[1])
+
+    server.on_data = answer
+    numbers = [client.send_request(serialize(SetBool.Request(data=data))) for data in (True, False)]
+    received = []
+
+    def both_came():
+        while (taken := client.take_response()) is not None:
+            received.append(taken)
+        return len(received) == 2
+
+    bell.wait_until(both_came)
+    assert [header.sequence for _, header in received] == numbers
+    responses = [deserialize(data, SetBool.Response) for data, _ in received]
+    assert [response.success for response in responses] == [False, True]
+    assert responses[0].message == "ünïcode"
+    assert other.take_response() is None
+    server.close()
+    bell.wait_until(lambda: not client.service_is_ready())
+
+
+def test_service_endpoints_are_named_as_rmw_cyclonedds_names_them(participant):
+    server = ServiceServer(participant, "/n/get", "rcl_interfaces/srv/GetParameters", RELIABLE)
+    request = participant.graph.endpoints("rq/n/getRequest")[0]
+    reply = participant.graph.endpoints("rr/n/getReply")[0]
+    assert (request.gid, reply.gid) == (server.reader_gid, server.writer_gid)
+    assert (request.is_writer, reply.is_writer) == (False, True)
+    assert request.type_name == "rcl_interfaces::srv::dds_::GetParameters_Request_"
+    assert reply.type_name == "rcl_interfaces::srv::dds_::GetParameters_Response_"
+    assert request.user_data["serviceid"] == reply.user_data["serviceid"]
+    assert reply.user_data["typehash"].startswith("RIHS01_")
+
+
+def test_what_was_closed_is_closed(domain):
+    participant = Participant(domain, reach=LOCALHOST)
+    writer = participant.create_writer("rt/closed", STRING, RELIABLE)
+    reader = participant.create_reader("rt/closed", STRING, RELIABLE)
+    writer.write(HELLO)
+    writer.close()
+    writer.close()
+    with pytest.raises(DdsError, match="the writer is closed"):
+        writer.write(HELLO)
+    participant.close()
+    participant.close()
+    assert reader.take() is None
+    assert reader.matched_count() == 0
+    assert participant.graph.endpoints() == participant.graph.nodes() == []
+    participant.graph.announce([])
+    with pytest.raises(DdsError, match="the participant is closed"):
+        participant.create_reader("rt/closed", STRING, RELIABLE)
+
+
+def test_closing_from_a_callback_does_not_deadlock(domain, bell):
+    participant = Participant(domain, reach=LOCALHOST)
+    reader = participant.create_reader("rt/suicide", STRING, RELIABLE)
+    closed = []
+
+    def close():
+        participant.close()
+        closed.append(True)
+        bell.ring()
+
+    reader.on_data = close
+    participant.create_writer("rt/suicide", STRING, RELIABLE).write(HELLO)
+    bell.wait_until(lambda: closed)
+
+
+def test_bytes_that_are_no_sample_are_refused(participant):
+    writer = participant.create_writer("rt/nothing", STRING, RELIABLE)
+    for data in (b"", b"abc", b"\0\1\0\0", b"\xff\xff\0\0abcd"):
+        with pytest.raises(DdsError, match="not a sample"):
+            writer.write(data)
+
+
+@pytest.mark.usefixtures("participant")
+def test_one_process_cannot_reach_two_ways_in_a_domain(domain):
+    with pytest.raises(DdsError, match="discovery range LOCALHOST"):
+        Participant(domain, reach=DiscoveryRange("SUBNET"))
+
+
+@pytest.mark.parametrize("number", [-1, 233])
+def test_a_domain_that_does_not_exist_is_refused(number):
+    with pytest.raises(DdsError, match="not one of 0 to 232"):
+        Participant(number, reach=LOCALHOST)
+
+
+def test_participants_with_range_off_meet_nobody_else(domain):
+    with (
+        Participant(domain, reach=DiscoveryRange("OFF")) as alone,
+        Child(LISTENER, domain) as child,
+    ):
+        assert child.process.stdout.readline() == "ready\n"
+        assert alone.graph.nodes() == []
+        assert alone.graph.endpoints("rt/ping") == []
+
+
+def test_the_environment_decides_the_discovery_range():
+    assert DiscoveryRange.from_environment({}) == DiscoveryRange("SUBNET")
+    assert DiscoveryRange.from_environment({"ROS_LOCALHOST_ONLY": "1"}).name == "LOCALHOST"
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOCALHOST_ONLY": "0"}
+    assert DiscoveryRange.from_environment(environment).name == "OFF"
+    with pytest.raises(DdsError, match="SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT"):
+        DiscoveryRange.from_environment({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"})
+
+
+def test_the_configuration_follows_the_discovery_range():
+    localhost = DiscoveryRange("LOCALHOST", ("pc<2>",)).configuration()
+    assert "address='127.0.0.1'" in localhost
+    assert "<AllowMulticast>false</AllowMulticast>" in localhost
+    assert "<Peer address='localhost'/><Peer address='pc&lt;2&gt;'/>" in localhost
+    subnet = DiscoveryRange("SUBNET", ("10.0.0.5",)).configuration()
+    assert "<Peers><Peer address='10.0.0.5'/></Peers>" in subnet
+    assert "AllowMulticast" not in subnet
+    off = DiscoveryRange("OFF", ("10.0.0.5",)).configuration()
+    assert f"<Tag>ros_discovery_off_{os.getpid()}</Tag>" in off
+    assert "Peer" not in off
+    assert "Participant" not in DiscoveryRange("SYSTEM_DEFAULT", ("a",)).configuration()
+
+
+def profile(**changes):
+    values = {
+        "reliability": 1,
+        "durability": 2,
+        "history": 1,
+        "depth": 10,
+        "deadline": SimpleNamespace(nanoseconds=0),
+        "lifespan": SimpleNamespace(nanoseconds=0),
+        "liveliness": 0,
+        "liveliness_lease_duration": SimpleNamespace(nanoseconds=2**63 - 1),
+    }
+    return SimpleNamespace(**values | changes)
+
+
+def test_a_profile_of_rclpys_becomes_policies():
+    assert qos_of_profile(profile(), True, ()) == EndpointQos()
+    system = profile(reliability=0, durability=0, history=0, depth=0)
+    assert qos_of_profile(system, False, ()) == EndpointQos(depth=1)
+    timed = profile(deadline=SimpleNamespace(nanoseconds=5), history=2, liveliness=3)
+    assert qos_of_profile(timed, True, ()) == EndpointQos(deadline=5, history=2, liveliness=3)
+
+
+def test_best_available_follows_the_other_side():
+    best = profile(
+        reliability=4, durability=4, liveliness=5, deadline=SimpleNamespace(nanoseconds=2**63 - 2)
+    )
+    latched, sensor = EndpointQos(durability=1, deadline=7), EndpointQos(reliability=2, deadline=9)
+    writer = EndpointQos(durability=1, deadline=7)
+    assert qos_of_profile(best, True, (latched, sensor)) == writer
+    assert qos_of_profile(best, False, (latched,)) == EndpointQos(durability=1, deadline=7)
+    assert qos_of_profile(best, False, (latched, sensor)) == EndpointQos(reliability=2, deadline=9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"reliability": 3}, "reliability policy 3 is unknown"),
+        ({"durability": 3}, "durability policy 3 is unknown"),
+        ({"history": 3}, "history policy 3 is unknown"),
+        ({"liveliness": 4}, "liveliness policy 4 is unknown"),
+        ({"depth": -1}, "depth of -1"),
+    ],
+)
+def test_an_unknown_policy_is_refused(changes, sentence):
+    with pytest.raises(DdsError, match=sentence):
+        qos_of_profile(profile(**changes), True, ())
+
+
+def test_all_policies_reach_the_other_side(participant, neighbour, bell):
+    asked = EndpointQos(
+        durability=EndpointQos.TRANSIENT_LOCAL,
+        history=EndpointQos.KEEP_ALL,
+        depth=0,
+        deadline=2_000_000_000,
+        lifespan=3_000_000_000,
+        liveliness=EndpointQos.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=4_000_000_000,
+    )
+    writer = participant.create_writer("rt/policies", STRING, asked)
+    neighbour.graph.on_change = bell.ring
+    bell.wait_until(lambda: neighbour.graph.endpoints("rt/policies"))
+    assert neighbour.graph.endpoints("rt/policies")[0].qos == asked
+    writer.assert_liveliness()
+
+
+@pytest.mark.parametrize("name", ["ddsc", "endpoint_qos", "domain", "transport"])
+def test_examples(name):
+    result = doctest.testmod(importlib.import_module(f"us_sim.standalone.{name}"))
+    assert result.attempted > 0
+    assert result.failed == 0
