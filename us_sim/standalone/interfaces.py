@@ -68,13 +68,15 @@ _SERVICES = {
     "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
 }
 
-# The only defaults that Jazzy's common interfaces declare (rosbags drops them).
-_DEFAULTS = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
+# The defaults in Jazzy's .msg files that are not zero anyway (rosbags drops them).
+_DEFAULTS = {
+    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("sensor_msgs/msg/NavSatStatus", "status"): -2,
+}
 
 _IDL_NAMES = {
     "bool": "boolean",
     "byte": "octet",
-    "char": "uint8",
     "float32": "float",
     "float64": "double",
 }
@@ -196,6 +198,11 @@ def type_hash(name: str) -> str:
 def _typestore() -> Any:
     """rosbags' Jazzy store with the services' messages, as rosidl derives them, added."""
     store = get_typestore(Stores.ROS2_JAZZY)
+    for name, (constants, fields) in store.fielddefs.items():
+        store.fielddefs[name] = (
+            constants,
+            [(field, _without_char(kind)) for field, kind in fields],
+        )
     for service, texts in _SERVICES.items():
         package = service.split("/")[0]
         for part, text in zip(("Request", "Response"), texts, strict=True):
@@ -220,6 +227,14 @@ def _typestore() -> Any:
             ],
         )
     return store
+
+
+def _without_char(description: Any) -> Any:
+    """The description with uint8 for char, which in ROS 2 is only another name for it."""
+    kind, content = description
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return kind, (_without_char(content[0]), content[1])
+    return (kind, ("uint8", 0)) if content == ("char", 0) else description
 
 
 def _field(owner: str, name: str, description: Any) -> Field:

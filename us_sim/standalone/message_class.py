@@ -29,7 +29,6 @@ __all__ = ["ARRAY_TYPES", "Message", "message_class"]
 
 # Primitive: (array.array type code, NumPy dtype) of the sequences and arrays that rosidl packs.
 ARRAY_TYPES: dict[str, tuple[str, Any]] = {
-    "char": ("B", np.uint8),
     "float32": ("f", np.float32),
     "float64": ("d", np.float64),
     "int8": ("b", np.int8),
@@ -43,7 +42,6 @@ ARRAY_TYPES: dict[str, tuple[str, Any]] = {
 }
 
 _INTEGERS = {
-    "char": (0, 2**8 - 1),
     **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
     **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
 }
