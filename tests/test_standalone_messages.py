@@ -99,17 +99,17 @@ def test_type_hashes_are_those_that_rosbag2_recorded(shared_data):
 
 
 def test_type_hashes_are_those_of_jazzys_own_packages():
-    # From share/*/*/*.json of a Jazzy installation.
+    # From share/*/*/*.json of a Jazzy installation; sixteen digits will do.
     hashes = {
-        "rmw_dds_common/msg/ParticipantEntitiesInfo": "91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",
-        "std_msgs/msg/Char": "3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9",
-        "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
-        "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
-        "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
-        "visualization_msgs/msg/MarkerArray": "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
-        "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+        "rmw_dds_common/msg/ParticipantEntitiesInfo": "91a0593bacdcc50e",
+        "std_msgs/msg/Char": "3ad2d04dd29ba19d",
+        "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9c",
+        "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8",
+        "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d2",
+        "visualization_msgs/msg/MarkerArray": "86cb8800b6fb05b5",
+        "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb250",
     }
-    assert {name: type_hash(name).removeprefix("RIHS01_") for name in hashes} == hashes
+    assert {name: type_hash(name).removeprefix("RIHS01_")[:16] for name in hashes} == hashes
 
 
 @pytest.mark.parametrize("package", packages())
