@@ -67,7 +67,7 @@ class Volume:
     @cached_property
     def patient_to_index(self) -> NDArray[np.float64]:
         """(4, 4) affine from frame ``patient``, m, to voxel indices."""
-        inverse: NDArray[np.float64] = np.linalg.inv(self.index_to_patient)
+        inverse = np.asarray(np.linalg.inv(self.index_to_patient), dtype=np.float64)
         inverse.flags.writeable = False
         return inverse
 

@@ -1,0 +1,148 @@
+"""Procedural phantoms: labelled ultrasound volumes made from a seed, and kept once made.
+
+>>> from us_sim.volume.phantom import upper_arm
+>>> arm = upper_arm(seed=1, voxel_size=2e-3)
+>>> arm.shape, arm.label_names[6]
+((36, 30, 27), 'vein')
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.phantom_cache import kept_volume
+from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
+from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+from us_sim.volume.volume import Volume
+
+__all__ = ["PHANTOMS", "cached_phantom", "upper_arm"]
+
+Progress = Callable[[float, str], None]
+
+# Raised whenever a change here, or in what this calls, changes a phantom's bytes: it is part of
+# the cache's key.
+_GENERATOR = 1
+
+_NOISE_FLOOR = -68.0  # dB at the skin
+_NOISE_GAIN = 160.0  # dB/m, as the time gain amplifies noise too
+
+
+def upper_arm(
+    seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
+) -> Volume:
+    """A labelled upper arm with the skin at z = 0, as a 60 dB B-mode image shows it.
+
+    The same seed and voxel size give the same bytes with the same NumPy and SciPy (bit generator
+    PCG64); another voxel size shows the same anatomy with other speckle.
+
+    Args:
+        seed: not negative.
+        voxel_size: m, 0.2 mm (1.1 GB while it is made) to 5 mm.
+        progress: told the fraction done and what is being done.
+
+    Raises:
+        VolumeError: the seed or the voxel size is out of range.
+    """
+    if seed < 0:
+        raise VolumeError(f"the seed of a phantom must not be negative, not {seed}")
+    if not 0.2e-3 <= voxel_size <= 5e-3:
+        raise VolumeError(
+            f"the voxel size of a phantom must be 0.2 mm to 5 mm, not {voxel_size * 1e3:g} mm"
+        )
+    report = progress or _silent
+    shape = np.ceil(np.diff(UPPER_ARM_BLOCK, axis=0)[0] / voxel_size - 1e-6).astype(int)
+    lower = UPPER_ARM_BLOCK.mean(axis=0) - shape / 2 * voxel_size
+    lower[2] = UPPER_ARM_BLOCK[0, 2]
+    spread = PointSpread()
+    depth = np.arange(shape[2]) * voxel_size
+    margin = np.ceil(np.array(spread.reach(depth)) / voxel_size).astype(int)
+    x, y, z = (
+        lower[axis] + (np.arange(-margin[axis], shape[axis] + margin[axis]) + 0.5) * voxel_size
+        for axis in range(3)
+    )
+    inside = tuple(slice(m, m + n) for m, n in zip(margin, shape, strict=True))
+
+    arm = UpperArm(seed)
+    labels = np.empty((len(x), len(y), len(z)), dtype=np.uint8)
+    diffuse = np.empty(labels.shape, dtype=np.float32)
+    specular = np.empty(labels.shape, dtype=np.float32)
+    for j, at in enumerate(y):
+        section = arm.section(x, float(at), z)
+        labels[:, j], diffuse[:, j] = section.labels, section.diffuse
+        specular[:, j] = section.specular
+        if j % 10 == 0:
+            report(0.8 * j / len(y), "laying out the tissue")
+    report(0.8, "scattering")
+    random = np.random.Generator(np.random.PCG64([seed, 1]))
+    envelope = echo_envelope(diffuse, specular, voxel_size, z, spread, random)
+    del diffuse, specular
+    report(0.95, "compressing")
+    envelope = np.ascontiguousarray(envelope[inside])
+    _add_noise(envelope, z[inside[2]], random)
+    volume = Volume(
+        log_compress(envelope),
+        _placement(lower + 0.5 * voxel_size, voxel_size),
+        labels[inside],
+        {number: name for name, number in UPPER_ARM_LABELS.items()},
+    )
+    report(1.0, "done")
+    return volume
+
+
+PHANTOMS: dict[str, Callable[[int, float, Progress | None], Volume]] = {"upper_arm": upper_arm}
+
+
+def cached_phantom(
+    name: str, seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
+) -> Volume:
+    """A phantom from the user's cache folder, made there first if it is not in it yet.
+
+    Its arrays are memory-mapped, so processes share them. Processes that ask at once wait for
+    the one that makes it; a damaged entry is made again, and a warning is logged.
+
+    Args:
+        name: one of PHANTOMS.
+        seed: see the phantom.
+        voxel_size: m.
+        progress: told the fraction done and what is being done; not called where the phantom is
+            in the cache already.
+
+    Raises:
+        VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
+    """
+    if name not in PHANTOMS:
+        raise VolumeError(f"there is no phantom named {name}; there is {', '.join(PHANTOMS)}")
+    decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
+    key = f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
+
+    def waiting() -> None:
+        if progress is not None:
+            progress(0.0, "waiting for another process that makes it")
+
+    return kept_volume(key, lambda: PHANTOMS[name](seed, voxel_size, progress), waiting)
+
+
+def _silent(fraction: float, text: str) -> None:
+    del fraction, text
+
+
+def _add_noise(
+    envelope: NDArray[np.float32], depth: NDArray[np.float64], random: np.random.Generator
+) -> None:
+    """Electronic noise, in place: power adds to power, and it does not pass the point spread."""
+    level = 10.0 ** ((_NOISE_FLOOR + _NOISE_GAIN * depth) / 20.0)
+    noise = random.standard_exponential(envelope.shape, dtype=np.float32)
+    envelope *= envelope
+    envelope += noise * (level**2).astype(np.float32)
+    np.sqrt(envelope, out=envelope)
+
+
+def _placement(first: NDArray[np.float64], voxel_size: float) -> NDArray[np.float64]:
+    placement = np.diag([voxel_size, voxel_size, voxel_size, 1.0])
+    placement[:3, 3] = first
+    return placement

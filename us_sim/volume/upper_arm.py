@@ -1,0 +1,264 @@
+"""The anatomy of a virtual upper arm: what lies where, and how it echoes.
+
+A block of the inner side of the arm, the skin at z = 0, vessels and humerus along y. Proportions
+follow what ultrasound shows at mid-arm: the brachial artery between a vein and the median nerve,
+in a sheath under the fascia, biceps above and brachialis below, the humerus to one side.
+
+>>> import numpy as np
+>>> from us_sim.volume.upper_arm import UPPER_ARM_LABELS, UpperArm
+>>> arm = UpperArm(seed=1)
+>>> x, z = np.linspace(-0.036, 0.036, 90), np.linspace(0.0, 0.054, 70)
+>>> section = arm.section(x, 0.0, z)
+>>> bool((section.labels == UPPER_ARM_LABELS["vein"]).any())
+True
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from us_sim.volume.texture import SmoothNoise, sheets
+from us_sim.volume.tube import Tube
+
+__all__ = ["UPPER_ARM_BLOCK", "UPPER_ARM_LABELS", "ArmSection", "UpperArm"]
+
+# Lower and upper corner of the block in frame ``patient``, m.
+UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
+
+# Texture goes on this far beyond the block, m, whose edges' echoes come from there too.
+_MARGIN = np.array([[-5e-3], [5e-3]])
+
+UPPER_ARM_LABELS = {
+    "skin": 1,
+    "fat": 2,
+    "muscle": 3,
+    "bone": 4,
+    "artery": 5,
+    "vein": 6,
+    "nerve": 7,
+}
+
+# Attenuation there and back at 8 MHz, dB/m by label: twice 0.15 (blood) to 1 (skin) dB/cm/MHz;
+# bone's leaves nothing. The scanner's time gain gives back a little less than muscle takes.
+_ATTENUATION = np.array([0.0, 1600.0, 800.0, 950.0, 6000.0, 250.0, 250.0, 950.0])
+_TIME_GAIN = 820.0
+_SIDE_LOBES = -27.0  # dB
+
+
+@dataclass(frozen=True)
+class ArmSection:
+    """A cross-section of the arm at one y, on evenly spaced x (X,) and z (Z,)."""
+
+    x: NDArray[np.float64]  # (X,) m
+    y: float  # m
+    z: NDArray[np.float64]  # (Z,) m
+    labels: NDArray[np.uint8] = field(init=False)  # (X, Z)
+    diffuse: NDArray[np.float64] = field(init=False)  # (X, Z) rms echo of unresolved scatterers
+    specular: NDArray[np.float64] = field(init=False)  # (X, Z) echo of smooth interfaces
+
+    def __post_init__(self) -> None:
+        shape = (len(self.x), len(self.z))
+        object.__setattr__(self, "labels", np.zeros(shape, dtype=np.uint8))
+        object.__setattr__(self, "diffuse", np.zeros(shape))
+        object.__setattr__(self, "specular", np.zeros(shape))
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Distance between samples along x and z, m."""
+        return float(self.x[1] - self.x[0]), float(self.z[1] - self.z[0])
+
+    @property
+    def depth(self) -> NDArray[np.float64]:
+        """(Z,) m below the skin; 0 above it."""
+        return np.maximum(self.z, 0.0)
+
+    def fill(self, label: str, where: NDArray[np.bool_], echo: NDArray[np.float64]) -> None:
+        """Put a tissue with its own scatterers where another was."""
+        self.labels[where] = UPPER_ARM_LABELS[label]
+        self.diffuse[where] = echo[where]
+        self.specular[where] = 0.0
+
+    def interface(self, profile: NDArray[np.float64], level: float, share: float = 0.7) -> None:
+        """Add an echoing surface: a share of it smooth, the rest rough and so speckled."""
+        np.maximum(self.specular, share * _echo(level) * profile, out=self.specular)
+        np.maximum(self.diffuse, (1 - share) * _echo(level) * profile, out=self.diffuse)
+
+
+class UpperArm:
+    """An arm from a seed: it moves structures by half a millimetre and redraws every texture."""
+
+    def __init__(self, seed: int) -> None:
+        random = np.random.Generator(np.random.PCG64(seed))
+
+        def tube(x: float, z: float, radius_x: float, radius_z: float, swing: float) -> Tube:
+            shift_x, shift_z, size = random.uniform(-1.0, 1.0, 3) * (0.4e-3, 0.4e-3, 0.04)
+            radii = radius_x * (1 + size), radius_z * (1 + size)
+            return Tube((x + shift_x, z + shift_z), radii, (swing, 0.5 * swing), sway)
+
+        def noise(*lengths: float) -> SmoothNoise:
+            x, y, z = lengths
+            return SmoothNoise(random, UPPER_ARM_BLOCK + _MARGIN, (x, y, z))
+
+        # Bound in one sheath, vessels and nerve swing together.
+        sway = random.uniform(0.0, 2 * np.pi)
+        self.artery = tube(-6e-3, 15e-3, 2.25e-3, 2.25e-3, 0.8e-3)
+        self.vein = tube(2e-3, 13e-3, 3.5e-3, 2.75e-3, 0.8e-3)
+        self.nerve = tube(-11.2e-3, 13.4e-3, 2.4e-3, 1.9e-3, 0.8e-3)
+        self.humerus = tube(12e-3, 38e-3, 10.5e-3, 9.8e-3, 0.3e-3)
+        turn = random.uniform(0.0, 2 * np.pi)
+        self._fascicles = [(0.0, 0.0)] + [
+            (0.62 * np.cos(turn + angle), 0.62 * np.sin(turn + angle))
+            for angle in np.arange(6) * np.pi / 3
+        ]
+        self._skin_border = noise(4e-3, 4e-3, 1.0)
+        self._fascia_shape = noise(9e-3, 14e-3, 1.0)
+        self._septum_shape = noise(8e-3, 20e-3, 1.0)
+        self._lobules = noise(3.2e-3, 4.5e-3, 0.75e-3)
+        self._fibres = noise(2.2e-3, 16e-3, 0.62e-3)
+        self._bundles = noise(4.5e-3, 22e-3, 1.6e-3)
+        self._patches = noise(3e-3, 6e-3, 1.6e-3)
+        self._cloud = noise(6e-3, 9e-3, 4e-3)
+
+    def section(self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]) -> ArmSection:
+        """Labels and echoes at evenly spaced x (X,) and z (Z,), m.
+
+        Points beside the block continue its tissue, those above it the skin.
+        """
+        section = ArmSection(x, y, z)
+        self._layers(section)
+        self._muscles(section)
+        self._bundle(section)
+        self._bone(section)
+        _attenuate(section)
+        return section
+
+    def _layers(self, section: ArmSection) -> None:
+        """Fat with its septa, and the skin over it."""
+        x, y, z = section.x, section.y, section.depth
+        border = 1.8e-3 + 0.08e-3 * self._skin_border.line(x, y)[:, None]
+        below = z[None, :] - border
+        cloud = self._cloud.plane(x, y, z)
+        section.fill("fat", below >= 0.0, _echo(-37.0 + 1.5 * cloud))
+        profile, facing = sheets(self._lobules.plane(x, y, z), section.steps, 0.15e-3)
+        section.interface(profile * self._patchy(section) * (0.1 + 0.9 * facing), -11.0)
+        section.fill("skin", below < 0.0, _echo(-25.0 - 2800.0 * below + cloud))
+        section.interface(_sheet(z[None, :] - 0.15e-3, 0.15e-3), -5.0)
+        section.interface(_sheet(below, 0.15e-3), -15.0)
+
+    def _muscles(self, section: ArmSection) -> None:
+        """Biceps, brachialis and triceps under the fascia, with the septa between them."""
+        x, y, z = section.x, section.y, section.depth
+        fascia = 7.0e-3 + 0.6e-3 * self._fascia_shape.line(x, y)[:, None]
+        # Septa wave along the arm, and from place to place between the muscles they part.
+        wave = self._septum_shape.line(x, y)[:, None] + 0.8 * self._cloud.plane(x, y, z)
+        # The medial septum runs from the fascia beside the nerve down to the humerus.
+        left_of_septum = 0.9 * (-9e-3 + 0.42 * (z - 15e-3) + 0.5e-3 * wave - x[:, None])
+        under_biceps = z - 21e-3 - 0.15 * x[:, None] - 0.8e-3 * wave
+        triceps = left_of_septum > 0.0
+        brachialis = ~triceps & (under_biceps > 0.0)
+        patchy = self._patchy(section)
+        # Fibres run along y, at each muscle's own small angle to the skin.
+        for slope, gain, where in (
+            (0.06, 0.0, ~triceps & ~brachialis),
+            (-0.09, 1.5, brachialis),
+            (0.13, -1.0, triceps),
+        ):
+            shifted = z + slope * y
+            muscle = where & (z > fascia)
+            cloud = self._cloud.plane(x, y, shifted)
+            section.fill("muscle", muscle, _echo(-41.0 + gain + 1.5 * cloud))
+            for fibres, thickness, level in (
+                (self._fibres, 0.12e-3, -18.0),
+                (self._bundles, 0.17e-3, -13.0),
+            ):
+                profile, facing = sheets(fibres.plane(x, y, shifted), section.steps, thickness)
+                profile *= patchy * (0.1 + 0.9 * facing) * muscle
+                section.interface(profile, level + gain)
+        section.interface(_sheet(z - fascia, 0.22e-3), -9.0)
+        section.interface(_sheet(z - fascia - 0.7e-3, 0.12e-3) * patchy, -16.0)
+        section.interface(_sheet(left_of_septum, 0.2e-3) * (z > 13e-3) * patchy, -18.0)
+        section.interface(_sheet(under_biceps, 0.2e-3) * ~triceps * (0.4 + 0.6 * patchy), -13.0)
+
+    def _bundle(self, section: ArmSection) -> None:
+        """Artery, vein and nerve in bright connective tissue."""
+        x, y, z = section.x, section.y, section.depth
+        walls = [tube.distance(x, y, z) for tube in (self.artery, self.vein, self.nerve)]
+        near = np.maximum(np.min([distance for distance, _ in walls], axis=0), 0.0)
+        sheath = _echo(-31.0 + 2.0 * self._cloud.plane(x, y, z)) * _sheet(near, 1.0e-3)
+        np.maximum(section.diffuse, sheath, out=section.diffuse)
+        _vessel(section, "artery", *walls[0], wall=0.3e-3, level=-7.0)
+        _vessel(section, "vein", *walls[1], wall=0.18e-3, level=-11.0)
+        self._nerve(section, *walls[2])
+
+    def _nerve(
+        self,
+        section: ArmSection,
+        distance: NDArray[np.float64],
+        normal_z: NDArray[np.float64],
+    ) -> None:
+        """Dark fascicles in a bright honeycomb."""
+        section.fill("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
+        section.interface(_sheet(distance, 0.15e-3) * (0.3 + 0.7 * normal_z**2), -14.0)
+        (middle_x, middle_z), (radius_x, radius_z) = self.nerve.middle(section.y), self.nerve.radii
+        for across, down in self._fascicles:
+            squares_x = ((section.x - middle_x - across * radius_x) / 0.50e-3) ** 2
+            squares_z = ((section.depth - middle_z - down * radius_z) / 0.42e-3) ** 2
+            section.diffuse[squares_x[:, None] + squares_z < 1.0] = _echo(-48.0)
+
+    def _bone(self, section: ArmSection) -> None:
+        """The humerus: a bright line where it faces the beam, and what little rings behind it."""
+        x, y, z = section.x, section.y, section.depth
+        distance, normal_z = self.humerus.distance(x, y, z)
+        distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse
+        section.fill("bone", distance < 0.0, np.full(distance.shape, _echo(-42.0)))
+        facing = np.maximum(-normal_z, 0.0) ** 3
+        section.interface(_sheet(distance + 0.15e-3, 0.22e-3) * (0.02 + 0.98 * facing), 7.0)
+
+    def _patchy(self, section: ArmSection) -> NDArray[np.float64]:
+        """(X, Z) from 0 to 1: no sheet of connective tissue echoes everywhere."""
+        noise = self._patches.plane(section.x, section.y, section.depth)
+        return np.clip(0.55 + 0.5 * noise, 0.0, 1.0)
+
+
+def _vessel(
+    section: ArmSection,
+    label: str,
+    distance: NDArray[np.float64],
+    normal_z: NDArray[np.float64],
+    *,
+    wall: float,
+    level: float,
+) -> None:
+    """An almost echo-free lumen, and a wall that echoes where it lies across the beam."""
+    section.fill(label, distance < 0.0, np.full(distance.shape, _echo(-60.0)))
+    facing = 0.08 + 0.92 * normal_z**4
+    section.interface(_sheet(distance - wall, wall) * facing * (distance >= 0.0), level)
+
+
+def _attenuate(section: ArmSection) -> None:
+    """Loss along the beam less the time gain, and the side lobes, which no lumen is free of."""
+    step_x, step_z = section.steps
+    loss = _ATTENUATION[section.labels] * (section.z > 0.0) * step_z
+    loss = np.cumsum(loss, axis=1) - 0.5 * loss - _TIME_GAIN * section.depth
+    # The beam is as wide as its aperture over bone's edge, so a shadow's side is soft.
+    arriving = gaussian_filter1d(_echo(-loss), 0.8e-3 / step_x, axis=0)
+    section.diffuse[:] *= arriving
+    section.specular[:] *= arriving
+    power = gaussian_filter1d(section.diffuse**2 + section.specular**2, 2.5e-3 / step_x, axis=0)
+    power = gaussian_filter1d(power, 0.5e-3 / step_z, axis=1)
+    section.diffuse[:] = np.sqrt(section.diffuse**2 + _echo(_SIDE_LOBES) ** 2 * power)
+
+
+def _echo(level: Any) -> Any:
+    """The amplitude of a level in dB below full display."""
+    return 10.0 ** (level / 20.0)
+
+
+def _sheet(distance: NDArray[np.float64], thickness: float) -> NDArray[np.float64]:
+    """The profile of a thin surface, 1 at distance 0; thickness is a standard deviation, m."""
+    return np.exp(-0.5 * (distance / thickness) ** 2)
