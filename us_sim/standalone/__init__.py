@@ -1,0 +1,25 @@
+"""ROS 2's Python interface where ROS 2 is not installed: `rclpy` and message packages over DDS."""
+
+import importlib.util
+import sys
+
+__all__ = ["install"]
+
+
+def install() -> bool:
+    """Make `rclpy` and message packages importable, unless the real rclpy is there.
+
+    Returns:
+        True when what can be imported is this package's subset.
+    """
+    from us_sim.standalone.alias import AliasFinder
+
+    if any(isinstance(finder, AliasFinder) for finder in sys.meta_path):
+        return True
+    if "rclpy" in sys.modules or importlib.util.find_spec("rclpy") is not None:
+        return False
+    from us_sim.standalone.messages import register_message_modules
+
+    sys.meta_path.append(AliasFinder("rclpy", "us_sim.standalone.rclpy"))
+    register_message_modules()
+    return True

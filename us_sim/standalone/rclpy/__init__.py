@@ -1,1 +1,173 @@
-"""The subset of rclpy that this project's nodes use."""
+"""The subset of rclpy that this project's nodes use, over DDS, without ROS 2.
+
+`us_sim.standalone.install()` makes it importable as `rclpy` where the real one is not installed.
+Names, arguments, defaults and errors are those of rclpy 7.1 (Jazzy).
+"""
+
+from typing import TYPE_CHECKING
+
+from .context import Context
+from .parameter import Parameter
+from .signals import SignalHandlerOptions, install_signal_handlers, uninstall_signal_handlers
+from .task import Future
+from .utilities import get_default_context, get_rmw_implementation_identifier, ok, try_shutdown
+from .utilities import shutdown as _shutdown
+
+if TYPE_CHECKING:
+    from .executors import Executor
+    from .node import Node
+
+__all__ = [
+    "Context",
+    "Future",
+    "Parameter",
+    "SignalHandlerOptions",
+    "create_node",
+    "get_default_context",
+    "get_global_executor",
+    "get_rmw_implementation_identifier",
+    "init",
+    "install_signal_handlers",
+    "ok",
+    "shutdown",
+    "spin",
+    "spin_once",
+    "spin_until_future_complete",
+    "try_shutdown",
+    "uninstall_signal_handlers",
+]
+
+_executor: "Executor | None" = None
+
+
+def init(
+    *,
+    args: list[str] | None = None,
+    context: Context | None = None,
+    domain_id: int | None = None,
+    signal_handler_options: SignalHandlerOptions | None = None,
+) -> None:
+    """Start.
+
+    Args:
+        args: command line, `sys.argv` when None.
+        context: what to initialise, the default context when None.
+        domain_id: DDS domain; None takes ROS_DOMAIN_ID, or 0.
+        signal_handler_options: which signals shut down; None means all for the default context,
+            none for another.
+    """
+    context = get_default_context() if context is None else context
+    if signal_handler_options is None:
+        is_default = context is get_default_context()
+        signal_handler_options = SignalHandlerOptions.ALL if is_default else SignalHandlerOptions.NO
+    context.init(args, domain_id=domain_id)
+    install_signal_handlers(signal_handler_options)
+
+
+def get_global_executor() -> "Executor":
+    """The executor that `spin` and the like use when none is given."""
+    global _executor
+    if _executor is None:
+        from .executors import SingleThreadedExecutor
+
+        _executor = SingleThreadedExecutor()
+        get_default_context().on_shutdown(_end_global_executor)
+    return _executor
+
+
+def _end_global_executor() -> None:
+    global _executor
+    executor, _executor = _executor, None
+    if executor is not None:
+        executor.shutdown()
+
+
+def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
+    """Stop: executors end, nodes leave the network.
+
+    Args:
+        context: what to shut down, the default context when None.
+        uninstall_handlers: whether signals are given back; None means only for the default context.
+    """
+    is_default = context is None or context is get_default_context()
+    _shutdown(context=context)
+    if uninstall_handlers or (uninstall_handlers is None and is_default):
+        uninstall_signal_handlers()
+
+
+def create_node(
+    node_name: str,
+    *,
+    context: Context | None = None,
+    cli_args: list[str] | None = None,
+    namespace: str | None = None,
+    use_global_arguments: bool = True,
+    enable_rosout: bool = True,
+    start_parameter_services: bool = True,
+    parameter_overrides: list[Parameter] | None = None,
+    allow_undeclared_parameters: bool = False,
+    automatically_declare_parameters_from_overrides: bool = False,
+    enable_logger_service: bool = False,
+) -> "Node":
+    """Make a node; the arguments are those of `rclpy.node.Node`."""
+    from .node import Node
+
+    return Node(
+        node_name,
+        context=context,
+        cli_args=cli_args,
+        namespace=namespace,
+        use_global_arguments=use_global_arguments,
+        enable_rosout=enable_rosout,
+        start_parameter_services=start_parameter_services,
+        parameter_overrides=parameter_overrides,
+        allow_undeclared_parameters=allow_undeclared_parameters,
+        automatically_declare_parameters_from_overrides=(
+            automatically_declare_parameters_from_overrides
+        ),
+        enable_logger_service=enable_logger_service,
+    )
+
+
+def spin_once(
+    node: "Node", *, executor: "Executor | None" = None, timeout_sec: float | None = None
+) -> None:
+    """Run one callback of a node, waiting for one to be ready until the time is over."""
+    executor = get_global_executor() if executor is None else executor
+    try:
+        executor.add_node(node)
+        executor.spin_once(timeout_sec=timeout_sec)
+    finally:
+        executor.remove_node(node)
+
+
+def spin(node: "Node", executor: "Executor | None" = None) -> None:
+    """Run a node's callbacks until the context is shut down.
+
+    Raises:
+        ExternalShutdownException: it was shut down meanwhile, by SIGTERM for example.
+    """
+    executor = get_global_executor() if executor is None else executor
+    try:
+        executor.add_node(node)
+        while executor.context.ok():
+            executor.spin_once()
+    finally:
+        executor.remove_node(node)
+
+
+def spin_until_future_complete(
+    node: "Node",
+    future: Future,
+    executor: "Executor | None" = None,
+    timeout_sec: float | None = None,
+) -> None:
+    """Run a node's callbacks until a future is done, or the time is over."""
+    executor = get_global_executor() if executor is None else executor
+    added = False
+    try:
+        added = executor.add_node(node)
+        executor.spin_until_future_complete(future, timeout_sec)
+    finally:
+        if added:
+            executor.remove_node(node)

@@ -2,10 +2,13 @@
 
 import os
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from threading import Condition, RLock
 from typing import TYPE_CHECKING, Any
 
 from ._arguments import Arguments
+from ._local_node import LocalNode
 from ._rclpy_pybind11 import RCLError
 from ._wake_up import WakeUp
 
@@ -28,7 +31,8 @@ class ContextHandle:
         self._valid = True
         self._waiting: tuple[weakref.ReferenceType[WakeUp], ...] = ()
         self._participant: Participant | None = None
-        self._nodes: list[tuple[str, str]] = []
+        self._nodes: list[LocalNode] = []
+        self._postponing = 0
         self._lock = RLock()
 
     def ok(self) -> bool:
@@ -69,6 +73,37 @@ class ContextHandle:
     def _on_graph_change(self, *_: Any) -> None:
         with self.graph_changed:
             self.graph_changed.notify_all()
+
+    def add_node(self, node: LocalNode) -> None:
+        """Have a node known to others."""
+        with self._lock:
+            self._nodes.append(node)
+        self.announce()
+
+    def remove_node(self, node: LocalNode) -> None:
+        """The counterpart of `add_node`."""
+        with self._lock:
+            if node in self._nodes:
+                self._nodes.remove(node)
+        self.announce()
+
+    @contextmanager
+    def announced_once(self) -> Iterator[None]:
+        """Tell others about many changes together, at the end of a with block."""
+        with self._lock:
+            self._postponing += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._postponing -= 1
+            self.announce()
+
+    def announce(self) -> None:
+        """Tell others which nodes there are, and with which endpoints."""
+        with self._lock:
+            if self._participant is not None and not self._postponing:
+                self._participant.graph.announce([node.description() for node in self._nodes])
 
     def close(self) -> None:
         """Leave the network. What the nodes still hold does nothing from now on."""

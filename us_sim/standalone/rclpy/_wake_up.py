@@ -13,7 +13,7 @@ __all__ = ["WakeUp"]
 class WakeUp:
     """One thread waits; any thread or signal handler wakes it, now or for its next wait."""
 
-    __slots__ = ("_lock",)
+    __slots__ = ("__weakref__", "_lock")
 
     def __init__(self) -> None:
         self._lock = _thread.allocate_lock()

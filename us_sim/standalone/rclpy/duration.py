@@ -43,7 +43,8 @@ class Duration:
         """The span that a `builtin_interfaces/msg/Duration` holds; raises TypeError for others."""
         from ..messages import message_class
 
-        if not isinstance(msg, message_class("builtin_interfaces/msg/Duration")):
+        expected: Any = message_class("builtin_interfaces/msg/Duration")
+        if not isinstance(msg, expected):
             raise TypeError("Must pass a builtin_interfaces.msg.Duration object")
         return cls(seconds=msg.sec, nanoseconds=msg.nanosec)
 

@@ -1,80 +1,51 @@
-"""Callbacks for what happens to an endpoint: somebody matches, or asks for another quality.
+"""Callbacks for what happens to an endpoint: somebody matches, a deadline passes, and the like.
 
-The transport reports matches and incompatible qualities of service; asking for another event
-raises UnsupportedEventTypeError, as rclpy does where the middleware does not have it.
+Types that differ are not reported; asking for that event raises UnsupportedEventTypeError, as
+rclpy does where the middleware does not have it.
 """
 
 import inspect
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
+from ._endpoint_events import (
+    REPORTS,
+    QoSLivelinessChangedInfo,
+    QoSLivelinessLostInfo,
+    QoSMessageLostInfo,
+    QoSOfferedDeadlineMissedInfo,
+    QoSOfferedIncompatibleQoSInfo,
+    QoSPublisherEventType,
+    QoSPublisherMatchedInfo,
+    QoSRequestedDeadlineMissedInfo,
+    QoSRequestedIncompatibleQoSInfo,
+    QoSSubscriptionEventType,
+    QoSSubscriptionMatchedInfo,
+)
 from ._rclpy_pybind11 import UnsupportedEventTypeError
 from .callback_groups import CallbackGroup
 from .logging import get_logger
-from .qos import QoSPolicyKind, qos_policy_name_from_kind
+from .qos import qos_policy_name_from_kind
 from .waitable import Waitable
 
 __all__ = [
     "EventHandler",
     "PublisherEventCallbacks",
+    "QoSLivelinessChangedInfo",
+    "QoSLivelinessLostInfo",
+    "QoSMessageLostInfo",
+    "QoSOfferedDeadlineMissedInfo",
     "QoSOfferedIncompatibleQoSInfo",
     "QoSPublisherEventType",
     "QoSPublisherMatchedInfo",
+    "QoSRequestedDeadlineMissedInfo",
     "QoSRequestedIncompatibleQoSInfo",
     "QoSSubscriptionEventType",
     "QoSSubscriptionMatchedInfo",
     "SubscriptionEventCallbacks",
     "UnsupportedEventTypeError",
 ]
-
-
-class QoSPublisherEventType(IntEnum):
-    """What can happen to a publisher."""
-
-    RCL_PUBLISHER_OFFERED_DEADLINE_MISSED = 0
-    RCL_PUBLISHER_LIVELINESS_LOST = 1
-    RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS = 2
-    RCL_PUBLISHER_INCOMPATIBLE_TYPE = 3
-    RCL_PUBLISHER_MATCHED = 4
-
-
-class QoSSubscriptionEventType(IntEnum):
-    """What can happen to a subscription."""
-
-    RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED = 0
-    RCL_SUBSCRIPTION_LIVELINESS_CHANGED = 1
-    RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS = 2
-    RCL_SUBSCRIPTION_MESSAGE_LOST = 3
-    RCL_SUBSCRIPTION_INCOMPATIBLE_TYPE = 4
-    RCL_SUBSCRIPTION_MATCHED = 5
-
-
-@dataclass(frozen=True)
-class QoSRequestedIncompatibleQoSInfo:
-    """How many endpoints were met whose quality does not fit, and by which policy."""
-
-    total_count: int
-    total_count_change: int
-    last_policy_kind: QoSPolicyKind
-
-
-QoSOfferedIncompatibleQoSInfo = QoSRequestedIncompatibleQoSInfo
-
-
-@dataclass(frozen=True)
-class QoSSubscriptionMatchedInfo:
-    """How many endpoints match now, and how many ever did."""
-
-    total_count: int
-    total_count_change: int
-    current_count: int
-    current_count_change: int
-
-
-QoSPublisherMatchedInfo = QoSSubscriptionMatchedInfo
 
 
 class EventHandler(Waitable):
@@ -85,18 +56,24 @@ class EventHandler(Waitable):
         *,
         callback_group: CallbackGroup,
         callback: Callable[..., Any],
-        event_type: IntEnum,
+        event_type: Any,
         parent_impl: Any,
     ):
+        if event_type not in REPORTS:
+            raise UnsupportedEventTypeError(
+                f"failed to create event: {event_type.name} is not reported by this middleware"
+            )
         super().__init__(callback_group)
         self.callback = callback
         self.event_type = event_type
         self._lock = threading.Lock()
         self._data: Any = None
         self._parent = parent_impl
-        parent_impl.add_event_listener(event_type.name, self._report)
+        self._kind, self._report = REPORTS[event_type]
+        parent_impl.add_event_listener(self._kind, self._happened)
 
-    def _report(self, data: Any) -> None:
+    def _happened(self, event: Any) -> None:
+        data = self._report(event)
         with self._lock:
             self._data = data if self._data is None else _accumulated(self._data, data)
 
@@ -116,15 +93,15 @@ class EventHandler(Waitable):
 
     def destroy(self):
         """Be told of nothing more."""
-        self._parent.remove_event_listener(self.event_type.name)
+        self._parent.remove_event_listener(self._kind)
 
 
 def _accumulated(earlier: Any, later: Any) -> Any:
     """One report for two that came before anybody looked: the changes add up."""
     changes = {
-        name: getattr(earlier, name) + getattr(later, name)
-        for name in ("total_count_change", "current_count_change")
-        if hasattr(later, name)
+        name: getattr(earlier, name) + value
+        for name, value in vars(later).items()
+        if name.endswith("_change")
     }
     return type(later)(**{**vars(later), **changes})
 
@@ -156,21 +133,17 @@ class SubscriptionEventCallbacks:
     ) -> list[EventHandler]:
         """Handlers for the callbacks that were given, and a warning for qualities that differ."""
         kind = QoSSubscriptionEventType
-        _refuse(
-            {
-                kind.RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED: self.deadline,
-                kind.RCL_SUBSCRIPTION_LIVELINESS_CHANGED: self.liveliness,
-                kind.RCL_SUBSCRIPTION_MESSAGE_LOST: self.message_lost,
-                kind.RCL_SUBSCRIPTION_INCOMPATIBLE_TYPE: self.incompatible_type,
-            }
-        )
-        wanted: dict[IntEnum, Callable[..., None] | None] = {
+        wanted: dict[Any, Callable[..., None] | None] = {
+            kind.RCL_SUBSCRIPTION_REQUESTED_DEADLINE_MISSED: self.deadline,
             kind.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS: self.incompatible_qos
             or self._warning(
                 subscription.logger_name,
                 f"New publisher discovered on topic '{topic_name}', offering incompatible QoS. "
                 "No messages will be received from it. Last incompatible policy: ",
             ),
+            kind.RCL_SUBSCRIPTION_LIVELINESS_CHANGED: self.liveliness,
+            kind.RCL_SUBSCRIPTION_MESSAGE_LOST: self.message_lost,
+            kind.RCL_SUBSCRIPTION_INCOMPATIBLE_TYPE: self.incompatible_type,
             kind.RCL_SUBSCRIPTION_MATCHED: self.matched,
         }
         return _handlers(wanted, callback_group, subscription)
@@ -204,20 +177,16 @@ class PublisherEventCallbacks:
     ) -> list[EventHandler]:
         """Handlers for the callbacks that were given, and a warning for qualities that differ."""
         kind = QoSPublisherEventType
-        _refuse(
-            {
-                kind.RCL_PUBLISHER_OFFERED_DEADLINE_MISSED: self.deadline,
-                kind.RCL_PUBLISHER_LIVELINESS_LOST: self.liveliness,
-                kind.RCL_PUBLISHER_INCOMPATIBLE_TYPE: self.incompatible_type,
-            }
-        )
-        wanted: dict[IntEnum, Callable[..., None] | None] = {
+        wanted: dict[Any, Callable[..., None] | None] = {
+            kind.RCL_PUBLISHER_OFFERED_DEADLINE_MISSED: self.deadline,
+            kind.RCL_PUBLISHER_LIVELINESS_LOST: self.liveliness,
             kind.RCL_PUBLISHER_OFFERED_INCOMPATIBLE_QOS: self.incompatible_qos
             or self._warning(
                 publisher.logger_name,
                 f"New subscription discovered on topic '{topic_name}', requesting incompatible "
                 "QoS. No messages will be sent to it. Last incompatible policy: ",
             ),
+            kind.RCL_PUBLISHER_INCOMPATIBLE_TYPE: self.incompatible_type,
             kind.RCL_PUBLISHER_MATCHED: self.matched,
         }
         return _handlers(wanted, callback_group, publisher)
@@ -226,16 +195,8 @@ class PublisherEventCallbacks:
         return _warn_about(logger_name, text) if self.use_default_callbacks else None
 
 
-def _refuse(callbacks: dict[IntEnum, Callable[..., None] | None]) -> None:
-    for event_type, callback in callbacks.items():
-        if callback is not None:
-            raise UnsupportedEventTypeError(
-                f"failed to create event: {event_type.name} is not reported without ROS 2"
-            )
-
-
 def _handlers(
-    wanted: dict[IntEnum, Callable[..., None] | None], group: CallbackGroup, parent: Any
+    wanted: dict[Any, Callable[..., None] | None], group: CallbackGroup, parent: Any
 ) -> list[EventHandler]:
     return [
         EventHandler(

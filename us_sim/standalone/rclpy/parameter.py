@@ -38,58 +38,8 @@ _FIELDS = {  # field of rcl_interfaces/msg/ParameterValue for each value of its 
 }
 
 
-class _ParameterType(Enum):
-    """The types a parameter can have; the values are those of rcl_interfaces/msg/ParameterType."""
-
-    NOT_SET = 0
-    BOOL = 1
-    INTEGER = 2
-    DOUBLE = 3
-    STRING = 4
-    BYTE_ARRAY = 5
-    BOOL_ARRAY = 6
-    INTEGER_ARRAY = 7
-    DOUBLE_ARRAY = 8
-    STRING_ARRAY = 9
-
-    @classmethod
-    def from_parameter_value(cls, parameter_value: Any) -> "_ParameterType":
-        """The type of a Python value; raises TypeError when parameters cannot have it."""
-        if parameter_value is None:
-            return cls.NOT_SET
-        for python_type, scalar, _ in _PYTHON_TYPES:
-            if scalar is not None and isinstance(parameter_value, python_type):
-                return cls(scalar)
-        if isinstance(parameter_value, list | tuple | array.array):
-            for python_type, _, sequence in (_PYTHON_TYPES[-1], *_PYTHON_TYPES[:-1]):
-                if all(isinstance(item, python_type) for item in parameter_value):
-                    return cls(sequence)
-            raise TypeError(
-                f"The given value is not a list of one of the allowed types '{parameter_value}'."
-            )
-        raise TypeError(f"The given value is not one of the allowed types '{parameter_value}'.")
-
-    def check(self, parameter_value: Any) -> bool:
-        """Whether a Python value is of this type."""
-        if self.value == 0:
-            return parameter_value is None
-        for python_type, scalar, sequence in _PYTHON_TYPES:
-            if self.value == scalar:
-                return isinstance(parameter_value, python_type)
-            if self.value == sequence:
-                holders = (list, tuple, array.array) if sequence in (7, 8) else (list, tuple)
-                return isinstance(parameter_value, holders) and all(
-                    isinstance(item, python_type) and (sequence != 5 or len(item) == 1)
-                    for item in parameter_value
-                )
-        return False
-
-    def __str__(self) -> str:
-        return f"Type.{self.name}"
-
-
 # bool before int, since a bool is an int; scalar and sequence as in ParameterType
-_PYTHON_TYPES: list[tuple[type, int | None, int]] = [
+_PYTHON_TYPES: list[tuple[Any, int | None, int]] = [
     (bool, 1, 6),
     (int, 2, 7),
     (float, 3, 8),
@@ -101,7 +51,52 @@ _PYTHON_TYPES: list[tuple[type, int | None, int]] = [
 class Parameter:
     """A named value; without a type it has the type of its value."""
 
-    Type = _ParameterType
+    class Type(Enum):
+        """The types a parameter can have, with the numbers of rcl_interfaces/msg/ParameterType."""
+
+        NOT_SET = 0
+        BOOL = 1
+        INTEGER = 2
+        DOUBLE = 3
+        STRING = 4
+        BYTE_ARRAY = 5
+        BOOL_ARRAY = 6
+        INTEGER_ARRAY = 7
+        DOUBLE_ARRAY = 8
+        STRING_ARRAY = 9
+
+        @classmethod
+        def from_parameter_value(cls, parameter_value: Any) -> "Parameter.Type":
+            """The type of a Python value; raises TypeError when parameters cannot have it."""
+            if parameter_value is None:
+                return cls.NOT_SET
+            for python_type, scalar, _ in _PYTHON_TYPES:
+                if scalar is not None and isinstance(parameter_value, python_type):
+                    return cls(scalar)
+            if isinstance(parameter_value, list | tuple | array.array):
+                for python_type, _, sequence in (_PYTHON_TYPES[-1], *_PYTHON_TYPES[:-1]):
+                    if all(isinstance(item, python_type) for item in parameter_value):
+                        return cls(sequence)
+                raise TypeError(
+                    "The given value is not a list of one of the allowed types "
+                    f"'{parameter_value}'."
+                )
+            raise TypeError(f"The given value is not one of the allowed types '{parameter_value}'.")
+
+        def check(self, parameter_value: Any) -> bool:
+            """Whether a Python value is of this type."""
+            if self.value == 0:
+                return parameter_value is None
+            for python_type, scalar, sequence in _PYTHON_TYPES:
+                if self.value == scalar:
+                    return isinstance(parameter_value, python_type)
+                if self.value == sequence:
+                    holders = (list, tuple, array.array) if sequence in (7, 8) else (list, tuple)
+                    return isinstance(parameter_value, holders) and all(
+                        isinstance(item, python_type) and (sequence != 5 or len(item) == 1)
+                        for item in parameter_value
+                    )
+            return False
 
     def __init__(self, name, type_=None, value=None):
         if type_ is None:

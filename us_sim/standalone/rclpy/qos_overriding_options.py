@@ -13,7 +13,7 @@ from .exceptions import ParameterAlreadyDeclaredException
 from .qos import QoSPolicyEnum, QoSPolicyKind, QoSProfile
 
 if TYPE_CHECKING:
-    from .node import Node
+    from ._node_declarations import NodeDeclarations
     from .parameter import Parameter
 
 __all__ = ["InvalidQosOverridesError", "QoSOverridingOptions"]
@@ -65,7 +65,11 @@ class QoSOverridingOptions:
 
 
 def _overridden(
-    kind: str, node: "Node", topic_name: str, qos: QoSProfile, options: QoSOverridingOptions | None
+    kind: str,
+    node: "NodeDeclarations",
+    topic_name: str,
+    qos: QoSProfile,
+    options: QoSOverridingOptions | None,
 ) -> QoSProfile:
     """A profile after the overrides for a 'publisher' or 'subscription' of an absolute topic.
 

@@ -27,6 +27,7 @@ class Future:
         self._exception: BaseException | None = None
         self._exception_fetched = False
         self._callbacks: list[Callable[[Any], Any]] = []
+        self._resumers: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._executor: weakref.ReferenceType[Any] | None = None
         self._set_executor(executor)
@@ -100,16 +101,27 @@ class Future:
         else:
             callback(self)
 
-    def _set_executor(self, executor) -> None:
+    def _set_executor(self, executor: Any) -> None:
         with self._lock:
             self._executor = None if executor is None else weakref.ref(executor)
 
+    def _when_done(self, resume: Callable[[], None]) -> None:
+        """Have a task that awaits this go on, at once in the thread that makes this done."""
+        with self._lock:
+            if not self._done:
+                self._resumers.append(resume)
+                return
+        resume()
+
     def _schedule_or_invoke_done_callbacks(self) -> None:
         with self._lock:
-            if not self._callbacks:
-                return
+            resumers: list[Callable[[], None]] = []
+            if self._done:
+                resumers, self._resumers = self._resumers, []
             executor = self._executor() if self._executor is not None else None
             callbacks, self._callbacks = self._callbacks, []
+        for resume in resumers:
+            resume()
         for callback in callbacks:
             if executor is not None:
                 executor.create_task(callback, self)

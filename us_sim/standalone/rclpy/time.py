@@ -66,7 +66,8 @@ class Time:
         """The point that a `builtin_interfaces/msg/Time` holds; raises TypeError for others."""
         from ..messages import message_class
 
-        if not isinstance(msg, message_class("builtin_interfaces/msg/Time")):
+        expected: Any = message_class("builtin_interfaces/msg/Time")
+        if not isinstance(msg, expected):
             raise TypeError("Must pass a builtin_interfaces.msg.Time object")
         return cls(seconds=msg.sec, nanoseconds=msg.nanosec, clock_type=clock_type)
 

@@ -137,7 +137,7 @@ class Timer:
 class Rate:
     """Sleeps until the next period of a timer, which an executor has to run in another thread."""
 
-    def __init__(self, timer: Timer, *, context):
+    def __init__(self, timer: Timer, *, context: Context):
         self._timer = timer
         self._is_shutdown = False
         self._is_destroyed = False

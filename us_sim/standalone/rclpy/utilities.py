@@ -22,7 +22,7 @@ _default_context: Context | None = None
 _lock = threading.RLock()
 
 
-def get_default_context(*, shutting_down=False) -> Context:
+def get_default_context(*, shutting_down: bool = False) -> Context:
     """The context that is used where none is given; forgotten when it is shutting down."""
     global _default_context
     with _lock:

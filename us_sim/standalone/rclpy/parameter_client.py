@@ -1,0 +1,169 @@
+"""The parameters of another node."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ..messages import message_class, service_class
+from .callback_groups import CallbackGroup
+from .event_handler import SubscriptionEventCallbacks
+from .node import Node
+from .parameter import Parameter, parameter_dict_from_yaml_file
+from .qos import QoSProfile, qos_profile_parameter_events, qos_profile_services_default
+from .qos_overriding_options import QoSOverridingOptions
+from .subscription import Subscription
+from .task import Future
+
+__all__ = ["AsyncParameterClient"]
+
+_LONGEST_WAIT = 0.25  # s; the graph's changes wake it earlier
+
+
+class AsyncParameterClient:
+    """Asks another node's parameter services; every answer is a future of the response.
+
+    Each request takes an optional `callback`, which is called with the future when it is done.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        remote_node_name: str,
+        qos_profile: QoSProfile = qos_profile_services_default,
+        callback_group: CallbackGroup | None = None,
+    ):
+        self.remote_node_name = remote_node_name
+        self.node = node
+        self._clients = {
+            service: node.create_client(
+                service_class(f"rcl_interfaces/srv/{type_name}"),
+                f"{remote_node_name}/{service}",
+                qos_profile=qos_profile,
+                callback_group=callback_group,
+            )
+            for service, type_name in (
+                ("get_parameters", "GetParameters"),
+                ("list_parameters", "ListParameters"),
+                ("set_parameters", "SetParameters"),
+                ("get_parameter_types", "GetParameterTypes"),
+                ("describe_parameters", "DescribeParameters"),
+                ("set_parameters_atomically", "SetParametersAtomically"),
+            )
+        }
+
+    def services_are_ready(self) -> bool:
+        """Whether all six services are connected."""
+        return all(client.service_is_ready() for client in self._clients.values())
+
+    def wait_for_services(self, timeout_sec: float | None = None) -> bool:
+        """Wait until all six services are connected; whether they were within the time."""
+        deadline = None if timeout_sec is None else time.monotonic() + timeout_sec
+        graph_changed = self.node._context_handle.graph_changed
+        while not self.services_are_ready() and self.node.context.ok():
+            rest = _LONGEST_WAIT if deadline is None else deadline - time.monotonic()
+            if rest <= 0:
+                break
+            with graph_changed:
+                graph_changed.wait(min(rest, _LONGEST_WAIT))
+        return self.services_are_ready()
+
+    def list_parameters(
+        self,
+        prefixes: list[str] | None = None,
+        depth: int | None = None,
+        callback: Callable[..., Any] | None = None,
+    ) -> Future:
+        """Ask for names: those that begin with one of the prefixes, of a depth."""
+        return self._call("list_parameters", callback, prefixes=prefixes or [], depth=depth or 0)
+
+    def get_parameters(
+        self, names: list[str], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Ask for values."""
+        return self._call("get_parameters", callback, names=names)
+
+    def set_parameters(
+        self, parameters: Sequence[Any], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Set Parameters or `rcl_interfaces/msg/Parameter`s one by one."""
+        return self._call("set_parameters", callback, parameters=_messages(parameters))
+
+    def describe_parameters(
+        self, names: list[str], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Ask for descriptors."""
+        return self._call("describe_parameters", callback, names=names)
+
+    def get_parameter_types(
+        self, names: list[str], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Ask for types."""
+        return self._call("get_parameter_types", callback, names=names)
+
+    def set_parameters_atomically(
+        self, parameters: Sequence[Any], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Set all Parameters or `rcl_interfaces/msg/Parameter`s, or none."""
+        return self._call("set_parameters_atomically", callback, parameters=_messages(parameters))
+
+    def delete_parameters(
+        self, names: list[str], callback: Callable[..., Any] | None = None
+    ) -> Future:
+        """Have parameters undeclared, which their node has to allow."""
+        return self.set_parameters([Parameter(name) for name in names], callback)
+
+    def load_parameter_file(
+        self,
+        parameter_file: str,
+        use_wildcard: bool = False,
+        callback: Callable[..., Any] | None = None,
+    ) -> Future:
+        """Set the parameters of a YAML file one by one, those under /** too if asked to."""
+        parameters = parameter_dict_from_yaml_file(parameter_file, use_wildcard)
+        return self.set_parameters(list(parameters.values()), callback)
+
+    def load_parameter_file_atomically(
+        self,
+        parameter_file: str,
+        use_wildcard: bool = False,
+        callback: Callable[..., Any] | None = None,
+    ) -> Future:
+        """Set all parameters of a YAML file or none, those under /** too if asked to."""
+        parameters = parameter_dict_from_yaml_file(parameter_file, use_wildcard)
+        return self.set_parameters_atomically(list(parameters.values()), callback)
+
+    def on_parameter_event(
+        self,
+        callback: Callable[..., Any],
+        qos_profile: QoSProfile = qos_profile_parameter_events,
+        *,
+        callback_group: CallbackGroup | None = None,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
+        qos_overriding_options: QoSOverridingOptions | None = None,
+        raw: bool = False,
+    ) -> Subscription:
+        """Call back when parameters of any node change."""
+        return self.node.create_subscription(
+            message_class("rcl_interfaces/msg/ParameterEvent"),
+            "/parameter_events",
+            callback,
+            qos_profile,
+            callback_group=callback_group,
+            event_callbacks=event_callbacks,
+            qos_overriding_options=qos_overriding_options,
+            raw=raw,
+        )
+
+    def _call(self, service: str, callback: Callable[..., Any] | None, **fields: Any) -> Future:
+        client = self._clients[service]
+        future = client.call_async(client.srv_type.Request(**fields))
+        if callback is not None:
+            future.add_done_callback(callback)
+        return future
+
+
+def _messages(parameters: Sequence[Any]) -> list[Any]:
+    return [
+        parameter.to_parameter_msg() if isinstance(parameter, Parameter) else parameter
+        for parameter in parameters
+    ]
