@@ -20,6 +20,7 @@ def install() -> bool:
         return False
     from us_sim.standalone.messages import register_message_modules
 
-    sys.meta_path.append(AliasFinder("rclpy", "us_sim.standalone.rclpy"))
+    # First, since otherwise the files would be found once more, as other modules.
+    sys.meta_path.insert(0, AliasFinder("rclpy", "us_sim.standalone.rclpy"))
     register_message_modules()
     return True

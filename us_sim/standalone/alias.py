@@ -1,7 +1,7 @@
 """A package under a second name: the same modules, imported when they are first asked for.
 
 >>> import sys
->>> sys.meta_path.append(AliasFinder("shapes", "collections"))
+>>> sys.meta_path.insert(0, AliasFinder("shapes", "collections"))
 >>> import shapes.abc, collections.abc
 >>> shapes.abc is collections.abc
 True
