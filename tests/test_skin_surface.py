@@ -1,0 +1,219 @@
+"""Skin surfaces: sheets, files, areas and normals."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from us_sim.errors import MeshError
+from us_sim.skin.surface import (
+    TriangleSurface,
+    bent_surface,
+    plane_surface,
+    read_surface,
+    vertex_normals,
+)
+
+
+def sphere(radius, rings=40, sectors=80):
+    """A latitude-longitude sphere with outward triangles."""
+    polar = np.linspace(0, np.pi, rings + 1)[1:-1]
+    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
+    theta, phi = np.meshgrid(polar, around, indexing="ij")
+    ring = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    vertices = radius * np.concatenate([ring.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
+    index = np.arange(ring.shape[0] * sectors).reshape(-1, sectors)
+    following = np.roll(index, -1, axis=1)
+    north, south = len(vertices) - 2, len(vertices) - 1
+    triangles = [
+        np.stack([index[:-1], index[1:], following[1:]], -1).reshape(-1, 3),
+        np.stack([index[:-1], following[1:], following[:-1]], -1).reshape(-1, 3),
+        np.stack([np.full(sectors, north), index[0], following[0]], -1),
+        np.stack([np.full(sectors, south), following[-1], index[-1]], -1),
+    ]
+    return TriangleSurface(vertices, np.concatenate(triangles))
+
+
+def test_normals_of_a_sphere_point_away_from_its_centre():
+    ball = sphere(0.05)
+    normals = vertex_normals(ball.vertices, ball.triangles)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+    assert np.einsum("ij,ij->i", normals, ball.vertices / 0.05).min() > np.cos(np.radians(1.0))
+
+
+def test_normals_are_weighted_by_area():
+    """Two right triangles share a vertex: 0.5 m² facing z, and 2 m² facing x."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 2]], dtype=float)
+    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
+    np.testing.assert_allclose(normals[0], np.array([4, 0, 1]) / np.sqrt(17))
+
+
+def test_normals_that_cancel_are_zero():
+    vertices = np.eye(3)
+    np.testing.assert_array_equal(vertex_normals(vertices, [[0, 1, 2], [0, 2, 1]]), 0)
+
+
+def test_vertex_areas_add_up_to_the_surface():
+    assert plane_surface((0.2, 0.1), 0.01).vertex_areas.sum() == pytest.approx(0.02, rel=1e-12)
+    assert sphere(0.05).vertex_areas.sum() == pytest.approx(4 * np.pi * 0.05**2, rel=3e-3)
+
+
+def test_a_flat_sheet_lies_in_z_0_and_faces_out_of_the_body():
+    sheet = plane_surface((0.2, 0.1), 0.01)
+    assert sheet.vertices.shape == (21 * 11, 3)
+    assert len(sheet.triangles) == 2 * 20 * 10
+    # Euler: V - E + F = 1 for a disc.
+    assert len(sheet.vertices) - len(sheet.edges) + len(sheet.triangles) == 1
+    np.testing.assert_allclose(sheet.vertices.min(axis=0), [-0.1, -0.05, 0], atol=1e-15)
+    np.testing.assert_allclose(sheet.vertices.max(axis=0), [0.1, 0.05, 0], atol=1e-15)
+    np.testing.assert_array_equal(
+        vertex_normals(sheet.vertices, sheet.triangles), np.tile([0, 0, -1.0], (231, 1))
+    )
+
+
+def test_a_bent_sheet_is_flat_and_then_two_arcs_downwards():
+    radius, flat = 0.04, 0.03
+    sheet = bent_surface((0.03 + 0.04 * np.pi, 0.02), 0.002, flat_width=flat, radius=radius)
+    x, _, z = sheet.vertices.T
+    on_top = np.abs(x) < flat / 2
+    assert on_top.any()
+    assert not z[on_top & (z < radius / 2)].any()
+    side = np.abs(x) > flat / 2 + 1e-9
+    np.testing.assert_allclose(
+        np.hypot(np.abs(x[side]) - flat / 2, z[side] - radius), radius, rtol=1e-12
+    )
+    # A quarter circle on each side ends where it points straight down.
+    assert np.abs(x).max() == pytest.approx(flat / 2 + radius)
+    assert z.max() == pytest.approx(radius)
+    normals = vertex_normals(sheet.vertices, sheet.triangles)
+    outward = np.column_stack([np.sign(x) * (np.abs(x) - flat / 2), 0 * x, z - radius])[side]
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    assert np.einsum("ij,ij->i", normals[side], outward).min() > np.cos(np.radians(3))
+
+
+def test_edges_are_each_there_once():
+    quad = TriangleSurface(
+        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[2, 1, 0], [3, 2, 0]])
+    )
+    np.testing.assert_array_equal(quad.edges, [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "stl", "vtk"])
+def test_a_sheet_comes_back_from_a_file(tmp_path, kind):
+    meshio = pytest.importorskip("meshio")
+    sheet = bent_surface((0.1, 0.04), 0.01, flat_width=0.05, radius=0.05)
+    stray = np.vstack([sheet.vertices * 1000, [[7.0, 7.0, 7.0]]])
+    points = sheet.vertices * 1000 if kind == "stl" else stray
+    path = tmp_path / f"sheet.{kind}"
+    meshio.write(path, meshio.Mesh(points, [("triangle", sheet.triangles)]))
+    read = read_surface(path, metres_per_unit=1e-3)
+    # STL has neither shared vertices nor double precision.
+    assert read.vertices.shape == sheet.vertices.shape
+    assert len(read.triangles) == len(sheet.triangles)
+    assert len(read.edges) == len(sheet.edges)
+    np.testing.assert_allclose(
+        np.sort(read.vertex_areas), np.sort(sheet.vertex_areas), rtol=1e-4, atol=1e-9
+    )
+
+
+def test_quadrilaterals_are_split(tmp_path):
+    path = tmp_path / "quad.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    read = read_surface(path)
+    assert len(read.triangles) == 2
+    assert read.vertex_areas.sum() == pytest.approx(1.0)
+
+
+def test_a_real_organ_is_a_closed_surface(shared_data):
+    organ = read_surface(shared_data / "meshes-sofa" / "liver-smooth.obj")
+    assert (len(organ.vertices), len(organ.triangles)) == (2194, 4384)
+    # Euler: V - E + F = 2 for a closed surface without handles.
+    assert len(organ.vertices) - len(organ.edges) + len(organ.triangles) == 2
+    a, b, c = organ.vertices[organ.triangles.T]
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0
+
+
+def test_a_real_head_with_texture_coordinates_is_read(shared_data):
+    """It has 3969 texture coordinates for 3931 vertices, and quadrilaterals."""
+    head = read_surface(shared_data / "meshes-sofa" / "head.obj")
+    assert len(head.vertices) == 3931
+
+
+def test_faces_may_count_backwards(tmp_path):
+    path = tmp_path / "back.obj"
+    path.write_text("# a comment\nv 0 0 0\nv 1 0 0\nv 0 0 1\nvn 0 1 0\nf -3//1 -2//1 -1//1\n")
+    np.testing.assert_array_equal(
+        vertex_normals(read_surface(path).vertices, read_surface(path).triangles),
+        np.tile([0, -1.0, 0], (3, 1)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("broken.stl", "solid nothing\nfacet", "not a surface that can be read"),
+        ("what.xyzzy", "?", "not a surface that can be read"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\n", "has no triangles"),
+        ("nan.obj", "v 0 0 0\nv 1 nan 0\nv 0 0 1\nf 1 2 3\n", "not finite"),
+        ("flat.obj", "v 0 0\n", "line 1: `v 0 0`: a vertex has three"),
+        ("word.obj", "v 0 0 zero\n", "line 1: `v 0 0 zero`: could not convert"),
+        ("far.obj", "v 0 0 0\nf 1 2 3\n", "line 2: `f 1 2 3`: there is no vertex 2 among the 1"),
+        ("zero.obj", "v 0 0 0\nf 0 1 1\n", "there is no vertex 0"),
+        ("line.obj", "v 0 0 0\nv 1 0 0\nf 1 2\n", "three vertices or more"),
+    ],
+)
+def test_files_that_cannot_be_read_are_refused(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MeshError, match=words) as refused:
+        read_surface(tmp_path / name)
+    assert str(refused.value).startswith(str(tmp_path / name))
+
+
+def test_a_missing_file_and_a_wrong_unit_are_refused(tmp_path):
+    with pytest.raises(MeshError, match="no such surface file"):
+        read_surface(tmp_path / "missing.obj")
+    (tmp_path / "fine.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n")
+    with pytest.raises(MeshError, match="metres_per_unit is 0"):
+        read_surface(tmp_path / "fine.obj", metres_per_unit=0)
+
+
+def test_without_meshio_the_way_out_is_said(tmp_path, monkeypatch):
+    (tmp_path / "fine.stl").write_text("solid fine\nendsolid fine\n")
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    with pytest.raises(MeshError, match="pip install meshio"):
+        read_surface(tmp_path / "fine.stl")
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "words"),
+    [
+        (np.eye(3)[:, :2], [[0, 1, 2]], r"give \(N, 3\)"),
+        (np.eye(3) * np.nan, [[0, 1, 2]], "vertex 0 is not finite"),
+        (np.eye(3), [[0, 1, 3]], "name vertices 0 to 3"),
+        (np.eye(3), [[0, 1, -1]], "name vertices -1"),
+        (np.eye(3), [[0, 1]], r"give \(T, 3\) integers"),
+        (np.eye(3), [[0.5, 1, 2]], r"give \(T, 3\) integers"),
+        (np.eye(3), np.empty((0, 3), int), "no triangle"),
+        (np.eye(3), [[0, 1, 2], [0, 1, 1]], "triangle 1 names a vertex twice"),
+        (np.vstack([np.eye(3), [[0, 0, 0]]]), [[0, 1, 2]], "vertex 3 is in no triangle"),
+    ],
+)
+def test_a_surface_that_cannot_be_is_refused(vertices, triangles, words):
+    with pytest.raises(MeshError, match=words):
+        TriangleSurface(vertices, np.array(triangles))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: plane_surface((0.1, -0.1), 0.01), "size is -0.1 m"),
+        (lambda: plane_surface((0.1, 0.1), 0.0), "spacing is 0.0 m"),
+        (lambda: plane_surface((1.0, 0.1), 1e-5), "give a wider spacing"),
+        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.2, radius=0.1), "flat_width is 0.2"),
+        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.0, radius=0.0), "radius is 0.0"),
+        (lambda: bent_surface((0.5, 0.1), 0.01, flat_width=0.0, radius=0.05), "half a circle"),
+    ],
+)
+def test_a_sheet_that_cannot_be_is_refused(make, words):
+    with pytest.raises(MeshError, match=words):
+        make()

@@ -1,0 +1,67 @@
+"""Probe geometry: where the pixels are."""
+
+import numpy as np
+import pytest
+
+from us_sim.errors import ProbeError
+from us_sim.pose import Pose
+from us_sim.slicing.plane import SlicePlane
+from us_sim.slicing.probe import LinearProbe
+
+
+def test_pixels_fill_the_aperture_from_the_face_down():
+    pixels = LinearProbe(aperture=0.04, depth=0.06, columns=4, rows=3).plane(Pose()).pixels()
+    np.testing.assert_allclose(pixels[0, :, 0], [-0.015, -0.005, 0.005, 0.015])
+    np.testing.assert_allclose(pixels[:, 0, 2], [0.01, 0.03, 0.05])
+    assert not pixels[..., 1].any()
+
+
+def test_the_plane_moves_with_the_pose():
+    quarter_turn_about_z = Pose([1.0, 2.0, 3.0], [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    probe = LinearProbe(aperture=0.04, depth=0.06, columns=4, rows=3)
+    expected = quarter_turn_about_z.apply(probe.plane(Pose()).pixels().reshape(-1, 3))
+    np.testing.assert_allclose(
+        probe.plane(quarter_turn_about_z).pixels().reshape(-1, 3), expected, atol=1e-15
+    )
+    np.testing.assert_allclose(expected[0], [1.0, 1.985, 3.01])
+
+
+def test_to_pixel_undoes_pixels():
+    pose = Pose([0.1, -0.2, 0.3], [0.1, 0.2, 0.3, 0.9])
+    plane = LinearProbe(aperture=0.05, depth=0.03, columns=7, rows=5).plane(pose)
+    found = plane.pixels() @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
+    column, row = np.meshgrid(np.arange(7), np.arange(5))
+    np.testing.assert_allclose(found, np.stack([column, row, 0 * row], -1), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"aperture": 0.004}, "aperture is 0.004 m: give 5 to 200 mm"),
+        ({"aperture": float("nan")}, "aperture is nan"),
+        ({"depth": 0.5}, "depth is 0.5 m: give 5 to 400 mm"),
+        ({"depth": "deep"}, "depth is 'deep'"),
+        ({"columns": 0}, "0 columns"),
+        ({"rows": 4097}, "4097 rows"),
+        ({"rows": 2.5}, "2.5 rows"),
+    ],
+)
+def test_a_probe_that_cannot_be_is_refused(change, words):
+    good = {"aperture": 0.04, "depth": 0.06, "columns": 4, "rows": 3}
+    with pytest.raises(ProbeError, match=words):
+        LinearProbe(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"origin": [0, 0]}, "origin is not three finite"),
+        ({"row_step": [0, 0, np.inf]}, "row_step is not three finite"),
+        ({"row_step": [2e-3, 0, 0]}, "do not span a plane"),
+        ({"column_step": [0, 0, 0]}, "do not span a plane"),
+    ],
+)
+def test_a_plane_that_cannot_be_is_refused(change, words):
+    good = {"origin": [0, 0, 0], "column_step": [1e-3, 0, 0], "row_step": [0, 0, 1e-3]}
+    with pytest.raises(ProbeError, match=words):
+        SlicePlane(**{**good, **change}, columns=3, rows=3)

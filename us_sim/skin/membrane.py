@@ -1,0 +1,345 @@
+"""The skin as a membrane of springs, anchored to its shape at rest (the paper, section V).
+
+Edges of the surface are springs; each vertex is a particle that a spring of zero length and a
+damper tie to its place at rest. The probe's repulsion is taken to its rigid limit: a particle
+inside the collider is put on its surface and loses its velocity into it, so that no particle is
+ever inside. Particles move by symplectic Euler (the paper, equations 3 to 5).
+
+An unstretched spring does not resist a displacement across it, and skin of such springs has a
+crease where contact ends. Skin in the body is under tension, which smooths it: the springs are
+prestrained here, and the anchors carry the tension at rest. With ``prestrain=0`` the springs are
+the paper's.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.skin.membrane import SkinMembrane
+>>> from us_sim.skin.surface import plane_surface
+>>> skin = SkinMembrane(plane_surface((0.1, 0.1), 0.005), Sphere(0.03))
+>>> pressed = skin.deform(Pose([0, 0, 0.005]))
+>>> f"{pressed.vertices[:, 2].max():.4f} m"
+'0.0050 m'
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.collider import Collider, signed_distance
+from us_sim.errors import SolverError
+from us_sim.pose import Pose
+from us_sim.skin.contact import push_out
+from us_sim.skin.springs import spring_energy, spring_forces
+from us_sim.skin.surface import TriangleSurface, vertex_normals
+
+__all__ = ["CONTACT_TOLERANCE", "SkinDeformation", "SkinMembrane"]
+
+CONTACT_TOLERANCE = 1e-9
+"""m: no vertex is deeper inside the collider than this."""
+
+# Share of the linear system's greatest stable step that is used. Near the whole of it, folded skin
+# with hardly any damping was seen to gain energy from frame to frame.
+_SAFETY = 0.7
+# m: a frame that moves no vertex farther than this leaves the membrane settled.
+_SETTLED = 1e-7
+# m: a settled membrane without contact that is this close to its rest shape is put there.
+_AT_REST = 1e-6
+# m: a probe that moves farther than this between frames was lifted and set down elsewhere.
+_JUMP = 0.03
+_MOST_STEPS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class SkinDeformation:
+    """The skin under the probe."""
+
+    vertices: NDArray[np.float64]  # (N, 3), m, frame patient
+    normals: NDArray[np.float64]  # (N, 3), unit, out of the body
+    residual: float  # unbalanced force, of the force that the anchors bear; 0 at rest
+    action: str  # what was done for stability, '' when nothing
+
+
+class SkinMembrane:
+    """A surface of anchored particles and springs that a probe presses.
+
+    Args:
+        surface: at rest.
+        collider: the probe's shape.
+        stiffness: N/m, of an edge's spring.
+        anchor_stiffness: N/m, of the zero-length spring of a vertex.
+        damping: of the anchors' dampers, 1 where an anchored particle alone is critically damped;
+            not less, since skin is overdamped.
+        density: kg/m², of the skin. Where a vertex would be too light for a stable step its mass
+            is raised, as every deformation's ``action`` then says.
+        prestrain: of the springs at rest, 0 to below 1.
+        time_step: s.
+        steps: in a frame. A probe that moves far takes more, as ``action`` then says.
+
+    Raises:
+        SolverError: a setting is not finite or out of its range.
+    """
+
+    def __init__(
+        self,
+        surface: TriangleSurface,
+        collider: Collider,
+        *,
+        stiffness: float = 40.0,
+        anchor_stiffness: float = 4.0,
+        damping: float = 1.0,
+        density: float = 2.0,
+        prestrain: float = 0.2,
+        time_step: float = 0.01,
+        steps: int = 10,
+    ) -> None:
+        _require("stiffness", stiffness, stiffness >= 0, "0 or more, in N/m")
+        _require("anchor_stiffness", anchor_stiffness, anchor_stiffness > 0, "more than 0, in N/m")
+        _require("damping", damping, damping >= 1, "1 or more, as skin is overdamped")
+        _require("density", density, density > 0, "more than 0, in kg/m²")
+        _require("prestrain", prestrain, 0 <= prestrain < 1, "0 to below 1")
+        _require("time_step", time_step, time_step > 0, "more than 0, in s")
+        _require("steps", steps, 1 <= steps <= _MOST_STEPS, f"1 to {_MOST_STEPS}")
+        self.surface = surface
+        self._collider = collider
+        self._stiffness = float(stiffness)
+        self._anchor = float(anchor_stiffness)
+        self._time_step = float(time_step)
+        self._steps = int(steps)
+
+        # Unsigned, since numba tests a signed index for counting from the end.
+        self._edges = edges = surface.edges.astype(np.uint32)
+        at_rest = surface.vertices[edges[:, 1]] - surface.vertices[edges[:, 0]]
+        length = np.sqrt((at_rest**2).sum(axis=1))
+        self._natural_length = (1.0 - prestrain) * length
+        self._rest_tension = np.ascontiguousarray(at_rest * prestrain)
+
+        valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
+        # Gershgorin: no mode is stiffer than twice a particle's springs and its anchor.
+        stiffest = 2.0 * self._stiffness * valence + self._anchor
+        density_mass = density * surface.vertex_areas
+        lightest = stiffest * (self._time_step / (2.0 * _SAFETY)) ** 2
+        self.mass: NDArray[np.float64] = np.maximum(density_mass, lightest)  # (N,), kg
+        self.step_limit = float(2.0 * np.sqrt(np.min(density_mass / stiffest)))
+        """s, the greatest stable step with the masses that ``density`` gives."""
+        self._decay = 2.0 * damping * np.sqrt(self._anchor / self.mass)
+        self._scaling = ""
+        if (self.mass > density_mass).any():
+            with np.errstate(divide="ignore"):
+                most = float(np.max(self.mass / density_mass))
+            self._scaling = (
+                f"masses raised up to {most:.3g} times, as a step of {self._time_step:g} s is "
+                f"stable only up to {self.step_limit:.2g} s without"
+            )
+        self._at_rest = SkinDeformation(
+            surface.vertices, vertex_normals(surface.vertices, surface.triangles), 0.0, ""
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the rest shape, without a probe."""
+        self._vertices = self.surface.vertices
+        self._velocity = np.zeros_like(self._vertices)
+        self._pose: Pose | None = None
+        self._settled = True
+        self._latest = self._at_rest
+
+    def warm_up(self) -> None:
+        """Compile every kernel, or load it from numba's cache; the membrane stays as it is."""
+        small = SkinMembrane(
+            TriangleSurface(np.eye(3), np.array([[0, 1, 2]], dtype=np.int32)), self._collider
+        )
+        small.deform(Pose())
+        small.energy()
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """(N, 3) m/s, of the vertices at the end of the latest frame."""
+        return self._velocity.copy()
+
+    def energy(self) -> float:
+        """J, of the springs, the anchors and the motion; 0 at rest."""
+        return float(
+            spring_energy(
+                self._vertices,
+                self._velocity,
+                self.surface.vertices,
+                self._edges,
+                self._natural_length,
+                self._rest_tension,
+                self._stiffness,
+                self._anchor,
+                self.mass,
+            )
+        )
+
+    def deform(self, pose: Pose | None) -> SkinDeformation:
+        """The skin one frame later, with the probe moved to ``pose``, or away where it is None.
+
+        With the probe where it was and the membrane settled, this is the latest result as it is.
+        """
+        if self._settled and _same(pose, self._pose):
+            return self._latest
+        start, steps, note = self._approach(pose)
+        vertices, velocity = self._vertices.copy(), self._velocity.copy()
+        residual, moved, contacts = _relax(
+            vertices,
+            velocity,
+            self.surface.vertices,
+            self._edges,
+            self._natural_length,
+            self._rest_tension,
+            self._stiffness,
+            self._anchor,
+            self.mass,
+            self._decay,
+            self._time_step,
+            steps,
+            self._collider.offset_box,
+            _placement(start),
+            _placement(pose),
+            pose is not None,
+        )
+        finite = np.isfinite(vertices).all() and np.isfinite(velocity).all()
+        if not (finite and math.isfinite(residual)):
+            self._velocity[:] = 0.0
+            return SkinDeformation(
+                self._latest.vertices,
+                self._latest.normals,
+                self._latest.residual,
+                "the springs' forces are not finite: kept the latest shape and stopped its motion",
+            )
+        self._settled = moved < _SETTLED
+        if self._settled:
+            velocity[:] = 0.0
+            if not contacts and np.abs(vertices - self.surface.vertices).max() < _AT_REST:
+                vertices[:] = self.surface.vertices
+                residual = 0.0
+        vertices.flags.writeable = False
+        self._vertices, self._velocity, self._pose = vertices, velocity, pose
+        if self._settled and not contacts and residual == 0.0:
+            self._latest = self._at_rest
+            return self._latest
+        self._latest = SkinDeformation(
+            vertices,
+            vertex_normals(vertices, self.surface.triangles),
+            float(residual),
+            "; ".join(part for part in (self._scaling, note) if part),
+        )
+        return self._latest
+
+    def _approach(self, pose: Pose | None) -> tuple[Pose | None, int, str]:
+        """Where the probe comes from, the steps it takes on the way, and a note on them.
+
+        A probe that appears inside the skin would push particles out on its far side. So it comes
+        along its axis from where it touches nothing, in steps that are short against its body.
+        """
+        if pose is None:
+            return None, self._steps, ""
+        start = self._pose
+        if start is None or np.linalg.norm(pose.position - start.position) > _JUMP:
+            start = self._lifted(pose)
+        box = self._collider.offset_box
+        turn = 2.0 * math.acos(min(1.0, abs(float(pose.orientation @ start.orientation))))
+        reach = math.hypot(box[0], box[1], 2 * box[2]) + 2 * box[3]
+        travel = float(np.linalg.norm(pose.position - start.position)) + turn * reach
+        wanted = math.ceil(travel / (0.25 * (box[2] + box[3])))
+        steps = min(max(self._steps, wanted), _MOST_STEPS)
+        if steps == self._steps:
+            return start, steps, ""
+        return start, steps, f"{steps} steps for a probe that moved {1e3 * travel:.3g} mm"
+
+    def _lifted(self, pose: Pose) -> Pose:
+        """The pose, lifted along the probe's axis until it touches nothing (100 mm at most)."""
+        axis = pose.rotation[:, 2]
+        for lift in np.arange(0.0, 0.1, 2.5e-3):
+            lifted = Pose(pose.position - lift * axis, pose.orientation)
+            distance, _ = signed_distance(self._collider, lifted, self._vertices)
+            if distance.min() >= 0.0:
+                break
+        return lifted
+
+
+def _require(name: str, value: float, good: bool, wanted: str) -> None:
+    if not (isinstance(value, int | float | np.number) and math.isfinite(value) and good):
+        raise SolverError(f"the skin's {name} is {value!r}: give {wanted}")
+
+
+def _same(a: Pose | None, b: Pose | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
+
+
+def _placement(pose: Pose | None) -> NDArray[np.float64]:
+    """(7,) position and orientation, as the kernels take them."""
+    if pose is None:
+        return np.array([0.0, 0, 0, 0, 0, 0, 1])
+    return np.concatenate([pose.position, pose.orientation])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _relax(
+    x, v, rest, edges, natural_length, rest_tension, stiffness, anchor, mass, decay,
+    time_step, steps, box, start, end, pressed,
+):  # fmt: skip
+    """Moves the membrane on in time, and the probe from ``start`` to ``end``.
+
+    Args:
+        x, v: (N, 3) m and m/s, changed here. rest: (N, 3) m. edges: (E, 2).
+        natural_length: (E,) m. rest_tension: (E, 3) m, of a spring at rest, over its stiffness.
+        mass, decay: (N,) kg and 1/s. box: the collider's ``offset_box``.
+        start, end: (7,) placements of the probe. pressed: whether there is one.
+
+    Returns:
+        The residual, the farthest that a vertex moved (m), and the number in contact.
+    """
+    n = len(x)
+    before = x.copy()
+    force = np.empty((n, 3))
+    normal = np.zeros((n, 3))
+    touched = np.zeros(n, dtype=np.bool_)
+    contacts = 0
+    awake = False
+    for i in range(n):
+        for a in range(3):
+            awake = awake or x[i, a] != rest[i, a] or v[i, a] != 0.0
+    for step in range(1, steps + 1):
+        if awake:
+            spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor)
+            for i in range(n):
+                gain = time_step / mass[i]
+                # The dampers act on the velocity at the end of the step: they cost no stability.
+                kept = 1.0 / (1.0 + time_step * decay[i])
+                for a in range(3):
+                    v[i, a] = kept * (v[i, a] + gain * force[i, a])
+                    x[i, a] += time_step * v[i, a]
+        if pressed:
+            contacts = push_out(x, v, normal, touched, box, start, end, step / steps)
+            awake = awake or contacts > 0
+
+    if not awake:
+        return 0.0, 0.0, contacts
+    spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor)
+    unbalanced = 0.0
+    borne = 0.0
+    moved = 0.0
+    for i in range(n):
+        into = 0.0
+        if touched[i]:
+            for a in range(3):
+                into += force[i, a] * normal[i, a]
+            into = min(into, 0.0)
+        distance = 0.0
+        for a in range(3):
+            unbalanced += (force[i, a] - into * normal[i, a]) ** 2
+            borne += (anchor * (x[i, a] - rest[i, a])) ** 2
+            distance += (x[i, a] - before[i, a]) ** 2
+        moved = max(moved, distance)
+    if borne == 0.0:
+        return 0.0, np.sqrt(moved), contacts
+    return np.sqrt(unbalanced / borne), np.sqrt(moved), contacts

@@ -1,0 +1,286 @@
+"""Triangle surfaces of the skin: sheets made here, or read from a file, and their normals.
+
+>>> from us_sim.skin.surface import bent_surface, vertex_normals
+>>> arm = bent_surface((0.1, 0.05), 0.005, flat_width=0.04, radius=0.05)
+>>> len(arm.vertices), len(arm.triangles)
+(231, 400)
+>>> vertex_normals(arm.vertices, arm.triangles)[115]
+array([ 0.,  0., -1.])
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError
+from us_sim.skin.wavefront import parse_wavefront
+
+__all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface", "vertex_normals"]
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleSurface:
+    """Vertices and triangles, wound so that their normals point out of the body.
+
+    Raises:
+        MeshError: wrong shapes, vertices that are not finite, indices out of range, a triangle
+            that names a vertex twice, or a vertex in no triangle.
+    """
+
+    vertices: NDArray[np.float64]  # (N, 3), m, frame patient
+    triangles: NDArray[np.int32]  # (T, 3), indices into vertices
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64, order="C")
+        given = np.asarray(self.triangles)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise MeshError(f"surface vertices have shape {vertices.shape}: give (N, 3)")
+        finite = np.isfinite(vertices).all(axis=1)
+        if not finite.all():
+            bad = int(np.argmin(finite))
+            raise MeshError(f"surface vertex {bad} is not finite: {vertices[bad].tolist()}")
+        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "iu":
+            raise MeshError(
+                f"surface triangles have shape {given.shape} and type {given.dtype}: give (T, 3) "
+                f"integers"
+            )
+        if not given.size:
+            raise MeshError("the surface has no triangle: give one at least")
+        if given.min() < 0 or given.max() >= len(vertices):
+            raise MeshError(
+                f"surface triangles name vertices {given.min()} to {given.max()}, but there are "
+                f"only {len(vertices)}"
+            )
+        triangles = np.array(given, dtype=np.int32, order="C")
+        twice = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+        if twice.any():
+            bad = int(np.argmax(twice))
+            raise MeshError(f"surface triangle {bad} names a vertex twice: {triangles[bad]}")
+        used = np.zeros(len(vertices), dtype=bool)
+        used[triangles] = True
+        if not used.all():
+            raise MeshError(
+                f"surface vertex {int(np.argmin(used))} is in no triangle: leave it out"
+            )
+        vertices.flags.writeable = False
+        triangles.flags.writeable = False
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "triangles", triangles)
+
+    @cached_property
+    def edges(self) -> NDArray[np.int32]:
+        """(E, 2) each edge once, lower index first, in ascending order."""
+        sides = np.concatenate([self.triangles[:, [0, 1]], self.triangles[:, [1, 2]],
+                                self.triangles[:, [2, 0]]])  # fmt: skip
+        return np.unique(np.sort(sides, axis=1), axis=0)
+
+    @cached_property
+    def vertex_areas(self) -> NDArray[np.float64]:
+        """(N,) m², a third of the area of each triangle at a vertex."""
+        a, b, c = self.vertices[self.triangles.T]
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        shares = np.zeros(len(self.vertices))
+        np.add.at(shares, self.triangles, areas[:, None] / 3)
+        return shares
+
+
+def plane_surface(size: tuple[float, float], spacing: float) -> TriangleSurface:
+    """A flat sheet in z = 0 around the origin, with normals along -z, out of the body.
+
+    Args:
+        size: m, along x and y.
+        spacing: m, the greatest distance of neighbours along x or y.
+
+    Raises:
+        MeshError: a length is not positive, or the sheet would have over four million vertices.
+    """
+    x, y = _steps("size", size[0], spacing), _steps("size", size[1], spacing)
+    return _sheet(np.column_stack([x, np.zeros_like(x)]), y)
+
+
+def bent_surface(
+    size: tuple[float, float], spacing: float, *, flat_width: float, radius: float
+) -> TriangleSurface:
+    """An arm-like sheet: flat in the middle, then bent towards +z in an arc on both sides.
+
+    Args:
+        size: m, along x (measured on the sheet, as if it were unrolled) and along y.
+        spacing: m, the greatest distance of neighbours along the sheet.
+        flat_width: m along x, the part around x = 0 that lies in z = 0.
+        radius: m, of the arcs; each spans ``(size[0] - flat_width) / (2 radius)`` radians.
+
+    Raises:
+        MeshError: a length is not positive, the flat part is wider than the sheet, or an arc
+            is more than half a circle.
+    """
+    if not (math.isfinite(flat_width) and 0.0 <= flat_width <= size[0]):
+        raise MeshError(
+            f"the sheet's flat_width is {flat_width!r} m: give 0 to its size along x, {size[0]!r} m"
+        )
+    if not (math.isfinite(radius) and radius > 0.0):
+        raise MeshError(f"the sheet's radius is {radius!r} m: give a length above zero")
+    if (size[0] - flat_width) / (2 * radius) > math.pi:
+        raise MeshError(
+            f"the sheet's sides of {(size[0] - flat_width) / 2:g} m are more than half a circle "
+            f"of radius {radius:g} m: give a larger radius or a smaller size"
+        )
+    along, y = _steps("size", size[0], spacing), _steps("size", size[1], spacing)
+    flat = np.clip(along, -flat_width / 2, flat_width / 2)
+    angle = (along - flat) / radius
+    profile = np.column_stack([flat + radius * np.sin(angle), radius * (1 - np.cos(angle))])
+    return _sheet(profile, y)
+
+
+def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurface:
+    """A surface from an OBJ file, or from an STL, PLY or VTK file as far as meshio reads it.
+
+    Quadrilaterals are split, vertices in the same place are joined, and those in no triangle are
+    left out.
+
+    Args:
+        path: the file, in frame ``patient``.
+        metres_per_unit: the file's unit, 0.001 where it is in millimetres.
+
+    Raises:
+        MeshError: the file is missing, unreadable or without triangles, or meshio is needed and
+            not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: there is no such surface file")
+    if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
+        raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
+    try:
+        if path.suffix.lower() == ".obj":
+            points, faces = parse_wavefront(path.read_text(errors="replace"))
+        else:
+            points, faces = _read_with_meshio(path)
+        if not len(faces):
+            raise MeshError("the file has no triangles")
+        places, joined = np.unique(points, axis=0, return_inverse=True)
+        triangles = joined.reshape(-1)[faces]
+        proper = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+        used, triangles = np.unique(triangles[proper], return_inverse=True)
+        return TriangleSurface(
+            places[used] * metres_per_unit, triangles.reshape(-1, 3).astype(np.int32)
+        )
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def vertex_normals(
+    vertices: NDArray[np.float64], triangles: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """(N, 3) unit normals, the sum of the adjacent triangles' normals weighted by area.
+
+    Where those cancel, the normal is zero.
+
+    Args:
+        vertices: (N, 3). triangles: (T, 3).
+    """
+    return _vertex_normals(
+        np.ascontiguousarray(vertices, dtype=np.float64),
+        np.ascontiguousarray(triangles, dtype=np.int32),
+    )
+
+
+def _read_with_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Points (N, 3) and triangles (T, 3) of a file."""
+    try:
+        import meshio
+    except ImportError as error:
+        raise MeshError(
+            f"reading a {path.suffix} file needs meshio; install it with `pip install meshio`"
+        ) from error
+    try:
+        # For a file that none of its readers takes, meshio prints and then leaves the process.
+        # Its STL reader overflows on the first bytes of a text file before it knows that it is one.
+        silence = io.StringIO()
+        with (
+            contextlib.redirect_stdout(silence),
+            contextlib.redirect_stderr(silence),
+            np.errstate(over="ignore"),
+        ):
+            mesh = meshio.read(path)
+        parts = [np.empty((0, 3), dtype=np.int32)]
+        for block in mesh.cells:
+            if block.type == "triangle":
+                parts.append(block.data)
+            elif block.type == "quad":
+                parts += [block.data[:, [0, 1, 2]], block.data[:, [0, 2, 3]]]
+        points = np.asarray(mesh.points, dtype=np.float64)
+        return points.reshape(len(points), 3), np.concatenate(parts).astype(np.int32)
+    except (Exception, SystemExit) as error:
+        raise MeshError(
+            "this is not a surface that can be read: give an OBJ, STL, PLY or VTK file"
+        ) from error
+
+
+def _steps(name: str, length: float, spacing: float) -> NDArray[np.float64]:
+    """Evenly spaced coordinates over a length around 0, at most ``spacing`` apart."""
+    for what, value in ((name, length), ("spacing", spacing)):
+        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+            raise MeshError(f"the sheet's {what} is {value!r} m: give a length above zero")
+    count = math.ceil(length / spacing - 1e-9)
+    if count > 2000:
+        raise MeshError(
+            f"the sheet would have {count} steps of {spacing:g} m along {length:g} m: give a "
+            f"wider spacing"
+        )
+    return length * (np.arange(count + 1) / count - 0.5)
+
+
+def _sheet(profile: NDArray[np.float64], y: NDArray[np.float64]) -> TriangleSurface:
+    """The sheet swept along y by a profile (M, 2) of x and z, with alternating diagonals."""
+    m, n = len(profile), len(y)
+    vertices = np.empty((m, n, 3))
+    vertices[:, :, 0] = profile[:, :1]
+    vertices[:, :, 1] = y
+    vertices[:, :, 2] = profile[:, 1:]
+    index = np.arange(m * n).reshape(m, n)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    even = (np.add.outer(np.arange(m - 1), np.arange(n - 1)) % 2 == 0)[..., None]
+    # Diagonals that alternate give the springs no preferred direction across the sheet.
+    first = np.where(even, np.stack([a, c, b], -1), np.stack([a, d, b], -1))
+    second = np.where(even, np.stack([a, d, c], -1), np.stack([b, d, c], -1))
+    triangles = np.stack([first, second], axis=2).reshape(-1, 3)
+    return TriangleSurface(vertices.reshape(-1, 3), triangles.astype(np.int32))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _vertex_normals(vertices, triangles):
+    """(N, 3) area-weighted unit normals of vertices (N, 3) with triangles (T, 3)."""
+    normals = np.zeros_like(vertices)
+    for t in range(len(triangles)):
+        i = triangles[t, 0]
+        j = triangles[t, 1]
+        k = triangles[t, 2]
+        ax = vertices[j, 0] - vertices[i, 0]
+        ay = vertices[j, 1] - vertices[i, 1]
+        az = vertices[j, 2] - vertices[i, 2]
+        bx = vertices[k, 0] - vertices[i, 0]
+        by = vertices[k, 1] - vertices[i, 1]
+        bz = vertices[k, 2] - vertices[i, 2]
+        x = ay * bz - az * by
+        y = az * bx - ax * bz
+        z = ax * by - ay * bx
+        for v in (i, j, k):
+            normals[v, 0] += x
+            normals[v, 1] += y
+            normals[v, 2] += z
+    for v in range(len(normals)):
+        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        if length > 0.0:
+            normals[v, 0] /= length
+            normals[v, 1] /= length
+            normals[v, 2] /= length
+    return normals
