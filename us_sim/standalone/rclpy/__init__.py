@@ -37,7 +37,7 @@ __all__ = [
     "uninstall_signal_handlers",
 ]
 
-_executor: "Executor | None" = None
+_global_executor: "Executor | None" = None
 
 
 def init(
@@ -66,18 +66,18 @@ def init(
 
 def get_global_executor() -> "Executor":
     """The executor that `spin` and the like use when none is given."""
-    global _executor
-    if _executor is None:
+    global _global_executor
+    if _global_executor is None:
         from .executors import SingleThreadedExecutor
 
-        _executor = SingleThreadedExecutor()
+        _global_executor = SingleThreadedExecutor()
         get_default_context().on_shutdown(_end_global_executor)
-    return _executor
+    return _global_executor
 
 
 def _end_global_executor() -> None:
-    global _executor
-    executor, _executor = _executor, None
+    global _global_executor
+    executor, _global_executor = _global_executor, None
     if executor is not None:
         executor.shutdown()
 
