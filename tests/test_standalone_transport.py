@@ -15,6 +15,8 @@ from types import SimpleNamespace
 
 import pytest
 
+pytest.importorskip("cyclonedds", reason="the transport needs pip install cyclonedds")
+
 from us_sim.standalone.domain import DiscoveryRange
 from us_sim.standalone.endpoint_qos import EndpointQos, qos_of_profile
 from us_sim.standalone.graph import GraphNode

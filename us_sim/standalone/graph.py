@@ -141,7 +141,7 @@ class Graph:
                 for node in nodes
             )
             self._writer.write(serialize(_to_message(self._participant.gid, self._announced)))
-        self._participant._dispatcher.call_soon(self._notify)
+        self._participant._dispatcher.call_soon(self.notify)
 
     def close(self) -> None:
         """Learn nothing more, and forget everything."""
@@ -155,14 +155,15 @@ class Graph:
     def _something_came(self) -> None:
         # Reading leaves nothing to trigger on, so the status needs no separate reset.
         if self._refresh():
-            self._notify()
+            self.notify()
 
     def _refresh_early(self) -> None:
         """Take in what the dispatcher has not seen yet, and have ``on_change`` told of it."""
         if self._refresh():
-            self._participant._dispatcher.call_soon(self._notify)
+            self._participant._dispatcher.call_soon(self.notify)
 
-    def _notify(self) -> None:
+    def notify(self) -> None:
+        """Call ``on_change``."""
         callback = self.on_change
         if callback is not None:
             callback()

@@ -68,10 +68,14 @@ _SERVICES = {
     "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
 }
 
-# The defaults in Jazzy's .msg files that are not zero anyway (rosbags drops them).
+# The defaults that Jazzy's .msg files declare (rosbags drops them).
 _DEFAULTS = {
+    **{("geometry_msgs/msg/Quaternion", axis): 0.0 for axis in "xyz"},
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("rcl_interfaces/msg/ParameterDescriptor", "dynamic_typing"): False,
+    ("rcl_interfaces/msg/ParameterDescriptor", "read_only"): False,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
+    ("type_description_interfaces/msg/FieldType", "type_id"): 0,
 }
 
 _IDL_NAMES = {

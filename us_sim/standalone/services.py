@@ -162,6 +162,9 @@ class ServiceClient(_ServiceEndpoint):
             f"no client can be made for {service!r}",
         )
         self._number = handle.value
+        # A server is in the graph shortly before it is connected: who waits for it on the graph's
+        # on_change must look again then.
+        self._writer.on_event = self._reader.on_event = lambda _: participant.graph.notify()
 
     def service_is_ready(self) -> bool:
         """Whether a server is connected in both directions."""
