@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -290,11 +289,9 @@ def _report(scene: Scene, out: Path, recording: Path, startup: float, wall: floa
     from us_sim.evaluation.contact_sheet import contact_sheet
     from us_sim.evaluation.session import read_session, write_summary
 
-    samples = 120
-    with Progress("measuring the recording", samples, "images") as bar:
+    with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(recording)
-        done = _counter(bar)
-        areas = session.lumen_areas(scene, samples, done)
+        areas = session.lumen_areas(scene, 120, lambda done: bar.update(100 * done))
     summary = session.summary(areas)
     summary |= {"scene": scene.name, "startup_s": round(startup, 2), "wall_s": round(wall, 2)}
     contact_sheet(session, scene, areas, out / "contact_sheet.png")
@@ -313,14 +310,3 @@ def _report(scene: Scene, out: Path, recording: Path, startup: float, wall: floa
     for file in ("session.mcap", "contact_sheet.png", "summary.json", "nodes.log"):
         print(out / file)
     return 0
-
-
-def _counter(bar: Progress) -> Callable[[int], None]:
-    total = 0
-
-    def add(count: int) -> None:
-        nonlocal total
-        total += count
-        bar.update(total)
-
-    return add

@@ -38,6 +38,8 @@ class Progress:
 
     def update(self, done: float, text: str = "") -> None:
         """Show that ``done`` of the total is done."""
+        if self._bar.total is not None:
+            done = min(done, self._bar.total)
         self._bar.set_postfix_str(text, refresh=False)
         self._bar.update(done - self._bar.n)
 

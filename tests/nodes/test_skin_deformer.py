@@ -38,7 +38,21 @@ def test_vertices_normals_marker_and_latched_mesh(bench, small_scene):
     triangles = membrane.surface.triangles
     assert len(meshes[0].triangles) == len(triangles)
     assert list(meshes[0].triangles[3].vertex_indices) == triangles[3].tolist()
-    corner = markers[0].points[0]
-    np.testing.assert_allclose(
-        [corner.x, corner.y, corner.z], expected.vertices[triangles[0, 0]], atol=1e-6
-    )
+    points = np.array([[point.x, point.y, point.z] for point in markers[0].points])
+    np.testing.assert_allclose(points, expected.vertices[triangles.ravel()], atol=1e-12)
+    assert markers[0].type == Marker.TRIANGLE_LIST
+    assert markers[0].color.a == np.float32(0.9)
+    assert (markers[0].header.stamp.sec, markers[0].header.frame_id) == (5, "patient")
+
+
+def test_markers_are_sent_at_their_rate_and_again_when_stamps_go_back(bench, small_scene):
+    bench.make(SkinDeformer, scene=str(small_scene), lockstep=True, marker_rate=0.5)
+    clouds = bench.collect(PointCloud2, "skin/nodes")
+    markers = bench.collect(Marker, "skin/marker")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    for topic in ("skin/nodes", "skin/marker"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    for second in (10, 11, 12, 13, 14, 1):
+        publisher.publish(pose_at(0.0, second))
+    bench.spin_until(lambda: len(clouds) == 6 and len(markers) >= 4)
+    assert [marker.header.stamp.sec for marker in markers] == [10, 12, 14, 1]

@@ -19,9 +19,11 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene import Scene
 from us_sim.slicing.row_subdivision import RowSubdivision
 
-__all__ = ["LumenAreas", "Session", "read_session"]
+__all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
 
 VESSELS = ("vein", "artery")
+STAMPED = ("/tracker/pose", "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
+OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
 MILLISECOND = 1e6
 """In nanoseconds."""
 
@@ -100,9 +102,12 @@ class Session:
         raise BagError(f"the session has no image with stamp {stamp}")
 
     def lumen_areas(
-        self, scene: Scene, samples: int, progress: Callable[[int], None] | None = None
+        self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
     ) -> LumenAreas | None:
-        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue."""
+        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
+
+        ``progress`` is called with the fraction that is done.
+        """
         volume = volume_of(scene)
         numbers = {name: label for label, name in volume.label_names.items()}
         vessels = [name for name in VESSELS if name in numbers]
@@ -111,15 +116,16 @@ class Session:
         probe = probe_of(scene)
         cutter = RowSubdivision(volume, self.rest, self.tetrahedra, regions=scene.slice.regions)
         stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
-        chosen = stamps[:: max(len(stamps) // samples, 1)]
+        picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
+        chosen = [stamps[i] for i in picked]
         pixel = probe.aperture * probe.depth / (probe.columns * probe.rows)
         area: dict[str, list[float]] = {name: [] for name in vessels}
-        for stamp in chosen:
+        for done, stamp in enumerate(chosen, start=1):
             labels = cutter.labels(self.nodes[stamp], probe.plane(self.poses[stamp]))
             for name in vessels:
                 area[name].append(float(np.count_nonzero(labels == numbers[name])) * pixel)
             if progress is not None:
-                progress(1)
+                progress(done / len(chosen))
         first = min(self.poses)
         return LumenAreas(
             time=np.array([(stamp - first) * 1e-9 for stamp in chosen]),
@@ -134,7 +140,7 @@ class Session:
         seconds = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 1 else 0.0
         latency = {
             topic: dict(zip(("p50", "p99"), self.latency(topic), strict=True))
-            for topic in ("/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
+            for topic in STAMPED[1:]
             if self.sent.get(topic)
         }
         summary: dict[str, Any] = {
@@ -194,9 +200,10 @@ def read_session(file: Path) -> Session:
     sent: dict[str, list[tuple[int, int, int]]] = {}
     reports: dict[str, dict[str, str]] = {}
     rest = tetrahedra = None
-    for message in bag.messages():
+    there = [topic.name for topic in bag.topics if topic.name in {*STAMPED, *OTHERS}]
+    for message in bag.messages(there):
         decoded: Any = bag.deserialize(message)
-        if hasattr(decoded, "header"):
+        if message.topic in STAMPED:
             times = (_stamp(decoded), message.publish_time, message.log_time)
             sent.setdefault(message.topic, []).append(times)
         if message.topic == "/probe/pose":

@@ -24,6 +24,9 @@ from us_sim.recording.path import ProbePath, read_path
 
 __all__ = ["PathPlayer", "main"]
 
+CHECK_S, CHECKS = 0.05, 6
+"""How often, and how often in a row, everything awaited must be there before the first pose."""
+
 
 class PathPlayer(Node):
     """A bag's poses on ``tracker/pose``.
@@ -50,6 +53,7 @@ class PathPlayer(Node):
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
         self._begun = 0
+        self._checks = 0
         self.finished = Future()
         self.health = Health(self, str(path))
         qos = EVERY if self._lockstep else STREAM
@@ -60,7 +64,7 @@ class PathPlayer(Node):
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
-        self._starting = self.create_timer(0.05, self._begin)
+        self._starting = self.create_timer(CHECK_S, self._begin)
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
         if self._path.note:
@@ -81,8 +85,13 @@ class PathPlayer(Node):
         return self.declare_parameter(name, value, descriptor).value
 
     def _begin(self) -> None:
-        """Start once somebody listens and the awaited topics are there."""
-        if not self._poses.get_subscription_count() or not all(map(self._is_there, self._awaited)):
+        """Start once somebody listens and the awaited topics have been there for a while.
+
+        A best-effort subscriber may find this publisher a little later than it is found itself.
+        """
+        there = self._poses.get_subscription_count() and all(map(self._is_there, self._awaited))
+        self._checks = self._checks + 1 if there else 0
+        if self._checks < CHECKS:
             return
         self._starting.cancel()
         self._begun = self.get_clock().now().nanoseconds

@@ -6,6 +6,8 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
@@ -20,13 +22,25 @@ __all__ = ["SkinDeformer", "main"]
 
 
 class SkinDeformer(SceneNode):
-    """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched."""
+    """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.
+
+    The parameter ``marker_rate`` bounds how often a second the marker is sent: it is for the eye.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("skin_deformer", **kwargs)
         self._membrane = membrane_of(self.scene)
         surface = self._membrane.surface
         self._triangles = surface.triangles
+        self.declare_parameter(
+            "marker_rate",
+            20.0,
+            ParameterDescriptor(
+                description="markers a second at most",
+                floating_point_range=[FloatingPointRange(from_value=0.1, to_value=1000.0)],
+            ),
+        )
+        self._marked = 0
         self.get_logger().info(f"preparing a membrane of {len(surface.vertices)} vertices")
         self._membrane.warm_up()
         self._nodes = self.stream(PointCloud2, "skin/nodes")
@@ -38,7 +52,7 @@ class SkinDeformer(SceneNode):
 
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
-        shown = self._marker.get_subscription_count() > 0
+        shown = self._marker.get_subscription_count() > 0 and self._is_marker_due(message)
         if not (wanted or shown):
             return
         stamp = message.header.stamp
@@ -59,6 +73,15 @@ class SkinDeformer(SceneNode):
             self.health.published("skin/marker")
         self.health.state = "running"
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}
+
+    def _is_marker_due(self, message: PoseStamped) -> bool:
+        """Whether a marker's time has passed since the last one, or the stamps went back."""
+        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        rate = self.get_parameter("marker_rate").value
+        if 0 <= stamp - self._marked < 0.99e9 / rate:
+            return False
+        self._marked = stamp
+        return True
 
 
 def main(args: list[str] | None = None) -> int:
