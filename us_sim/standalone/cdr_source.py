@@ -1,8 +1,7 @@
 """Generates the functions that write and read a message's CDR.
 
 Consecutive primitives whose alignment is known beforehand go through one ``struct`` call;
-``array.array`` and NumPy data are copied whole. The format is the OMG's CDR (CORBA 3.3, part 2,
-9.3): every primitive is aligned to its own size, counted from the end of the four-byte header.
+``array.array`` and NumPy data are copied whole.
 
 >>> from us_sim.standalone.cdr_source import writer_source
 >>> print(writer_source("geometry_msgs/msg/Point").splitlines()[-2].strip())
@@ -12,21 +11,18 @@ add(c0(v0._x, v0._y, v0._z)); pos += 24
 from __future__ import annotations
 
 import struct
-from abc import ABC, abstractmethod
-from array import array
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from us_sim.standalone.cdr_layout import FORMATS, CdrLayout
+from us_sim.standalone.field_setters import ARRAY_TYPES
 from us_sim.standalone.interfaces import Field, interface
-from us_sim.standalone.message_class import ARRAY_TYPES, Message, message_class
+from us_sim.standalone.message_class import Message, message_class
 
 __all__ = ["compiled_reader", "compiled_writer", "writer_source"]
-
-_FORMATS = {"bool": "?", "byte": "c", **{kind: code for kind, (code, _) in ARRAY_TYPES.items()}}
-_PADS = tuple(bytes(n) for n in range(8))
 
 
 @cache
@@ -50,125 +46,7 @@ def writer_source(type_name: str) -> str:
     return "\n".join(_Writer(type_name).lines)
 
 
-class _Source(ABC):
-    """A function's source as it grows, and what is known of the position at its current end.
-
-    ``known`` is (modulus, remainder): the distance from the header's end is ``remainder`` modulo
-    the power of two ``modulus``, at most 8. Nothing is known modulo 1.
-    """
-
-    def __init__(self, order: str) -> None:
-        self.lines: list[str] = []
-        self.indent = 1
-        self.order = order
-        self.known = (8, 0)
-        self.format, self.size = "", 0
-        self.terms: list[str] = []
-        self.variables = 0
-        self.constants: list[Any] = []
-        self.line("pos = 4")
-
-    def compile(self, signature: str) -> Callable[..., Any]:
-        namespace: dict[str, Any] = {"array": array, "np": np, "PADS": _PADS}
-        namespace |= {f"c{index}": value for index, value in enumerate(self.constants)}
-        exec("\n".join([f"def {signature}:", *self.lines]), namespace)
-        return namespace[signature.split("(")[0]]
-
-    def line(self, text: str) -> None:
-        self.lines.append("    " * self.indent + text)
-
-    def variable(self) -> str:
-        self.variables += 1
-        return f"v{self.variables}"
-
-    def constant(self, value: Any) -> str:
-        self.constants.append(value)
-        return f"c{len(self.constants) - 1}"
-
-    def advance(self, size: int) -> None:
-        modulus, remainder = self.known
-        self.known = (modulus, (remainder + size) % modulus)
-
-    def primitive(self, code: str, term: str) -> None:
-        """Append a primitive to the pending ``struct`` call."""
-        size = struct.calcsize(f"={code}")
-        modulus, remainder = self.known
-        if size > modulus:
-            self.align(size)
-            remainder = 0
-        pad = -remainder % size
-        self.format += "x" * pad + code
-        self.size += pad + size
-        self.terms.append(term)
-        self.advance(pad + size)
-
-    def align(self, size: int) -> None:
-        """Move to a multiple of ``size``, computing the padding at run time where it must be."""
-        self.flush()
-        modulus, remainder = self.known
-        if size > modulus:
-            self.pad(f"(4 - pos) & {size - 1}")
-            self.known = (size, 0)
-        elif pad := -remainder % size:
-            self.pad(str(pad))
-            self.advance(pad)
-
-    def flush(self) -> None:
-        """Emit the pending ``struct`` call."""
-        if self.size:
-            self.struct_call(struct.Struct(self.order + self.format))
-            self.format, self.size, self.terms = "", 0, []
-
-    def messages(self, header: str, field: Field, body: Callable[[], None]) -> None:
-        """A loop over a list of messages or strings, laid out for what holds at every turn."""
-        before = self.known
-        size = _first_alignment(field)
-        if field.shape == "array":
-            self.align(size)
-            before = self.known
-        elif size > before[0] or before[1] % size:
-            # Aligned once before the loop, the layout of every element is often known beforehand.
-            self.when_not_empty(lambda: self.align(size))
-        entry = self.known
-        while True:
-            mark = len(self.lines)
-            self.known = entry
-            self.line(header)
-            self.indent += 1
-            body()
-            self.flush()
-            self.indent -= 1
-            met = _meet(entry, self.known)
-            if met == entry:
-                break
-            del self.lines[mark:]
-            entry = met
-        self.known = _meet(before, self.known)
-
-    def packed(self, size: int, emit: Callable[[], None]) -> None:
-        """A sequence of ``n`` primitives of ``size`` bytes, aligned only if there are any."""
-        before = self.known
-        if size > before[0] or before[1] % size:
-            self.when_not_empty(lambda: self.align(size))
-        emit()
-        self.known = _meet(before, (size, 0))
-
-    def when_not_empty(self, emit: Callable[[], None]) -> None:
-        self.line("if n:")
-        self.indent += 1
-        emit()
-        self.indent -= 1
-
-    @abstractmethod
-    def pad(self, amount: str) -> None:
-        """Emit ``amount`` (an expression) bytes of padding."""
-
-    @abstractmethod
-    def struct_call(self, packing: struct.Struct) -> None:
-        """Emit the call of ``packing`` for the pending terms."""
-
-
-class _Writer(_Source):
+class _Writer(CdrLayout):
     def __init__(self, type_name: str) -> None:
         super().__init__("<")
         self.line('parts = [b"\\0\\1\\0\\0"]; add = parts.append')
@@ -208,7 +86,7 @@ class _Writer(_Source):
             self.line(f"add({text}); pos += len({text})")
             self.known = (1, 0)
         else:
-            self.primitive(_FORMATS[field.kind], term)
+            self.primitive(FORMATS[field.kind], term)
 
     def elements(self, field: Field, term: str) -> None:
         values = self.variable()
@@ -220,7 +98,7 @@ class _Writer(_Source):
             item = self.variable()
             self.messages(f"for {item} in {values}:", field, lambda: self.element(field, item))
             return
-        size = struct.calcsize(f"={_FORMATS[field.kind]}")
+        size = struct.calcsize(f"={FORMATS[field.kind]}")
         if field.kind == "bool":
             values = f"bytes({values})"
         elif field.kind == "byte":
@@ -235,7 +113,7 @@ class _Writer(_Source):
             self.packed(size, lambda: self.line(f"add({values}); pos += {size} * n"))
 
 
-class _Reader(_Source):
+class _Reader(CdrLayout):
     def __init__(self, type_name: str, order: str) -> None:
         super().__init__(order)
         owner = self.message(type_name)
@@ -275,7 +153,7 @@ class _Reader(_Source):
             self.line(f'{term} = data[pos:pos + m - 1].decode() if m else ""; pos += m')
             self.known = (1, 0)
         else:
-            self.primitive(_FORMATS[field.kind], term)
+            self.primitive(FORMATS[field.kind], term)
 
     def elements(self, field: Field, term: str) -> None:
         if field.shape == "sequence":
@@ -295,7 +173,7 @@ class _Reader(_Source):
 
             self.messages("for _ in range(n):", field, body)
             return
-        size = struct.calcsize(f"={_FORMATS[field.kind]}")
+        size = struct.calcsize(f"={FORMATS[field.kind]}")
         if field.shape == "array" and field.kind in ARRAY_TYPES:
             dtype = self.constant(np.dtype(ARRAY_TYPES[field.kind][1]).newbyteorder(self.order))
             native = self.constant(ARRAY_TYPES[field.kind][1])
@@ -313,28 +191,10 @@ class _Reader(_Source):
                 self.line(f"{term} = [data[i:i + 1] for i in range(pos, end)]")
             else:
                 values = self.variable()
-                self.line(f'{values} = array("{_FORMATS[field.kind]}"); {term} = {values}')
+                self.line(f'{values} = array("{FORMATS[field.kind]}"); {term} = {values}')
                 self.line(f"{values}.frombytes(view[pos:end])")
                 if self.order == ">" and size > 1:
                     self.line(f"{values}.byteswap()")
             self.line("pos = end")
 
         self.packed(size, emit)
-
-
-def _first_alignment(field: Field) -> int:
-    """The alignment of the first primitive of one element of ``field``."""
-    if field.is_message:
-        fields = interface(field.kind).fields
-        if not fields:
-            return 1
-        return 4 if fields[0].shape == "sequence" else _first_alignment(fields[0])
-    return 4 if field.kind == "string" else struct.calcsize(f"={_FORMATS[field.kind]}")
-
-
-def _meet(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
-    """What is known of a position of which one or the other is."""
-    modulus = min(first[0], second[0])
-    while (first[1] - second[1]) % modulus:
-        modulus //= 2
-    return modulus, first[1] % modulus

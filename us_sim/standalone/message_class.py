@@ -14,41 +14,19 @@ AssertionError: The 'z' field must be of type 'float'
 
 from __future__ import annotations
 
-import math
 from array import array
-from collections.abc import Callable
 from functools import cache
 from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
 
+from us_sim.standalone.field_setters import ARRAY_TYPES, Setter, field_setter
 from us_sim.standalone.interfaces import Field, interface
 
-__all__ = ["ARRAY_TYPES", "Message", "message_class"]
+__all__ = ["Message", "message_class"]
 
-# Primitive: (array.array type code, NumPy dtype) of the sequences and arrays that rosidl packs.
-ARRAY_TYPES: dict[str, tuple[str, Any]] = {
-    "float32": ("f", np.float32),
-    "float64": ("d", np.float64),
-    "int8": ("b", np.int8),
-    "uint8": ("B", np.uint8),
-    "int16": ("h", np.int16),
-    "uint16": ("H", np.uint16),
-    "int32": ("i", np.int32),
-    "uint32": ("I", np.uint32),
-    "int64": ("q", np.int64),
-    "uint64": ("Q", np.uint64),
-}
-
-_INTEGERS = {
-    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
-    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
-}
-_FLOAT_LIMITS = {"float32": 3.402823466e38, "float64": 1.7976931348623157e308}
 _ZEROS: dict[str, Any] = {"bool": False, "byte": b"\x00", "string": ""}
-
-Setter = Callable[[Any, Any], None]
 
 
 class Message:
@@ -126,7 +104,8 @@ def message_class(name: str) -> type[Message]:
     defaults = []
     for field in definition.fields:
         store = getattr(cls, f"_{field.name}").__set__
-        setter = _setter(field, store)
+        element_class = message_class(field.kind) if field.is_message else None
+        setter = field_setter(field, store, element_class)
         documentation = f"Message field '{field.name}'."
         setattr(
             cls, field.name, property(attrgetter(f"_{field.name}"), setter, None, documentation)
@@ -158,168 +137,6 @@ def _default(field: Field) -> tuple[Any, bool]:
         return (lambda: [zero] * size), True
     if field.is_message:
         return message_class(field.kind), True
-    if field.kind in _FLOAT_LIMITS:
+    if field.kind in ("float32", "float64"):
         return 0.0, False
     return _ZEROS.get(field.kind, 0), False
-
-
-def _setter(field: Field, store: Setter) -> Setter:
-    if field.shape == "scalar":
-        check = _element_check(field)
-
-        def set_scalar(message: Any, value: Any) -> None:
-            check(value)
-            store(message, value)
-
-        return set_scalar
-    if field.kind in ARRAY_TYPES:
-        return (_packed_sequence if field.shape == "sequence" else _packed_array)(field, store)
-    return _list_setter(field, store)
-
-
-def _element_check(field: Field) -> Callable[[Any], None]:
-    """A function that raises AssertionError, in rosidl's words, for what is no such element."""
-    name = field.name
-    if field.is_message:
-        expected = message_class(field.kind)
-        return _instance_check(
-            expected, f"The '{name}' field must be a sub message of type '{expected.__name__}'"
-        )
-    if field.kind == "string":
-        if not field.string_bound:
-            return _instance_check(str, f"The '{name}' field must be of type 'str'")
-        bound = field.string_bound
-
-        def check_bounded(value: Any) -> None:
-            if not isinstance(value, str) or len(value) > bound:
-                raise AssertionError(
-                    f"The '{name}' field must be string value not longer than {bound}"
-                )
-
-        return check_bounded
-    if field.kind == "bool":
-        return _instance_check(bool, f"The '{name}' field must be of type 'bool'")
-    if field.kind == "byte":
-
-        def check_byte(value: Any) -> None:
-            if not isinstance(value, (bytes, bytearray)) or len(value) != 1:
-                raise AssertionError(
-                    f"The '{name}' field must be of type 'bytes' or 'ByteString' with length 1"
-                )
-
-        return check_byte
-    if field.kind in _FLOAT_LIMITS:
-        limit = _FLOAT_LIMITS[field.kind]
-        idl_type = "float" if field.kind == "float32" else "double"
-
-        def check_float(value: Any) -> None:
-            if not isinstance(value, float):
-                raise AssertionError(f"The '{name}' field must be of type 'float'")
-            if not -limit <= value <= limit and math.isfinite(value):
-                raise AssertionError(
-                    f"The '{name}' field must be a {idl_type} in [{-limit}, {limit}]"
-                )
-
-        return check_float
-    low, high = _INTEGERS[field.kind]
-
-    def check_integer(value: Any) -> None:
-        if not isinstance(value, int):
-            raise AssertionError(f"The '{name}' field must be of type 'int'")
-        if not low <= value <= high:
-            sign = "an integer" if low else "an unsigned integer"
-            raise AssertionError(f"The '{name}' field must be {sign} in [{low}, {high}]")
-
-    return check_integer
-
-
-def _instance_check(expected: type, sentence: str) -> Callable[[Any], None]:
-    def check(value: Any) -> None:
-        if not isinstance(value, expected):
-            raise AssertionError(sentence)
-
-    return check
-
-
-def _packed_sequence(field: Field, store: Setter) -> Setter:
-    """A setter that stores an array.array, the very one it is given where the type code fits."""
-    name, bound = field.name, field.size
-    code, dtype = ARRAY_TYPES[field.kind]
-    element_check = _element_check(field)
-
-    def convert(value: Any) -> array[Any]:
-        if isinstance(value, array):
-            raise AssertionError(f"The '{name}' array.array() must have the type code of '{code}'")
-        if isinstance(value, np.ndarray):
-            if value.dtype != dtype or value.ndim != 1:
-                raise AssertionError(
-                    f"The '{name}' field must be a one-dimensional ndarray of {dtype.__name__}, "
-                    f"not of {value.dtype} with shape {value.shape}"
-                )
-            return array(code, value.tobytes())
-        if isinstance(value, (bytes, bytearray, memoryview)) and code == "B":
-            return array(code, bytes(value))
-        _check_collection(field, value)
-        for element in value:
-            element_check(element)
-        return array(code, value)
-
-    def set_sequence(message: Any, value: Any) -> None:
-        if not (type(value) is array and value.typecode == code):
-            value = convert(value)
-        if bound and len(value) > bound:
-            raise AssertionError(f"The '{name}' array.array() must have a size <= {bound}")
-        store(message, value)
-
-    return set_sequence
-
-
-def _packed_array(field: Field, store: Setter) -> Setter:
-    """A setter that stores a NumPy array of the field's type and size."""
-    name, size = field.name, field.size
-    dtype = ARRAY_TYPES[field.kind][1]
-    element_check = _element_check(field)
-
-    def set_array(message: Any, value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            if value.dtype != dtype:
-                raise AssertionError(
-                    f"The '{name}' numpy.ndarray() must have the dtype of 'numpy.{dtype.__name__}'"
-                )
-            if value.shape != (size,):
-                raise AssertionError(f"The '{name}' numpy.ndarray() must have a size of {size}")
-        else:
-            _check_collection(field, value)
-            for element in value:
-                element_check(element)
-            value = np.array(list(value), dtype)
-        store(message, value)
-
-    return set_array
-
-
-def _list_setter(field: Field, store: Setter) -> Setter:
-    """A setter for lists of strings, booleans, bytes and messages."""
-    element_check = _element_check(field)
-
-    def set_list(message: Any, value: Any) -> None:
-        _check_collection(field, value)
-        for element in value:
-            element_check(element)
-        store(message, value)
-
-    return set_list
-
-
-def _check_collection(field: Field, value: Any) -> None:
-    if isinstance(value, str) or not hasattr(value, "__len__") or not hasattr(value, "__iter__"):
-        raise AssertionError(f"The '{field.name}' field must be a set or sequence")
-    length = len(value)
-    if field.shape == "array" and length != field.size:
-        raise AssertionError(
-            f"The '{field.name}' field must be a set or sequence with length {field.size}"
-        )
-    if field.shape == "sequence" and field.size and length > field.size:
-        raise AssertionError(
-            f"The '{field.name}' field must be a set or sequence with length <= {field.size}"
-        )

@@ -1,0 +1,260 @@
+"""Readers and writers of serialized samples; `us_sim.standalone.transport` makes them."""
+
+from __future__ import annotations
+
+import ctypes as ct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from us_sim.standalone import ddsc
+from us_sim.standalone.ddsc import DdsError, IoVector, RawSampleInfo, check, guid_of, lib
+from us_sim.standalone.endpoint_event import EndpointEvent, read_events, status_mask
+from us_sim.standalone.endpoint_qos import EndpointQos, user_data
+
+if TYPE_CHECKING:
+    from us_sim.standalone.transport import Participant
+
+__all__ = ["Endpoint", "Reader", "SampleInfo", "Writer"]
+
+_DATA_AVAILABLE = 1 << 8
+
+
+@dataclass(frozen=True)
+class SampleInfo:
+    """Where a sample came from.
+
+    Attributes:
+        source_timestamp: ns since 1970, when it was written, by the writer's clock.
+        received_timestamp: ns since 1970, when it was taken here.
+        publication_handle: this process's number for the writer.
+    """
+
+    source_timestamp: int
+    received_timestamp: int
+    publication_handle: int
+
+
+class Endpoint:
+    """What readers and writers have in common."""
+
+    _side: str  # the other side, as the C functions call it: publication or subscription
+
+    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
+        self._participant = participant
+        self._handle = handle
+        self._closed = False
+        # Held while samples are in Python's hands: their memory belongs to the domain.
+        self._in_use = threading.Lock()
+        self.qos = qos
+        self.gid = guid_of(handle)  # 16 bytes
+        self._on_event: Callable[[EndpointEvent], None] | None = None
+        self._token = participant._dispatcher.attach(handle, self._mask(), self._status_changed)
+
+    @property
+    def on_event(self) -> Callable[[EndpointEvent], None] | None:
+        """Called with each `EndpointEvent`, also with those from before it was set."""
+        return self._on_event
+
+    @on_event.setter
+    def on_event(self, callback: Callable[[EndpointEvent], None] | None) -> None:
+        self._on_event = callback
+        if not self._closed:
+            check(lib.dds_set_status_mask(self._handle, self._mask()), "the endpoint is closed")
+            self._participant._dispatcher.call_soon(self._status_changed)
+
+    def matched_count(self) -> int:
+        """How many endpoints are connected to this one."""
+        return max(0, self._matched(None, 0))
+
+    def matched_user_data(self) -> list[dict[str, str]]:
+        """The USER_DATA of each endpoint that is connected to this one."""
+        handles = (ct.c_uint64 * (self.matched_count() + 8))()
+        found = self._matched(handles, len(handles))
+        data = [
+            self._user_data_of(handle) for handle in handles[: min(max(found, 0), len(handles))]
+        ]
+        return [entry for entry in data if entry is not None]
+
+    def close(self) -> None:
+        """Leave the topic. Callbacks that are running may end after this."""
+        if self._end():
+            self._participant._dispatcher.detach(self._token)
+            self._participant._endpoints.discard(self)
+            lib.dds_delete(self._handle)
+
+    def _end(self) -> bool:
+        """Neither give nor take samples any more; False if that was so already."""
+        with self._in_use:
+            was_open, self._closed = not self._closed, True
+        return was_open
+
+    def _matched(self, handles: Any, size: int) -> int:
+        return getattr(lib, f"dds_get_matched_{self._side}s")(self._handle, handles, size)
+
+    def _user_data_of(self, handle: int) -> dict[str, str] | None:
+        endpoint = getattr(lib, f"dds_get_matched_{self._side}_data")(self._handle, handle)
+        if not endpoint:
+            return None
+        try:
+            return user_data(endpoint.contents.qos)
+        finally:
+            lib.dds_builtintopic_free_endpoint(endpoint)
+
+    def _mask(self) -> int:
+        # Statuses that nobody asks for are left alone, so that who asks later still learns of them.
+        return 0 if self._on_event is None else status_mask(self._side)
+
+    def _status_changed(self) -> None:
+        status = ct.c_uint32()
+        if self._closed or lib.dds_take_status(self._handle, ct.byref(status), self._mask()) < 0:
+            return
+        self._notify(status.value)
+
+    def _notify(self, status: int) -> None:
+        callback = self._on_event
+        if callback is not None:
+            for event in read_events(self._handle, self._side, status):
+                callback(event)
+
+
+class Writer(Endpoint):
+    """Publishes serialized samples.
+
+    ``on_event`` may be set to a function of an `EndpointEvent`, which another thread calls.
+    """
+
+    _side = "subscription"
+
+    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
+        super().__init__(participant, handle, qos)
+        sertype = ct.c_void_p()
+        check(lib.dds_get_entity_sertype(handle, ct.byref(sertype)), "the writer has no type")
+        self._sertype = sertype
+
+    def write(self, data: bytes | bytearray | memoryview) -> bool:
+        """Send one sample: a four-byte CDR header and at least one byte.
+
+        Returns:
+            False if a reliable reader kept the writer waiting for 0.1 s, so that the sample was
+            not accepted.
+
+        Raises:
+            DdsError: the writer is closed, or the bytes are no sample.
+        """
+        return self.write_parts(data)
+
+    def write_parts(self, *parts: bytes | bytearray | memoryview) -> bool:
+        """Send one sample that is the parts put together; the first holds the CDR header."""
+        first, *others = (bytes(part) for part in parts)
+        size = len(first) + sum(map(len, others))
+        padding = -size % 4  # RTPS wants samples in multiples of four; the header says how many
+        others.append(bytes(padding))
+        header = first[:3] + bytes([padding]) if padding else first[:4]
+        vectors = (IoVector * (len(others) + 2))(
+            IoVector(_address(header), len(header)),
+            IoVector(_address(first) + 4, max(0, len(first) - 4)),
+            *(IoVector(_address(part), len(part)) for part in others),
+        )
+        with self._in_use:
+            if self._closed:
+                raise DdsError("the writer is closed, so nothing can be published with it")
+            serialized = lib.ddsi_serdata_from_ser_iov(
+                self._sertype, ddsc.SAMPLE_OF_DATA, len(vectors), vectors, size + padding
+            )
+            if not serialized:
+                raise DdsError(f"{size} bytes are not a sample; serialize the message first")
+            returned = lib.dds_writecdr(self._handle, serialized)
+        if returned == ddsc.RETURN_TIMEOUT:
+            return False
+        check(returned, "a sample cannot be written; the writer may have been closed")
+        return True
+
+    def wait_for_acked(self, timeout: float) -> bool:
+        """Whether all readers had acknowledged all samples within ``timeout`` seconds."""
+        duration = ddsc.INFINITY if timeout < 0 else int(timeout * 1e9)
+        returned = lib.dds_wait_for_acks(self._handle, duration)
+        if returned == ddsc.RETURN_TIMEOUT:
+            return False
+        check(returned, "nothing can be acknowledged to a closed writer")
+        return True
+
+    def assert_liveliness(self) -> None:
+        """Say that this writer is alive, where its liveliness is MANUAL_BY_TOPIC."""
+        check(lib.dds_assert_liveliness(self._handle), "the writer is closed")
+
+
+class Reader(Endpoint):
+    """Receives serialized samples.
+
+    ``on_data`` may be set to a function without arguments that is called, from another thread,
+    when samples may be waiting; ``on_event`` as for writers.
+    """
+
+    _side = "publication"
+
+    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
+        self._on_data: Callable[[], None] | None = None
+        super().__init__(participant, handle, qos)
+
+    @property
+    def on_data(self) -> Callable[[], None] | None:
+        """Called when data may be waiting, and once after it was set."""
+        return self._on_data
+
+    @on_data.setter
+    def on_data(self, callback: Callable[[], None] | None) -> None:
+        self._on_data = callback
+        if callback is not None:
+            self._participant._dispatcher.call_soon(callback)
+
+    def take(self) -> tuple[bytes, SampleInfo] | None:
+        """The oldest sample that is waiting, removed from the reader; None if there is none."""
+        serialized, info = ct.c_void_p(), RawSampleInfo()
+        with self._in_use:
+            while not self._closed and (
+                lib.dds_takecdr(
+                    self._handle, ct.byref(serialized), 1, ct.byref(info), ddsc.ANY_STATE
+                )
+                > 0
+            ):
+                data = _bytes_of(serialized) if info.valid_data else None
+                lib.ddsi_serdata_unref(serialized)
+                if data is not None:
+                    return data, SampleInfo(
+                        info.source_timestamp, time.time_ns(), info.publication_handle
+                    )
+        return None
+
+    def user_data_of(self, publication_handle: int) -> dict[str, str] | None:
+        """The USER_DATA of a writer that is connected to this reader; None if it has gone."""
+        return self._user_data_of(publication_handle)
+
+    def _mask(self) -> int:
+        return super()._mask() | _DATA_AVAILABLE
+
+    def _notify(self, status: int) -> None:
+        callback = self._on_data
+        if status & _DATA_AVAILABLE and callback is not None:
+            callback()
+        super()._notify(status)
+
+
+def _address(data: bytes) -> int:
+    """Where the bytes are; whoever asks keeps them alive."""
+    return ct.cast(ct.c_char_p(data), ct.c_void_p).value or 0
+
+
+def _bytes_of(serialized: ct.c_void_p) -> bytes:
+    """The sample's bytes, without the padding that its header admits to."""
+    vector = IoVector()
+    size = lib.ddsi_serdata_size(serialized)
+    reference = lib.ddsi_serdata_to_ser_ref(serialized, 0, size, ct.byref(vector))
+    data = ct.string_at(vector.base, vector.length)
+    lib.ddsi_serdata_to_ser_unref(reference, ct.byref(vector))
+    padding = data[3] & 3
+    if padding:
+        return data[:2] + b"\x00\x00" + data[4 : len(data) - padding]
+    return data
