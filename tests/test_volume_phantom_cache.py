@@ -1,0 +1,211 @@
+"""The cache: made once, whole or absent, shared by processes, mended when damaged."""
+
+import json
+import logging
+import multiprocessing
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from us_sim.errors import VolumeError
+from us_sim.volume.phantom import cached_phantom, upper_arm
+from us_sim.volume.phantom_cache import cache_folder, kept_volume
+from us_sim.volume.volume import Volume
+
+COARSE = 2e-3
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("US_SIM_CACHE", str(folder))
+    return folder
+
+
+def _small() -> Volume:
+    grey = np.arange(210, dtype=np.uint8).reshape(5, 6, 7)
+    return Volume(grey, np.diag([1e-3, 1e-3, 2e-3, 1.0]), grey // 50, {1: "skin", 2: "fat"})
+
+
+def _unused() -> Volume:
+    raise AssertionError("made again although it was kept")
+
+
+def _entry(cache: Path) -> Path:
+    (entry,) = (path for path in cache.iterdir() if path.is_dir())
+    return entry
+
+
+def test_a_phantom_comes_back_as_it_was_made(cache):
+    said = []
+    made = cached_phantom("upper_arm", 1, COARSE, lambda *what: said.append(what))
+    fractions = [fraction for fraction, _ in said]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    kept = cached_phantom("upper_arm", 1, COARSE, lambda *_: pytest.fail("was in the cache"))
+    fresh = upper_arm(1, COARSE)
+    for volume in (made, kept):
+        np.testing.assert_array_equal(volume.intensities, fresh.intensities)
+        np.testing.assert_array_equal(volume.labels, fresh.labels)
+        np.testing.assert_array_equal(volume.index_to_patient, fresh.index_to_patient)
+        assert volume.label_names == fresh.label_names
+    assert sorted(p.name for p in _entry(cache).iterdir()) == [
+        "intensities.npy",
+        "labels.npy",
+        "volume.json",
+    ]
+
+
+def test_kept_arrays_are_plain_and_lie_in_the_file(cache):
+    kept_volume("small", _small)
+    kept = kept_volume("small", _unused)
+    for array in (kept.intensities, kept.labels):
+        assert type(array) is np.ndarray
+        base = array
+        while not isinstance(base, np.memmap):
+            base = base.base
+        assert Path(base.filename).parent == cache / "small"
+
+
+def test_seed_and_voxel_size_have_entries_of_their_own(cache):
+    cached_phantom("upper_arm", 1, 4e-3)
+    cached_phantom("upper_arm", 2, 4e-3)
+    cached_phantom("upper_arm", 1, 5e-3)
+    assert sum(path.is_dir() for path in cache.iterdir()) == 3
+
+
+def _flip_a_byte(entry: Path) -> None:
+    path = entry / "labels.npy"
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(content)
+
+
+def _cut(entry: Path) -> None:
+    path = entry / "intensities.npy"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def _forget_a_key(entry: Path) -> None:
+    path = entry / "volume.json"
+    path.write_text(json.dumps({"crc32": {}}))
+
+
+def _replace_by_a_file(entry: Path) -> None:
+    for path in entry.iterdir():
+        path.unlink()
+    entry.rmdir()
+    entry.write_text("")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        _flip_a_byte,
+        _cut,
+        _forget_a_key,
+        _replace_by_a_file,
+        lambda entry: (entry / "labels.npy").unlink(),
+        lambda entry: (entry / "labels.npy").write_bytes(b""),
+        lambda entry: (entry / "volume.json").write_bytes(b"\xff{"),
+        lambda entry: (entry / "volume.json").write_text("[]"),
+    ],
+)
+def test_a_damaged_entry_is_made_again_with_a_word(cache, caplog, damage):
+    kept_volume("small", _small)
+    damage(cache / "small")
+    with caplog.at_level(logging.WARNING):
+        mended = kept_volume("small", _small)
+    assert "is damaged" in caplog.text
+    assert "made again" in caplog.text
+    np.testing.assert_array_equal(mended.labels, _small().labels)
+    np.testing.assert_array_equal(kept_volume("small", _unused).labels, _small().labels)
+
+
+def test_what_a_killed_process_left_is_cleared_away(cache):
+    left_over = cache / "small.partial-abc"
+    left_over.mkdir(parents=True)
+    (left_over / "labels.npy").write_bytes(b"half")
+    kept_volume("small", _small)
+    assert not left_over.exists()
+
+
+def test_a_failure_while_making_leaves_nothing(cache):
+    with pytest.raises(VolumeError, match="seed"):
+        cached_phantom("upper_arm", -1, COARSE)
+    assert not [path for path in cache.iterdir() if path.is_dir()]
+    kept_volume("small", _small)  # and the lock is free
+
+
+def test_a_cache_that_cannot_be_written_costs_only_a_warning(tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "file" / "cache"))
+    with caplog.at_level(logging.WARNING):
+        volume = kept_volume("small", _small)
+    assert "cannot be written" in caplog.text
+    np.testing.assert_array_equal(volume.intensities, _small().intensities)
+
+
+def test_the_folder_is_the_users_own_unless_given(monkeypatch, tmp_path):
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    monkeypatch.delenv("US_SIM_CACHE")
+    assert cache_folder().name == "us_sim" or "us_sim" in cache_folder().parts
+
+
+def test_an_unknown_phantom_is_refused(cache):
+    with pytest.raises(VolumeError, match="no phantom named leg; there is upper_arm"):
+        cached_phantom("leg", 1, COARSE)
+    assert not cache.exists()
+
+
+def _ask(cache: str, marks: str, start, answers) -> None:
+    os.environ["US_SIM_CACHE"] = cache
+
+    def make() -> Volume:
+        Path(marks, str(os.getpid())).touch()
+        return upper_arm(1, 1.5e-3)
+
+    start.wait()
+    volume = kept_volume("arm", make)
+    answers.put(int(volume.intensities.sum(dtype=np.int64)))
+
+
+def test_processes_that_ask_at_once_make_it_once(cache, tmp_path):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    spawn = multiprocessing.get_context("spawn")
+    start, answers = spawn.Barrier(3), spawn.Queue()
+    processes = [
+        spawn.Process(target=_ask, args=(str(cache), str(marks), start, answers)) for _ in range(3)
+    ]
+    for process in processes:
+        process.start()
+    try:
+        sums = {answers.get(timeout=60) for _ in processes}
+    finally:
+        for process in processes:
+            process.join(timeout=60)
+            process.kill()
+    assert len(sums) == 1
+    assert len(list(marks.iterdir())) == 1
+
+
+def test_who_waits_for_another_is_told(cache, monkeypatch):
+    from filelock import FileLock
+
+    cache.mkdir()
+    other = FileLock(cache / "small.lock")
+    other.acquire()
+    monkeypatch.setattr("us_sim.volume.phantom_cache._WAIT", 0.01)
+    told = []
+
+    def waiting() -> None:
+        told.append(True)
+        if len(told) == 2:
+            other.release()
+
+    kept_volume("small", _small, waiting)
+    assert len(told) == 2

@@ -1,0 +1,237 @@
+"""Volume files: hand-written MetaImage and NIfTI, what SimpleITK writes, and a real sweep."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+
+from us_sim.errors import VolumeError
+from us_sim.volume.readers import read_volume
+
+SHAPE = (4, 5, 6)
+GREY = np.random.Generator(np.random.PCG64(2)).integers(0, 256, SHAPE, dtype=np.uint8)
+
+
+def _metaimage(path, data=None, **fields):
+    """A MetaImage file of uint8 voxels (i, j, k) written field by field, i fastest."""
+    header = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": "1 0 0 0 1 0 0 0 1",
+        "Offset": "0 0 0",
+        "ElementSpacing": "1 1 1",
+        "DimSize": "4 5 6",
+        "ElementType": "MET_UCHAR",
+        **fields,
+        "ElementDataFile": "LOCAL",
+    }
+    text = "".join(f"{key} = {value}\n" for key, value in header.items())
+    path.write_bytes(text.encode() + (GREY.tobytes(order="F") if data is None else data))
+    return path
+
+
+def _nifti(path, data, matrix_ras):
+    """A NIfTI-1 file of uint8 voxels placed by its sform, written byte by byte."""
+    header = bytearray(352)
+    struct.pack_into("<i", header, 0, 348)
+    struct.pack_into("<8h", header, 40, 3, *SHAPE, 1, 1, 1, 1)
+    struct.pack_into("<2h", header, 70, 2, 8)  # DT_UINT8, 8 bits
+    steps = np.linalg.norm(matrix_ras[:3, :3], axis=0)
+    struct.pack_into("<8f", header, 76, 1.0, *steps, 1, 1, 1, 1)
+    struct.pack_into("<f", header, 108, 352.0)
+    struct.pack_into("<2f", header, 112, 1.0, 0.0)
+    header[123] = 2  # millimetres
+    struct.pack_into("<2h", header, 252, 0, 1)  # only the sform holds
+    struct.pack_into("<12f", header, 280, *matrix_ras[:3].ravel())
+    header[344:348] = b"n+1\0"
+    content = bytes(header) + data
+    path.write_bytes(gzip.compress(content) if path.suffix == ".gz" else content)
+    return path
+
+
+def test_axis_0_is_the_files_fastest_axis(tmp_path):
+    volume = read_volume(_metaimage(tmp_path / "a.mha"))
+    assert volume.labels is None
+    assert volume.intensities.flags.c_contiguous
+    np.testing.assert_array_equal(volume.intensities, GREY)
+
+
+def test_direction_spacing_and_offset_place_the_voxels(tmp_path):
+    # MetaImage gives one axis after another: i along y, j along z, k along x.
+    path = _metaimage(
+        tmp_path / "a.mha",
+        TransformMatrix="0 1 0 0 0 1 1 0 0",
+        ElementSpacing="0.5 2 3",
+        Offset="10 20 -30",
+    )
+    volume = read_volume(path)
+    index = np.array([2, 3, 4, 1])
+    expected = [0.010 + 4 * 3e-3, 0.020 + 2 * 0.5e-3, -0.030 + 3 * 2e-3, 1.0]
+    np.testing.assert_allclose(volume.index_to_patient @ index, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_an_oblique_image_lies_where_simpleitk_says(tmp_path, suffix, compressed):
+    image = sitk.GetImageFromArray(GREY.transpose(2, 1, 0))
+    turn = sitk.VersorRigid3DTransform()
+    turn.SetRotation((0.3, -0.5, 0.8), 0.7)
+    image.SetDirection(turn.GetMatrix())
+    image.SetSpacing((0.5, 0.25, 2.0))
+    image.SetOrigin((-12.5, 40.0, 7.75))
+    path = tmp_path / f"oblique{suffix}"
+    sitk.WriteImage(image, str(path), compressed)
+    volume = read_volume(path)
+    np.testing.assert_array_equal(volume.intensities, GREY)
+    for index in ((0, 0, 0), (3, 0, 0), (0, 4, 0), (1, 2, 5)):
+        expected = np.array(image.TransformIndexToPhysicalPoint(index)) * 1e-3
+        placed = volume.index_to_patient @ [*index, 1]
+        np.testing.assert_allclose(placed[:3], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_nifti_is_turned_from_ras_to_lps(tmp_path, suffix):
+    matrix = np.array([[2.0, 0, 0, 5], [0, 0, -3, 6], [0, 4, 0, 7], [0, 0, 0, 1]])
+    path = _nifti(tmp_path / f"a{suffix}", GREY.tobytes(order="F"), matrix)
+    volume = read_volume(path)
+    expected = np.diag([-1e-3, -1e-3, 1e-3, 1.0]) @ matrix
+    np.testing.assert_allclose(volume.index_to_patient, expected, atol=1e-9)
+    np.testing.assert_array_equal(volume.intensities, GREY)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.uint16, np.int32, np.float32, np.float64])
+def test_other_types_are_spread_over_the_whole_range(tmp_path, dtype):
+    lowest = 0 if dtype == np.uint16 else -100
+    stored = (lowest + np.array([0, 51, 102, 153, 204])).astype(dtype)
+    image = sitk.GetImageFromArray(np.resize(stored, (5, 5, 5)))
+    sitk.WriteImage(image, str(tmp_path / "a.nrrd"))
+    grey = read_volume(tmp_path / "a.nrrd").intensities
+    # 0, 1/4, 1/2, 3/4 and 1 of 255, halves rounded up.
+    np.testing.assert_array_equal(grey[:, 0, 0], [0, 64, 128, 191, 255])
+
+
+def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
+    stored = np.zeros((3, 3, 3))
+    stored[0, 0] = [-1.7e308, np.nan, 1.7e308]
+    stored[0, 1] = [np.inf, -np.inf, 0.0]
+    sitk.WriteImage(sitk.GetImageFromArray(stored), str(tmp_path / "a.nrrd"))
+    grey = read_volume(tmp_path / "a.nrrd").intensities[:, :, 0]
+    np.testing.assert_array_equal(grey[:, 0], [0, 0, 255])
+    np.testing.assert_array_equal(grey[:, 1], [255, 0, 128])
+
+
+def test_a_constant_image_is_dark_and_one_without_a_number_is_refused(tmp_path):
+    path = str(tmp_path / "a.nrrd")
+    sitk.WriteImage(sitk.GetImageFromArray(np.full((3, 3, 3), 7, np.int16)), path)
+    assert not read_volume(path).intensities.any()
+    sitk.WriteImage(sitk.GetImageFromArray(np.full((3, 3, 3), np.nan)), path)
+    with pytest.raises(VolumeError, match=r"a\.nrrd: holds no finite value"):
+        read_volume(path)
+
+
+def test_the_real_liver_sweep(shared_data):
+    path = shared_data / "imfusion-liver-sweep" / "liver_sweep_compounded_1mm.mha"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    volume = read_volume(path)
+    assert volume.shape == (237, 192, 154)
+    np.testing.assert_allclose(
+        volume.index_to_patient,
+        [
+            [1e-3, 0, 0, -0.15746105809698449],
+            [0, 1e-3, 0, -0.095903891754215408],
+            [0, 0, 1e-3, 0.019731770208955197],
+            [0, 0, 0, 1],
+        ],
+        atol=1e-12,
+    )
+    stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))
+    assert volume.intensities[100, 90, 80] == stored[80, 90, 100]
+    assert volume.intensities.mean() == pytest.approx(stored.mean())
+
+
+def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_data):
+    path = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    with pytest.raises(VolumeError, match="sequence of tracked frames"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize(
+    ("fields", "data", "message"),
+    [
+        ({}, b"\0" * 60, "holds 60 bytes of image data where its header says 120"),
+        ({}, b"\0" * 121, "holds 121 bytes of image data where its header says 120"),
+        ({"DimSize": "4 5 7"}, None, "holds 120 bytes of image data where its header says 140"),
+        ({"ElementType": "MET_SHORT"}, None, "header says 240"),
+        ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
+        ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
+        ({"ElementSpacing": "1 nan 1"}, None, "must be a number above zero"),
+        ({"ElementSpacing": "1 1 inf"}, None, "must be a number above zero"),
+        ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular direction matrix"),
+        ({"DimSize": "4 5 1"}, b"\0" * 20, "two or more along each axis"),
+        ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers per voxel"),
+    ],
+)
+def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, message):
+    path = _metaimage(tmp_path / "bad.mha", data, **fields)
+    with pytest.raises(VolumeError, match=message) as refused:
+        read_volume(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_cut_file_is_refused(tmp_path, suffix, compressed):
+    path = tmp_path / f"cut{suffix}"
+    image = sitk.GetImageFromArray(np.resize(GREY, (20, 20, 20)))
+    sitk.WriteImage(image, str(path), compressed)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(VolumeError, match=r"bytes of image data|broken or cut|cannot be read"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize("dimension", [2, 4])
+def test_images_of_other_dimensions_are_refused(tmp_path, dimension):
+    path = tmp_path / "flat.mha"
+    sitk.WriteImage(sitk.Image([6] * dimension, sitk.sitkUInt8), str(path))
+    with pytest.raises(VolumeError, match=rf"is {dimension}-dimensional"):
+        read_volume(path)
+
+
+def test_colour_is_refused(tmp_path):
+    path = tmp_path / "colour.nrrd"
+    sitk.WriteImage(sitk.Image([6, 6, 6], sitk.sitkVectorUInt8, 3), str(path))
+    with pytest.raises(VolumeError, match="3 numbers per voxel"):
+        read_volume(path)
+
+
+def test_a_header_without_its_data_file_is_refused(tmp_path):
+    path = tmp_path / "a.mhd"
+    sitk.WriteImage(sitk.GetImageFromArray(GREY), str(path))
+    (tmp_path / "a.raw").unlink()
+    with pytest.raises(VolumeError, match=r"data file a\.raw, which is not there"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize("name", ["note.txt", "note.mha", "note.nii", "note.nrrd", "note"])
+@pytest.mark.parametrize("content", [b"", b"no image at all\n" * 40])
+def test_what_is_no_image_is_refused(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(VolumeError, match="cannot be read as an image"):
+        read_volume(path)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    with pytest.raises(VolumeError, match="there is no such file"):
+        read_volume(tmp_path / "nowhere.mha")
+    with pytest.raises(VolumeError, match="is not a file"):
+        read_volume(tmp_path)

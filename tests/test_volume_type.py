@@ -1,0 +1,100 @@
+"""The volume type: where its voxels lie, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import VolumeError
+from us_sim.volume.volume import Volume
+
+GREY = np.zeros((4, 5, 6), dtype=np.uint8)
+MILLIMETRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+STEPS = st.floats(1e-5, 1e-2)
+OFFSETS = st.floats(-1.0, 1.0)
+
+
+def _rotation(angles: tuple[float, float, float]) -> np.ndarray:
+    matrix = np.eye(3)
+    for axis, angle in enumerate(angles):
+        cosine, sine = np.cos(angle), np.sin(angle)
+        turn = np.eye(3)
+        a, b = [i for i in range(3) if i != axis]
+        turn[a, a] = turn[b, b] = cosine
+        turn[a, b], turn[b, a] = -sine, sine
+        matrix = turn @ matrix
+    return matrix
+
+
+@given(
+    steps=st.tuples(STEPS, STEPS, STEPS),
+    offset=st.tuples(OFFSETS, OFFSETS, OFFSETS),
+    angles=st.tuples(OFFSETS, OFFSETS, OFFSETS),
+)
+@settings(max_examples=30, deadline=None)
+def test_patient_to_index_undoes_index_to_patient(steps, offset, angles):
+    matrix = np.eye(4)
+    matrix[:3, :3] = _rotation(angles) * steps
+    matrix[:3, 3] = offset
+    volume = Volume(GREY, matrix)
+    index = np.array([1.0, 2.5, -3.0, 1.0])
+    np.testing.assert_allclose(volume.patient_to_index @ (matrix @ index), index, atol=1e-6)
+
+
+def test_extent_encloses_the_voxels_faces():
+    matrix = np.diag([2e-3, 1e-3, -0.5e-3, 1.0])
+    matrix[:3, 3] = [0.1, 0.2, 0.3]
+    expected = [[0.099, 0.1995, 0.3 - 5.5 * 0.5e-3], [0.107, 0.2045, 0.30025]]
+    np.testing.assert_allclose(Volume(GREY, matrix).extent, expected, atol=1e-12)
+
+
+def test_arrays_are_read_only_views_and_the_callers_stay_writable():
+    grey = GREY.copy()
+    volume = Volume(grey, MILLIMETRES, labels=GREY)
+    assert np.shares_memory(volume.intensities, grey)
+    assert not volume.intensities.flags.writeable
+    assert not volume.labels.flags.writeable
+    assert grey.flags.writeable
+
+
+def test_fortran_order_is_made_contiguous_with_the_same_voxels():
+    grey = np.arange(120, dtype=np.uint8).reshape(4, 5, 6)
+    volume = Volume(np.asfortranarray(grey), MILLIMETRES)
+    assert volume.intensities.flags.c_contiguous
+    np.testing.assert_array_equal(volume.intensities, grey)
+
+
+def test_replacing_the_placement_replaces_its_inverse():
+    volume = Volume(GREY, MILLIMETRES)
+    assert volume.patient_to_index[0, 0] == pytest.approx(1000.0)
+    moved = dataclasses.replace(volume, index_to_patient=2 * MILLIMETRES - np.diag([0, 0, 0, 1.0]))
+    assert moved.patient_to_index[0, 0] == pytest.approx(500.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"intensities": GREY.astype(np.int16)}, "uint8 array, not 3-dimensional int16"),
+        ({"intensities": GREY[0]}, "not 2-dimensional"),
+        ({"intensities": GREY[:, :1]}, "two voxels or more"),
+        ({"labels": GREY[:, :, :5]}, "must have the same shape"),
+        ({"labels": GREY.astype(float)}, "the labels of a volume must be"),
+        ({"index_to_patient": np.eye(3)}, "finite 4×4"),
+        ({"index_to_patient": np.full((4, 4), np.nan)}, "finite 4×4"),
+        ({"index_to_patient": np.diag([1e-3, 0.0, 1e-3, 1.0])}, "singular"),
+        ({"index_to_patient": np.diag([1e-3, 1e-3, 1e-3, 2.0])}, "last row"),
+    ],
+)
+def test_what_is_no_volume_is_refused(change, message):
+    given_values = {"intensities": GREY, "index_to_patient": MILLIMETRES, **change}
+    with pytest.raises(VolumeError, match=message):
+        Volume(**given_values)
+
+
+def test_an_oblique_plane_of_axes_is_singular():
+    matrix = MILLIMETRES.copy()
+    matrix[:3, 2] = matrix[:3, 0] + matrix[:3, 1]
+    with pytest.raises(VolumeError, match="singular"):
+        Volume(GREY, matrix)
