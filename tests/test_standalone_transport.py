@@ -399,15 +399,17 @@ def test_what_was_closed_is_closed(domain):
 def test_closing_from_a_callback_does_not_deadlock(domain, bell):
     participant = Participant(domain, reach=LOCALHOST)
     reader = participant.create_reader("rt/suicide", STRING, RELIABLE)
+    writer = participant.create_writer("rt/suicide", STRING, RELIABLE)
     closed = []
 
     def close():
-        participant.close()
-        closed.append(True)
-        bell.ring()
+        if reader.take() is not None:
+            participant.close()
+            closed.append(True)
+            bell.ring()
 
     reader.on_data = close
-    participant.create_writer("rt/suicide", STRING, RELIABLE).write(HELLO)
+    writer.write(HELLO)
     bell.wait_until(lambda: closed)
 
 
