@@ -51,6 +51,7 @@ setup(
     install_requires=[
         "cyclonedds>=11.0",
         "matplotlib>=3.6",
+        "filelock>=3.12",
         "lz4>=4",
         "mcap>=1.5",
         "numba>=0.59",
