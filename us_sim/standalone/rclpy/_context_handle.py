@@ -25,8 +25,6 @@ class ContextHandle:
     """
 
     def __init__(self, arguments: Arguments, domain_id: int | None) -> None:
-        self.arguments = arguments
-        self.domain_id = _domain_from_environment() if domain_id is None else domain_id
         self.graph_changed = Condition()
         self._valid = True
         self._waiting: tuple[weakref.ReferenceType[WakeUp], ...] = ()
@@ -34,6 +32,8 @@ class ContextHandle:
         self._nodes: list[LocalNode] = []
         self._postponing = 0
         self._lock = RLock()
+        self.arguments = arguments
+        self.domain_id = _domain_from_environment() if domain_id is None else domain_id
 
     def ok(self) -> bool:
         return self._valid

@@ -139,18 +139,20 @@ def expand(name: str, node_name: str, namespace: str) -> str:
             {substitution} is unknown.
     """
     for kind, error in (
-        ("topic name is invalid", error_in_topic_name(name)),
-        ("node name is invalid", error_in_node_name(node_name)),
-        ("node namespace is invalid", error_in_namespace(namespace)),
+        (f"topic name '{name}'", error_in_topic_name(name)),
+        (f"node name '{node_name}'", error_in_node_name(node_name)),
+        (f"node namespace '{namespace}'", error_in_namespace(namespace)),
     ):
         if error:
-            raise ValueError(f"{kind}: {error[0]}")
+            raise ValueError(f"{kind} is invalid: {error[0]}")
     prefix = "" if namespace == "/" else namespace
     if name.startswith("~"):
         name = f"{prefix}/{node_name}{name[1:]}"
     known = {"{node}": node_name, "{ns}": namespace, "{namespace}": namespace}
     for substitution in re.findall(r"\{[^}]*\}", name):
         if substitution not in known:
-            raise ValueError(f"topic name is invalid: unknown substitution: {substitution}")
+            raise ValueError(
+                f"topic name '{name}' is invalid: unknown substitution: {substitution}"
+            )
         name = name.replace(substitution, known[substitution])
     return name if name.startswith("/") else f"{prefix}/{name}"

@@ -33,7 +33,7 @@ _RULE = re.compile(
     rf"(?:(?P<node>{_TOKEN}):(?!=))?"
     rf"(?:(?:__node|__name):=(?P<name>{_TOKEN})"
     rf"|__ns:=(?P<namespace>/(?:{_TOKEN}/)*(?:{_TOKEN})?)"
-    rf"|(?P<scheme>rostopic://|rosservice://)?(?P<match>{_NAME}):=(?P<replacement>{_NAME}))"
+    rf"|(?!__(?:ns|node|name):)(?P<scheme>rostopic://|rosservice://)?(?P<match>{_NAME}):=(?P<replacement>{_NAME}))"
 )
 
 

@@ -111,9 +111,9 @@ class Timer:
         now = self._clock._now()
         self._last_call = now
         self._next_call += self._period
-        if self._next_call < now:
+        if self._next_call <= now:
             if self._period:
-                missed = -(-(now - self._next_call) // self._period)
+                missed = 1 + (now - self._next_call) // self._period
                 self._next_call += missed * self._period
             else:
                 self._next_call = now

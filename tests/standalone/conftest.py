@@ -1,0 +1,66 @@
+"""A private context with an executor, for tests that run against any rclpy."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+
+class Bench:
+    """Nodes in one context, and an executor that runs until something is so."""
+
+    def __init__(self, args: list[str] | None = None) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, args=args or [])
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self._nodes: list[Node] = []
+
+    def node(self, name: str = "probe", **options: Any) -> Node:
+        node = Node(name, context=self.context, **options)
+        self.executor.add_node(node)
+        self._nodes.append(node)
+        return node
+
+    def spin_until(self, condition: Callable[[], Any], seconds: float = 10.0) -> bool:
+        """Whether it came true while callbacks ran, for so many seconds at most."""
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+        return bool(condition())
+
+    def result(self, future: Any) -> Any:
+        """What a future comes to."""
+        assert self.spin_until(future.done)
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def bench_with() -> Iterator[Callable[[list[str]], Bench]]:
+    """A bench whose context has the given command line."""
+    made: list[Bench] = []
+
+    def make(args: list[str]) -> Bench:
+        made.append(Bench(args))
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.close()

@@ -1,0 +1,182 @@
+"""Every signature, member and preset against what was introspected from the real rclpy 7.1.3."""
+
+import importlib
+import inspect
+import json
+import re
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy import qos
+
+pytestmark = pytest.mark.skipif(
+    rclpy.__name__ == "rclpy", reason="the real rclpy is here, so there is nothing to compare"
+)
+
+ROOTS = (object, int, Enum, BaseException)
+
+
+@pytest.fixture(scope="session")
+def api(shared_data: Path) -> dict[str, Any]:
+    return json.loads((shared_data / "ros2-jazzy" / "rclpy_api.json").read_text())
+
+
+def ours(name: str) -> Any:
+    """What we have under a dotted name, None when we lack it."""
+    module, _, attribute = name.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), attribute, None)
+    except ModuleNotFoundError:
+        return None
+
+
+def split(text: str) -> list[str]:
+    """The comma-separated parts of a parameter list, brackets and quotes respected."""
+    parts, depth, start, quote = [], 0, 0, ""
+    for index, character in enumerate(text):
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "'\"":
+            quote = character
+        elif character in "([{<":
+            depth += 1
+        elif character in ")]}>":
+            depth -= 1
+        elif character == "," and not depth:
+            parts.append(text[start:index].strip())
+            start = index + 1
+    return [part for part in [*parts, text[start:].strip()] if part]
+
+
+def parameters(signature: str) -> list[tuple[str, str, str | None]]:
+    """Kind, name and default (as text) of the parameters in a signature's text."""
+    depth = 0
+    for end, character in enumerate(signature):
+        depth += {"(": 1, ")": -1}.get(character, 0)
+        if not depth:
+            break
+    kind, found = "POSITIONAL_OR_KEYWORD", []
+    for part in split(signature[1:end]):
+        if part == "/":
+            found = [("POSITIONAL_ONLY", name, default) for _, name, default in found]
+        elif part == "*":
+            kind = "KEYWORD_ONLY"
+        elif part.startswith("**"):
+            found.append(("VAR_KEYWORD", part[2:].partition(":")[0], None))
+        elif part.startswith("*"):
+            found.append(("VAR_POSITIONAL", part[1:].partition(":")[0], None))
+            kind = "KEYWORD_ONLY"
+        else:
+            name = re.match(r"\w+", part).group()
+            default = re.search(r"=\s*(.*)$", re.sub(r"^[^=]*\[.*\](?=\s*=)", "", part))
+            found.append((kind, name, default.group(1) if default else None))
+    return found
+
+
+def shown(default: Any) -> str | None:
+    if default is inspect.Parameter.empty:
+        return None
+    if isinstance(default, qos.QoSProfile):
+        return "<rclpy.qos.QoSProfile object>"
+    if inspect.isclass(default):
+        return (
+            f"<class '{default.__module__.replace('us_sim.standalone.', '')}.{default.__name__}'>"
+        )
+    return repr(default)
+
+
+def parameters_of(function: Any) -> list[tuple[str, str, str | None]]:
+    return [
+        (parameter.kind.name, parameter.name, shown(parameter.default))
+        for parameter in inspect.signature(function).parameters.values()
+    ]
+
+
+def is_inherited(cls: type, member: str) -> bool:
+    """Whether a member comes from Python itself."""
+    return not any(
+        member in vars(base)
+        for base in cls.__mro__
+        if base.__module__.partition(".")[0] in PACKAGES
+    )
+
+
+PACKAGES = ("rclpy", "us_sim")
+
+
+def compare_class(name: str, cls: type, members: dict[str, str]) -> list[str]:
+    wrong = []
+    for member in ["__init__", *(m for m in dir(cls) if not m.startswith("_"))]:
+        if is_inherited(cls, member):
+            continue
+        if member not in members:
+            wrong.append(f"{name}.{member} is not in rclpy")
+            continue
+        expected = members[member]
+        value = inspect.getattr_static(cls, member)
+        if expected == "property":
+            same = isinstance(value, property)
+        elif expected.startswith("value "):
+            actual = getattr(cls, member)
+            text = str(int(actual)) if isinstance(actual, int) else repr(actual)
+            same = re.sub(r"us_sim\.standalone\.| at 0x\w+", "", text) in expected
+        elif inspect.isclass(value):
+            same = True  # a nested class has a check of its own where it matters
+        elif expected.startswith("classmethod "):
+            text = expected.removeprefix("classmethod ")
+            same = isinstance(value, classmethod) and parameters_of(
+                getattr(cls, member)
+            ) == parameters(text)
+        else:
+            same = parameters_of(getattr(cls, member)) == parameters(expected)
+        if not same:
+            wrong.append(f"{name}.{member} differs from rclpy's {expected}")
+    return wrong
+
+
+def test_every_name_of_the_api_has_rclpys_parameters_kinds_and_defaults(
+    api: dict[str, Any],
+) -> None:
+    wrong, missing = [], []
+    for name, expected in api.items():
+        if name == "qos profiles":
+            continue
+        found = ours(name)
+        if found is None:
+            missing.append(name)
+        elif isinstance(expected, str):
+            if parameters_of(found) != parameters(expected):
+                wrong.append(f"{name} differs from rclpy's {expected}")
+        else:
+            wrong += compare_class(name, found, expected["members"])
+    assert not missing
+    assert not wrong, "\n".join(wrong)
+
+
+def test_only_what_shows_the_compiled_part_is_missing_from_the_classes(api: dict[str, Any]) -> None:
+    of_the_compiled_part = {
+        "configure_introspection",
+        "get_c_duration",
+        "get_c_qos_profile",
+        "handle",
+        "Parameter",
+    }
+    for name, expected in api.items():
+        if name == "qos profiles" or isinstance(expected, str):
+            continue
+        members = {m for m in expected["members"] if m != "__init__" and not hasattr(int, m)}
+        lacking = {m for m in members if m not in dir(ours(name)) and m not in ("name", "value")}
+        assert lacking - {"is_integer"} <= of_the_compiled_part, name
+
+
+def test_the_presets_of_quality_of_service_are_rclpys(api: dict[str, Any]) -> None:
+    for name, expected in api["qos profiles"].items():
+        profile = qos.QoSProfile(depth=10) if "(" in name else getattr(qos, name)
+        for policy, value in expected.items():
+            actual = getattr(profile, policy)
+            if isinstance(actual, Enum):
+                actual = actual.name
+            assert getattr(actual, "nanoseconds", actual) == value, f"{name}.{policy}"
