@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from us_sim.errors import VolumeError
 from us_sim.volume.phantom_cache import kept_volume
@@ -71,12 +72,14 @@ def upper_arm(
     labels = np.empty((len(x), len(y), len(z)), dtype=np.uint8)
     diffuse = np.empty(labels.shape, dtype=np.float32)
     specular = np.empty(labels.shape, dtype=np.float32)
-    for j, at in enumerate(y):
-        section = arm.section(x, float(at), z)
-        labels[:, j], diffuse[:, j] = section.labels, section.diffuse
-        specular[:, j] = section.specular
-        if j % 10 == 0:
-            report(0.8 * j / len(y), "laying out the tissue")
+    # Products of matrices this small take five times as long on several threads.
+    with threadpool_limits(1, user_api="blas"):
+        for j, at in enumerate(y):
+            section = arm.section(x, float(at), z)
+            labels[:, j], diffuse[:, j] = section.labels, section.diffuse
+            specular[:, j] = section.specular
+            if j % 10 == 0:
+                report(0.8 * j / len(y), "laying out the tissue")
     report(0.8, "scattering")
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     envelope = echo_envelope(diffuse, specular, voxel_size, z, spread, random)
