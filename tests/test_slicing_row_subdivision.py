@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.pose import Pose
-from us_sim.slicing import location, resampling, section
+from us_sim.slicing import location, resampling, section, trilinear
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import sample_labels, sample_plane
@@ -303,7 +303,7 @@ def test_other_bad_input_is_refused():
 def test_nothing_is_left_to_compile_after_warming_up():
     warm_up()
     kernels = (section._cut, location.cells, location.subdivide_rows, location.leave_black,
-               resampling.sample_linear, resampling.sample_nearest)  # fmt: skip
+               trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) >= 1
     volume, mesh = volume_around_the_box(), box()

@@ -42,11 +42,11 @@ from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import (
     label_voxels,
     pixel_to_index,
-    sample_linear,
     sample_nearest,
     voxels_of,
 )
 from us_sim.slicing.section import RestMesh, finite_nodes
+from us_sim.slicing.trilinear import sample_linear
 
 if TYPE_CHECKING:
     from collections.abc import Callable
