@@ -23,9 +23,16 @@ from us_sim.tissue.contact import GAP_TOLERANCE, push_out
 
 __all__ = ["ActiveSet"]
 
-# m. A touched node whose rest position the probe has left by this much is let go at once, without
-# waiting for its force to change sign: after a jump it would be pulled far up first.
-_CLEARANCE = 1e-4
+# m. When the probe has moved this far off a touched node and off its rest position, it is let go at
+# once, without waiting for its force to change sign: after a jump it would be pulled far up first.
+_CLEARANCE = 1e-3
+
+# m. On taking over, a node this near the probe is taken to be pushed.
+_NEAR = 1e-4
+
+# Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
+# under it again without end. So a touched node stays so until it is this part of the spacing away.
+_SKIRT = 0.25
 
 # As a touched node slides along a curved surface, its prescribed displacement and its normal become
 # outdated. Renewing them starts the search anew, so while it goes on small errors wait.
@@ -59,11 +66,16 @@ class ActiveSet:
     def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
         """Take as touched what lies on the probe's surface; who is pulled leaves at a revision."""
         gap, self.normal = self._gap(pose, self._rest + displacement)
-        self.touched = gap < _CLEARANCE
+        self.touched = gap < _NEAR
         self.push[:] = 0.0
 
     def revise(
-        self, pose: Pose | None, displacement: NDArray[np.float64], *, exactly: bool = True
+        self,
+        pose: Pose | None,
+        displacement: NDArray[np.float64],
+        *,
+        exactly: bool = True,
+        moved: bool = True,
     ) -> bool:
         """Let go who is pulled, add who is entered, and move all touched nodes onto the probe.
 
@@ -71,6 +83,7 @@ class ActiveSet:
             pose: of the probe, or None when none is near.
             displacement: (C, 3) m, corrected in place.
             exactly: whether nodes that slid a little are corrected too.
+            moved: whether the probe has moved since the last revision.
 
         Returns:
             Whether the equations changed: the set, a normal, or a displacement.
@@ -82,8 +95,8 @@ class ActiveSet:
         gap, normal = self._gap(pose, self._rest + displacement)
         touched = self.touched & (self.push >= 0) & np.isfinite(gap)
         departed = touched & (gap > _CLEARANCE)
-        if departed.any():
-            rest_gap, _ = self._gap(pose, self._rest[departed])
+        if moved and departed.any():
+            rest_gap, _ = push_out(self._collider, pose, self._rest[departed], self._spacing)
             touched[np.flatnonzero(departed)[rest_gap > _CLEARANCE]] = False
         touched |= gap < -GAP_TOLERANCE
         off = touched & (np.abs(gap) > (_LITTLE_DRIFT if exactly else _DRIFT))
@@ -112,7 +125,10 @@ class ActiveSet:
         """Take the forces (C, 3) N that hold the nodes; what is along the normal is the push."""
         self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
 
+    def _margin(self) -> NDArray[np.float64]:
+        return np.where(self.touched, _SKIRT * self._spacing, 0.0)
+
     def _gap(
         self, pose: Pose, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return push_out(self._collider, pose, points, self._spacing)
+        return push_out(self._collider, pose, points, self._spacing, self._margin())

@@ -48,7 +48,11 @@ def only_forward(collider: Collider, spacing: float) -> bool:
 
 
 def push_out(
-    collider: Collider, pose: Pose, points: NDArray[np.float64], spacing: float
+    collider: Collider,
+    pose: Pose,
+    points: NDArray[np.float64],
+    spacing: float,
+    skirt: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
@@ -64,6 +68,8 @@ def push_out(
         pose: of the probe in the points' frame.
         points: (N, 3) m.
         spacing: m, between neighbouring points.
+        skirt: (N,) m, how far beside the probe each point still counts as under its rim, where it
+            pushes along +z only; none by default.
 
     Returns:
         (N,) m, negative inside, infinite where the probe cannot push, and (N, 3) unit directions in
@@ -78,6 +84,7 @@ def push_out(
         pose.rotation,
         np.array(pose.position),
         points,
+        np.zeros(len(points)) if skirt is None else skirt,
         gap,
         normal,
     )
@@ -103,10 +110,11 @@ def wrench_on_probe(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pushing_gap(box, forward, x, y, z):
+def pushing_gap(box, forward, skirt, x, y, z):
     """Gap and push direction for one point of frame ``probe``: (gap, nx, ny, nz).
 
-    ``box`` is the collider's ``offset_box``, ``forward`` as `only_forward` says.
+    ``box`` is the collider's ``offset_box``, ``forward`` as `only_forward` says, and ``skirt`` (m)
+    widens a forward push beyond the rim.
     """
     rounding = box[3]
     sx = 1.0 if x >= 0 else -1.0
@@ -116,7 +124,7 @@ def pushing_gap(box, forward, x, y, z):
     beside = ox * ox + oy * oy
     ahead = z + rounding  # of the core's front
     behind = -(ahead + 2 * box[2] + _GRIP)  # the end of the grip
-    under = beside < rounding * rounding
+    under = beside < (rounding + skirt) ** 2
     if forward and not (under and behind < 0.0):
         return math.inf, 0.0, 0.0, 1.0
     rise = math.sqrt(max(rounding * rounding - beside, 0.0))
@@ -131,8 +139,8 @@ def pushing_gap(box, forward, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pushing_gaps(box, forward, rotation, origin, points, gap, normal):
-    """Fills gap (N,) and normal (N, 3) for points (N, 3) of the probe's parent frame."""
+def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
+    """Fills gap (N,), normal (N, 3) for points (N, 3) of the probe's parent frame, skirt (N,)."""
     r = rotation
     for i in range(len(points)):
         a = points[i, 0] - origin[0]
@@ -141,7 +149,7 @@ def _pushing_gaps(box, forward, rotation, origin, points, gap, normal):
         x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
-        g, nx, ny, nz = pushing_gap(box, forward, x, y, z)
+        g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         gap[i] = g
         normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
         normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz

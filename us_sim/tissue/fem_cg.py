@@ -31,7 +31,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
 from us_sim.tissue.conjugate_gradients import conjugate_gradients, product_rows
@@ -39,7 +38,7 @@ from us_sim.tissue.contact import wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity import free_stiffness, require_held, stiffness
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solver import TissueSolver
+from us_sim.tissue.solver import TissueSolver, require_count, require_number, same_pose
 
 __all__ = ["FemCg"]
 
@@ -74,11 +73,9 @@ class FemCg(TissueSolver):
         tolerance: float = 1e-6,
         contact_updates: int = 3,
     ) -> None:
-        for setting, value in (("iterations", iterations), ("contact_updates", contact_updates)):
-            if not (isinstance(value, int) and 1 <= value <= 10_000):
-                raise SolverError(f"fem_cg.{setting} is {value!r}: give an integer from 1 to 10000")
-        if not 0 < tolerance < 1:
-            raise SolverError(f"fem_cg.tolerance is {tolerance!r}: give a number between 0 and 1")
+        require_count("fem_cg.iterations", iterations)
+        require_count("fem_cg.contact_updates", contact_updates)
+        require_number("fem_cg.tolerance", tolerance, 0.0, 1.0)
         require_held(model.mesh, model.fixed)
         super().__init__(model)
         self._tolerance = tolerance
@@ -141,9 +138,11 @@ class FemCg(TissueSolver):
             contact.adopt(pose, displacement[self._touchable])
             self._renew_equations()
         self._taken_over = False
-        for iterations in self._rounds:
+        moved = not same_pose(pose, self._pose)
+        for round_number, iterations in enumerate(self._rounds):
             surface = displacement[self._touchable]
-            if contact.revise(pose, surface, exactly=self._norm <= self._refine_at):
+            exactly = self._norm <= self._refine_at
+            if contact.revise(pose, surface, exactly=exactly, moved=round_number == 0 and moved):
                 displacement[self._touchable] = surface
                 self._renew_equations()
             anew = self._slope < 0.0
@@ -176,7 +175,8 @@ class FemCg(TissueSolver):
         push = np.maximum(contact.push, 0.0)[:, None] * contact.normal
         unbalanced[self._touchable] -= push
         imbalance = float(np.linalg.norm(unbalanced))
-        self._reference = self._reference or imbalance
+        if self._reference == 0.0:
+            self._reference = self._heaviest = imbalance  # taken over deformed, and not touched
         residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
         self._settled = balanced and contact.consistent(pose, displacement[self._touchable])

@@ -19,7 +19,6 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import numpy as np
@@ -31,7 +30,7 @@ from us_sim.pose import Pose
 from us_sim.tissue.contact import only_forward, push_out
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solver import TissueSolver
+from us_sim.tissue.solver import TissueSolver, require_count, require_number
 from us_sim.tissue.springs import springs_of, stabilised
 from us_sim.tissue.symplectic_euler import advance_frame
 
@@ -87,18 +86,13 @@ class Msds(TissueSolver):
         maximum_substeps: int = 100,
         rest_tolerance: float = 1e-6,
     ) -> None:
-        for setting, count in (("steps", steps), ("maximum_substeps", maximum_substeps)):
-            if not (isinstance(count, int) and 1 <= count <= 10_000):
-                raise SolverError(f"msds.{setting} is {count!r}: give an integer from 1 to 10000")
-        for setting, value in (
-            ("time_step", time_step),
-            ("stiffness_factor", stiffness_factor),
-            ("rest_tolerance", rest_tolerance),
-        ):
-            if not (math.isfinite(value) and value > 0):
-                raise SolverError(f"msds.{setting} is {value!r}: give a number above zero")
-        if not (math.isfinite(damping_factor) and damping_factor >= 0):
-            raise SolverError(f"msds.damping_factor is {damping_factor!r}: give 0 or more")
+        require_count("msds.steps", steps)
+        require_count("msds.maximum_substeps", maximum_substeps)
+        require_number("msds.time_step", time_step, 0.0)
+        require_number("msds.stiffness_factor", stiffness_factor, 0.0)
+        require_number("msds.rest_tolerance", rest_tolerance, 0.0)
+        if damping_factor != 0:
+            require_number("msds.damping_factor", damping_factor, 0.0)
         if stabilisation not in ("mass_scaling", "substeps"):
             raise SolverError(
                 f"msds.stabilisation is {stabilisation!r}: choose mass_scaling or substeps"
@@ -136,7 +130,14 @@ class Msds(TissueSolver):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._touched.any() and not self._entered(pose):
-            return self._outcome(pose, np.zeros(3), np.zeros(3))
+            return Deformation(
+                self._positions.copy(),
+                np.empty(0, np.int32),
+                np.zeros(3),
+                np.zeros(3),
+                self._last.residual,
+                self._action,
+            )
         rotations, origins = self._path(pose)
         wrench = np.zeros((2, 3))
         self._touched[:] = False
@@ -208,8 +209,8 @@ class Msds(TissueSolver):
         unbalanced[movable] += push[:, None] * self._normal
         imbalance = float(np.linalg.norm(unbalanced))
         load = float(np.linalg.norm(push))
-        self._heaviest = max(self._heaviest, load)
-        reference = load or self._heaviest or imbalance
+        self._heaviest = max(self._heaviest, load) or imbalance
+        reference = load or self._heaviest
         residual = imbalance / reference if reference else 0.0
 
         frame = self._steps * self._substeps * self._time_step

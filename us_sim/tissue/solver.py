@@ -22,6 +22,7 @@ True
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from importlib import import_module
@@ -37,7 +38,14 @@ from us_sim.tissue.materials import Material, uniform_material
 from us_sim.tissue.mesh import box_mesh
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["SOLVERS", "TissueSolver", "create_solver"]
+__all__ = [
+    "SOLVERS",
+    "TissueSolver",
+    "create_solver",
+    "require_count",
+    "require_number",
+    "same_pose",
+]
 
 #: Where each solver is found; a solver that is not asked for is not imported.
 SOLVERS = {
@@ -72,7 +80,7 @@ class TissueSolver(ABC):
         Args:
             probe_pose: in frame ``patient``, or None when no probe is near.
         """
-        if self._settled and _same(probe_pose, self._pose):
+        if self._settled and same_pose(probe_pose, self._pose):
             return self._last
         good, settled = self.state, self._settled
         deformation = self._advance(probe_pose)
@@ -177,7 +185,29 @@ def create_solver(name: str, model: TissueModel, **settings: Any) -> TissueSolve
     return solver(model, **settings)
 
 
-def _same(a: Pose | None, b: Pose | None) -> bool:
+def require_count(setting: str, value: object) -> None:
+    """Check a number of iterations or steps.
+
+    Raises:
+        SolverError: it is not an integer from 1 to 10000.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 10_000:
+        raise SolverError(f"{setting} is {value!r}: give an integer from 1 to 10000")
+
+
+def require_number(setting: str, value: object, low: float, high: float = math.inf) -> None:
+    """Check a setting's range.
+
+    Raises:
+        SolverError: it is not a number above ``low`` and below ``high``.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+        below = f" and below {high:g}" if math.isfinite(high) else ""
+        raise SolverError(f"{setting} is {value!r}: give a number above {low:g}{below}")
+
+
+def same_pose(a: Pose | None, b: Pose | None) -> bool:
+    """Whether two poses are the same, to the last bit."""
     if a is None or b is None:
         return a is b
     return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)

@@ -112,7 +112,7 @@ def _stop_at_probe(
         x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
-        gap, u, v, w = pushing_gap(box, forward, x, y, z)
+        gap, u, v, w = pushing_gap(box, forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
         nx = r[0, 0] * u + r[0, 1] * v + r[0, 2] * w
