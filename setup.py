@@ -49,7 +49,7 @@ setup(
     packages=find_packages(include=["us_sim", "us_sim.*"]),
     python_requires=">=3.11",
     install_requires=[
-        "cyclonedds>=11.0",
+        "cyclonedds>=11.0,<12",
         "matplotlib>=3.6",
         "filelock>=3.12",
         "lz4>=4",

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from us_sim.quantity import Quantity
@@ -52,7 +53,7 @@ class VolumeSection:
     file: str | None = _given(default=None)
     phantom: str | None = _given(default=None, choices=("upper_arm",))
     seed: int = _given(Quantity("number", 0, 2**31), default=1)
-    voxel_size: float = _given(Quantity("length", 1e-4, 5e-3), default=0.3e-3)
+    voxel_size: float = _given(Quantity("length", 2e-4, 5e-3), default=0.3e-3)
     pose: PoseSection = _given(default=PoseSection())
 
 
@@ -177,8 +178,10 @@ class Scene:
 
     @property
     def volume_name(self) -> str:
-        """The volume's file or phantom, for a person."""
-        return self.volume.file or f"phantom {self.volume.phantom}, seed {self.volume.seed}"
+        """The volume's file name or phantom, for a person."""
+        if self.volume.file:
+            return Path(self.volume.file).name
+        return f"phantom {self.volume.phantom}, seed {self.volume.seed}"
 
 
 def _part(node: str, section: object | None, key: str, consequence: str) -> Part:

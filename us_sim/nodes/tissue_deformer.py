@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
@@ -24,6 +25,9 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.tissue.solver import SOLVERS, TissueSolver, create_solver
 
 __all__ = ["TissueDeformer", "main"]
+
+ALWAYS = Time()
+"""The stamp of what does not change: zero, which tf takes as the latest."""
 
 
 class TissueDeformer(SceneNode):
@@ -58,7 +62,7 @@ class TissueDeformer(SceneNode):
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
-        rest.publish(self._cloud(mesh.nodes, self.get_clock().now().to_msg()))
+        rest.publish(self._cloud(mesh.nodes, ALWAYS))
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self.newest(PoseStamped, "probe/pose", self._deform)
         self.health.state = f"ready with {name}"
