@@ -5,6 +5,7 @@ import inspect
 import json
 import re
 from enum import Enum
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,8 @@ def split(text: str) -> list[str]:
 
 def parameters(signature: str) -> list[tuple[str, str, str | None]]:
     """Kind, name and default (as text) of the parameters in a signature's text."""
-    depth = 0
-    for end, character in enumerate(signature):
-        depth += {"(": 1, ")": -1}.get(character, 0)
-        if not depth:
-            break
+    depths = accumulate({"(": 1, ")": -1}.get(character, 0) for character in signature)
+    end = next(index for index, depth in enumerate(depths) if not depth)
     kind, found = "POSITIONAL_OR_KEYWORD", []
     for part in split(signature[1:end]):
         if part == "/":

@@ -88,8 +88,19 @@ def test_parameter_values_have_the_types_that_rcl_gives_them(
 
 def test_parameters_can_be_for_one_node_and_the_last_one_wins(bench_with) -> None:
     bench = bench_with(
-        ["--ros-args", "-p", "rate:=1", "-p", "probe:rate:=2", "--param", "a.b:=3"]
-        + ["-p", "skin:rate:=4", "-p", "skin:rate:=5"]
+        [
+            "--ros-args",
+            "-p",
+            "rate:=1",
+            "-p",
+            "probe:rate:=2",
+            "--param",
+            "a.b:=3",
+            "-p",
+            "skin:rate:=4",
+            "-p",
+            "skin:rate:=5",
+        ]
     )
     assert overrides(bench, "probe") == {"rate": 2, "a.b": 3}
     assert overrides(bench, "skin") == {"rate": 5, "a.b": 3}

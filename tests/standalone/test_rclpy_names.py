@@ -29,7 +29,8 @@ from std_srvs.srv import Trigger
         ("us/", "topic name must not end with a forward slash", 2),
         (
             "us image",
-            "topic name must not contain characters other than alphanumerics, '_', '~', '{', or '}'",
+            "topic name must not contain characters other than alphanumerics, "
+            "'_', '~', '{', or '}'",
             2,
         ),
         ("us/~", "topic name must not have tilde '~' unless it is the first character", 3),
@@ -150,10 +151,25 @@ def test_nodes_refuse_names_that_are_not_allowed(bench) -> None:
 
 def test_rules_of_the_command_line_rename_nodes_topics_and_services(bench_with) -> None:
     bench = bench_with(
-        ["--ros-args", "-r", "__ns:=/right", "--remap", "__node:=needle"]
-        + ["-r", "image:=us/picture", "-r", "~/state:=/state", "-r", "other:image:=nowhere"]
-        + ["-r", "rostopic://reset:=reset_topic", "-r", "rosservice://reset:=restart"]
-        + ["-r", "image:=never_the_second"]
+        [
+            "--ros-args",
+            "-r",
+            "__ns:=/right",
+            "--remap",
+            "__node:=needle",
+            "-r",
+            "image:=us/picture",
+            "-r",
+            "~/state:=/state",
+            "-r",
+            "other:image:=nowhere",
+            "-r",
+            "rostopic://reset:=reset_topic",
+            "-r",
+            "rosservice://reset:=restart",
+            "-r",
+            "image:=never_the_second",
+        ]
     )
     node = bench.node("probe", namespace="left")
     assert node.get_fully_qualified_name() == "/right/needle"

@@ -239,13 +239,19 @@ class Executor(AbstractContextManager["Executor"]):
         if condition():
             raise ConditionReachedException()
 
-    def _take_tasks(self, nodes: "list[Node]") -> list[Work]:
+    def _take_tasks(self, nodes: "list[Node]") -> Generator[Work, None, None]:
+        """The tasks there are now, the latest first, each removed when its turn comes."""
+        if not self._tasks:
+            return
         with self._tasks_lock:
-            if not self._tasks:
-                return []
-            taken = [work for work in self._tasks if work[2] is None or work[2] in nodes]
-            self._tasks = [work for work in self._tasks if work not in taken]
-        return taken[::-1]
+            waiting = self._tasks[::-1]
+        for work in waiting:
+            if work[2] is None or work[2] in nodes:
+                with self._tasks_lock:
+                    if work not in self._tasks:
+                        continue
+                    self._tasks.remove(work)
+                yield work
 
     def _wait(self, nodes: "list[Node]", deadline: float | None) -> None:
         """Wait until something may be ready: data, a trigger, a timer, a task, or the deadline."""

@@ -167,9 +167,9 @@ def _wanted_filters(kwargs: dict[str, Any]) -> list[str]:
 
 def _throttle(context: dict[str, Any]) -> bool:
     now = context["throttle_time_source_type"].now().nanoseconds
-    if now < context.get("next_time", 0):
+    if now < context.get("last_logged", 0) + context["throttle_duration_sec"] * 1e9:
         return False
-    context["next_time"] = now + context["throttle_duration_sec"] * 1e9
+    context["last_logged"] = now
     return True
 
 

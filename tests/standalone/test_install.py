@@ -1,0 +1,96 @@
+"""`us_sim.standalone.install`: only where there is no ROS 2, and light."""
+
+import subprocess
+import sys
+
+import pytest
+import rclpy
+
+pytestmark = pytest.mark.skipif(
+    rclpy.__name__ == "rclpy", reason="the real rclpy is here, so nothing is installed"
+)
+
+MODULES = (
+    "callback_groups",
+    "client",
+    "clock",
+    "clock_type",
+    "constants",
+    "context",
+    "duration",
+    "event_handler",
+    "exceptions",
+    "executors",
+    "expand_topic_name",
+    "guard_condition",
+    "impl.logging_severity",
+    "impl.rcutils_logger",
+    "logging",
+    "node",
+    "parameter",
+    "parameter_client",
+    "parameter_service",
+    "publisher",
+    "qos",
+    "qos_overriding_options",
+    "serialization",
+    "service",
+    "signals",
+    "subscription",
+    "task",
+    "time",
+    "time_source",
+    "timer",
+    "topic_endpoint_info",
+    "type_hash",
+    "utilities",
+    "validate_full_topic_name",
+    "validate_namespace",
+    "validate_node_name",
+    "validate_parameter_name",
+    "validate_topic_name",
+    "wait_for_message",
+    "waitable",
+)
+
+
+def run(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_module_has_one_identity_under_both_names() -> None:
+    code = "import importlib, sys, us_sim.standalone as s\nassert s.install() and s.install()\n"
+    for module in MODULES:
+        code += (
+            f"assert importlib.import_module('rclpy.{module}') is "
+            f"importlib.import_module('us_sim.standalone.rclpy.{module}')\n"
+        )
+    code += "import rclpy\nfrom rclpy.node import Node\nassert rclpy.node.Node is Node\n"
+    code += (
+        "from geometry_msgs.msg import PoseStamped\nfrom rcl_interfaces.srv import GetParameters\n"
+    )
+    code += "try:\n    import rclpy.nothing\nexcept ModuleNotFoundError:\n    print('none')\n"
+    assert run(code) == "none\n"
+
+
+def test_installing_does_not_load_the_middleware() -> None:
+    code = (
+        "import sys, us_sim.standalone as s; s.install()\n"
+        "import rclpy, rclpy.qos, rclpy.parameter\n"
+        "print([m for m in sys.modules if 'ddsc' in m or m.startswith('cyclonedds')])"
+    )
+    assert run(code) == "[]\n"
+
+
+def test_a_real_rclpy_is_left_alone(tmp_path) -> None:
+    (tmp_path / "rclpy.py").write_text("real = True\n")
+    code = (
+        f"import sys; sys.path.append({str(tmp_path)!r})\n"
+        "import us_sim.standalone as s; print(s.install())\n"
+        "import rclpy; print(rclpy.real)"
+    )
+    assert run(code) == "False\nTrue\n"
