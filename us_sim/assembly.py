@@ -18,19 +18,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import SceneError
+from us_sim.errors import BagError, SceneError
 from us_sim.pose import Pose
 from us_sim.scene import Scene, TissueSection
 
 if TYPE_CHECKING:
     from us_sim.collider import Collider
+    from us_sim.recording.path import ProbePath
     from us_sim.skin.membrane import SkinMembrane
     from us_sim.slicing.probe import LinearProbe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
     from us_sim.volume.volume import Volume
 
-__all__ = ["collider_of", "membrane_of", "probe_of", "tissue_model_of", "volume_of"]
+__all__ = [
+    "collider_of",
+    "membrane_of",
+    "path_of",
+    "probe_of",
+    "tissue_model_of",
+    "volume_of",
+]
 
 
 def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
@@ -56,6 +64,23 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
     return dataclasses.replace(
         volume, index_to_patient=patient_from_volume.matrix @ volume.index_to_patient
     )
+
+
+def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
+    """The probe path in a bag, in the frame that the scene's tracker has.
+
+    Raises:
+        BagError: it cannot be read, or is in another frame.
+    """
+    from us_sim.recording.path import read_path
+
+    path = read_path(file, topic)
+    if path.frame_id != scene.tracker.frame:
+        raise BagError(
+            f"{file}: {path.topic} is in frame '{path.frame_id}', but the scene's tracker is in "
+            f"'{scene.tracker.frame}'; set tracker.frame in {scene.origin}"
+        )
+    return path
 
 
 def probe_of(scene: Scene) -> LinearProbe:

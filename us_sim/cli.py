@@ -81,10 +81,6 @@ def _scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
     )
-
-
-def _live_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--network", action="store_true", help="talk beyond this host")
     parser.add_argument(
         "--param",
         action="append",
@@ -92,6 +88,10 @@ def _live_options(parser: argparse.ArgumentParser) -> None:
         metavar="NODE.NAME=VALUE",
         help="set a node's parameter; may be given again",
     )
+
+
+def _live_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--network", action="store_true", help="talk beyond this host")
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -125,7 +125,8 @@ def _render(args: argparse.Namespace) -> int:
     from us_sim.lockstep import render_scene
     from us_sim.scene_file import load_scene
 
-    return render_scene(load_scene(args.scene, volume=args.volume), args.path, args.out)
+    scene = load_scene(args.scene, volume=args.volume)
+    return render_scene(scene, args.path, args.out, _parameters(args.param))
 
 
 def _play(args: argparse.Namespace) -> int:

@@ -17,7 +17,10 @@ from typing import IO
 from us_sim.errors import UsSimError
 from us_sim.scene import Scene
 
-__all__ = ["NodeProcess", "ProcessGroup", "keep_on_this_host", "simulation_nodes"]
+__all__ = ["NodeProcess", "Parameters", "ProcessGroup", "keep_on_this_host", "simulation_nodes"]
+
+Parameters = dict[str, dict[str, str]]
+"""Parameters given by a person: YAML texts by node and name."""
 
 _PR_SET_PDEATHSIG = 1
 STOP_S = 1.0
@@ -42,9 +45,7 @@ class NodeProcess:
         return command
 
 
-def simulation_nodes(
-    scene: Scene, parameters: dict[str, dict[str, str]] | None = None
-) -> list[NodeProcess]:
+def simulation_nodes(scene: Scene, parameters: Parameters | None = None) -> list[NodeProcess]:
     """The nodes that ``scene`` needs; ``parameters`` gives extra ones by node, as YAML texts.
 
     Raises:

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from us_sim.assembly import path_of
 from us_sim.errors import UsSimError
-from us_sim.graph import keep_on_this_host
+from us_sim.graph import NodeProcess, Parameters, keep_on_this_host, simulation_nodes
 from us_sim.live import prepare_volume
 from us_sim.progress import Progress
-from us_sim.recording.path import read_path
 from us_sim.scene import Scene
 
 __all__ = ["render", "render_scene"]
@@ -21,7 +23,7 @@ QUIET_S = 0.25
 """Silence after which everything that was sent has been taken."""
 
 
-def render_scene(scene: Scene, path: Path | None, out: Path) -> int:
+def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Parameters) -> int:
     """`us-sim render`: with checks of its arguments, and progress.
 
     Raises:
@@ -38,17 +40,24 @@ def render_scene(scene: Scene, path: Path | None, out: Path) -> int:
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
     prepare_volume(scene)
-    with Progress("rendering", len(read_path(path)), "images") as bar:
-        count = render(scene, path, out, lambda done, _: bar.update(done))
+    with Progress("rendering", len(path_of(scene, path)), "images") as bar:
+        count = render(scene, path, out, lambda done, _: bar.update(done), parameters)
     print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
     return 0
 
 
-def render(scene: Scene, path: Path, out: Path, progress: Callable[[int, int], None]) -> int:
+def render(
+    scene: Scene,
+    path: Path,
+    out: Path,
+    progress: Callable[[int, int], None],
+    parameters: Parameters | None = None,
+) -> int:
     """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
 
     Args:
         progress: called with the images done and the poses there are.
+        parameters: more parameters by node, as YAML texts.
 
     Returns:
         The number of images, equal to the number of poses.
@@ -73,8 +82,8 @@ def render(scene: Scene, path: Path, out: Path, progress: Callable[[int, int], N
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
-        for module, name, parameters in _nodes(scene, path, out):
-            nodes.append(_created(module, name, parameters, context))
+        for module, name, settings in _nodes(scene, path, out, parameters or {}):
+            nodes.append(_created(module, name, settings, context))
             executor.add_node(nodes[-1])
         return _spin(executor, nodes, progress)
     finally:
@@ -85,12 +94,11 @@ def render(scene: Scene, path: Path, out: Path, progress: Callable[[int, int], N
         context.try_shutdown()
 
 
-def _nodes(scene: Scene, path: Path, out: Path) -> list[tuple[str, str, dict[str, object]]]:
+def _nodes(
+    scene: Scene, path: Path, out: Path, parameters: Parameters
+) -> list[tuple[str, str, dict[str, object]]]:
     """Module, class and parameters of each node: listeners first, the player last."""
-    common: dict[str, object] = {"scene": scene.origin, "lockstep": True}
-    if scene.volume.file:
-        common["volume"] = scene.volume.file
-    classes = {part.node: _class_name(part.node) for part in scene.parts() if part.needed}
+    common: dict[str, object] = {"lockstep": True}
     recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
         "compression": "zstd",
@@ -111,13 +119,22 @@ def _nodes(scene: Scene, path: Path, out: Path) -> list[tuple[str, str, dict[str
     return [
         ("session_recorder", "SessionRecorder", recorder),
         ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
-        *((node, name, common) for node, name in classes.items()),
+        *(
+            (process.node, _class_name(process.node), {**common, **_values(process)})
+            for process in simulation_nodes(scene, parameters)
+        ),
         ("path_player", "PathPlayer", player),
     ]
 
 
 def _class_name(node: str) -> str:
     return "".join(word.capitalize() for word in node.split("_"))
+
+
+def _values(process: NodeProcess) -> dict[str, object]:
+    """All its parameters, those given as YAML texts parsed."""
+    given = {name: yaml.safe_load(text) for name, text in process.raw_parameters.items()}
+    return process.parameters | given
 
 
 def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:

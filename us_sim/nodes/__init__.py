@@ -2,10 +2,11 @@
 
 import os
 
-from us_sim.standalone import install
-
-# Several node processes share few cores, and small dense solves are far slower on many threads.
+# Before NumPy loads its BLAS: several node processes share few cores, and small dense solves are
+# far slower on many threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from us_sim.standalone import install
 
 install()

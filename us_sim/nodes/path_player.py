@@ -53,6 +53,7 @@ class PathPlayer(Node):
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
         self._begun = 0
+        self._half_period = 0.0
         self._checks = 0
         self.finished = Future()
         self.health = Health(self, str(path))
@@ -64,6 +65,7 @@ class PathPlayer(Node):
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
+        self.health.state = "waiting for the simulation"
         self._starting = self.create_timer(CHECK_S, self._begin)
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
@@ -115,11 +117,14 @@ class PathPlayer(Node):
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
-        elapsed = self.get_clock().now().nanoseconds - self._begun + self._half_period
-        times = self._path.log_times
-        while not self.finished.done() and (times[self._next] - times[0]) / self._rate <= elapsed:
+        while not self.finished.done() and self._is_due():
             self._send()
             self._advance()
+
+    def _is_due(self) -> bool:
+        elapsed = self.get_clock().now().nanoseconds - self._begun + self._half_period
+        times = self._path.log_times
+        return bool((times[self._next] - times[0]) / self._rate <= elapsed)
 
     def _imaged(self, image: Image) -> None:
         stamp = Time.from_msg(image.header.stamp).nanoseconds
@@ -142,7 +147,7 @@ class PathPlayer(Node):
             return
         if self._loop:
             self._next = 0
-            self._begun = self.get_clock().now().nanoseconds
+            self._begun = self.get_clock().now().nanoseconds + int(2 * self._half_period)
             return
         self.health.state = "finished"
         self.get_logger().info("the path is at its end")

@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from us_sim.errors import SceneError
 from us_sim.nodes.health import Health
 from us_sim.nodes.newest import Newest
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
@@ -23,7 +24,8 @@ class SceneNode(Node):
     """A node that works on a scene.
 
     Parameters: ``scene`` (file, or name of an installed scene), ``volume`` (a file that replaces
-    the scene's), ``lockstep`` (work on every message instead of the newest).
+    the scene's), ``lockstep`` (work on every message instead of the newest), ``threads`` (for
+    the numerical work, where it can be shared out).
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
@@ -36,6 +38,9 @@ class SceneNode(Node):
         self.lockstep: bool = self._declared(
             "lockstep", False, "work on every message, in order, instead of the newest", fixed
         )
+        self.threads: int = self._declared("threads", 1, "for the numerical work", fixed)
+        if not 1 <= self.threads <= 256:
+            raise SceneError(f"threads is {self.threads}; it must be from 1 to 256")
         self.health = Health(self, self.scene.name)
 
     def _declared(self, name: str, value: Any, description: str, options: dict[str, bool]) -> Any:

@@ -73,6 +73,7 @@ class SliceInterpolator(SceneNode):
                 vectors_from(self._rest),
                 tetrahedra_from(self._tetrahedra),
                 regions=self.scene.slice.regions,
+                threads=self.threads,
             )
         except UsSimError as error:
             self.health.problem("mesh", f"tissue mesh: {error}")

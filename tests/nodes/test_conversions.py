@@ -1,0 +1,127 @@
+"""Arrays to messages and back, by their laws; what does not fit is one sentence."""
+
+from array import array
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Image, PointCloud2, PointField
+from std_msgs.msg import Int32MultiArray
+from visualization_msgs.msg import Marker
+
+from us_sim.errors import MeshError, VolumeError
+from us_sim.nodes.conversions import (
+    cloud_message,
+    image_message,
+    mesh_message,
+    pixels_from,
+    pose_from,
+    pose_message,
+    surface_marker,
+    tetrahedra_from,
+    tetrahedra_message,
+    vectors_from,
+)
+from us_sim.pose import Pose
+
+STAMP = Time(sec=3, nanosec=4)
+quick = settings(max_examples=25, deadline=None)
+floats = st.floats(-1e3, 1e3, width=32)
+points = arrays(np.float64, st.tuples(st.integers(1, 20), st.just(3)), elements=floats)
+
+
+@quick
+@given(points)
+def test_clouds_keep_float32_coordinates(vectors):
+    message = cloud_message(dict(zip("xyz", vectors.T, strict=True)), STAMP, "patient")
+    assert message.row_step == 12 * len(vectors) == len(message.data)
+    np.testing.assert_array_equal(vectors_from(message), vectors)
+
+
+@quick
+@given(points, st.sampled_from(["<", ">"]), st.sampled_from([4, 8]), st.integers(0, 7))
+def test_clouds_of_any_layout_are_read(vectors, order, size, padding):
+    kind = {4: PointField.FLOAT32, 8: PointField.FLOAT64}[size]
+    offsets = [padding + size * k for k in (2, 0, 1)]
+    layout = np.dtype(
+        {
+            "names": ["x", "y", "z"],
+            "formats": [f"{order}f{size}"] * 3,
+            "offsets": offsets,
+            "itemsize": padding + 3 * size + 2,
+        }
+    )
+    table = np.zeros(len(vectors), layout)
+    for name, column in zip("xyz", vectors.T, strict=True):
+        table[name] = column
+    message = PointCloud2(
+        height=1,
+        width=len(vectors),
+        is_bigendian=order == ">",
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(vectors),
+        data=array("B", table.tobytes()),
+        fields=[
+            PointField(name=name, offset=offset, datatype=kind, count=1)
+            for name, offset in zip("xyz", offsets, strict=True)
+        ],
+    )
+    np.testing.assert_array_equal(vectors_from(message), vectors)
+
+
+@quick
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9))))
+def test_images_round_trip(pixels):
+    np.testing.assert_array_equal(pixels_from(image_message(pixels, STAMP, "probe")), pixels)
+
+
+@quick
+@given(arrays(np.int32, st.tuples(st.integers(0, 9), st.just(4))))
+def test_tetrahedra_round_trip(tetrahedra):
+    np.testing.assert_array_equal(tetrahedra_from(tetrahedra_message(tetrahedra)), tetrahedra)
+
+
+def test_poses_round_trip():
+    pose = Pose([0.1, -0.2, 0.3], [0.5, -0.5, 0.5, 0.5])
+    message = pose_message(pose, STAMP, "patient")
+    assert (message.header.stamp, message.header.frame_id) == (STAMP, "patient")
+    np.testing.assert_array_equal(pose_from(message).matrix, pose.matrix)
+
+
+@pytest.mark.parametrize("frame", ["p", "pa", "patient", "a/long/frame"])
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_a_marker_has_each_corner_of_each_triangle(frame, count):
+    rng = np.random.default_rng(5)
+    vertices, triangles = rng.normal(size=(9, 3)), rng.integers(0, 9, (count, 3))
+    marker = deserialize_message(surface_marker(vertices, triangles, STAMP, frame), Marker)
+    received = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3)
+    np.testing.assert_array_equal(received, vertices[triangles.ravel()])
+    assert marker.header.frame_id == frame
+    assert (marker.ns, marker.colors, marker.text) == ("skin", [], "")
+    assert marker.pose.orientation.w == 1.0
+
+
+def test_a_mesh_has_vertices_and_triangles():
+    mesh = mesh_message(np.eye(3), np.array([[2, 1, 0]]))
+    assert [list(t.vertex_indices) for t in mesh.triangles] == [[2, 1, 0]]
+    assert [(v.x, v.y, v.z) for v in mesh.vertices] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+
+
+def test_what_does_not_fit_is_refused():
+    cloud = cloud_message({"x": np.zeros(2), "y": np.zeros(2)}, STAMP, "patient")
+    with pytest.raises(MeshError, match="no float field for 'z'"):
+        vectors_from(cloud)
+    cloud = cloud_message(dict(zip("xyz", np.zeros((3, 2)), strict=True)), STAMP, "patient")
+    cloud.width = 5
+    with pytest.raises(MeshError, match="holds 24 bytes, but says it has 5 points"):
+        vectors_from(cloud)
+    with pytest.raises(MeshError, match="5 node indices do not make whole tetrahedra"):
+        tetrahedra_from(Int32MultiArray(data=array("i", range(5))))
+    with pytest.raises(VolumeError, match="the image is rgb8"):
+        pixels_from(Image(encoding="rgb8"))
+    with pytest.raises(VolumeError, match="holds 0 bytes"):
+        pixels_from(Image(encoding="mono8", height=2, width=2, step=2))

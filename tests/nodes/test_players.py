@@ -1,0 +1,114 @@
+"""Paths and recordings played again: pace, stamps, lockstep, ends."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from rclpy.time import Time
+from sensor_msgs.msg import Image
+from std_msgs.msg import Int32MultiArray
+
+from us_sim.errors import BagError
+from us_sim.nodes.conversions import image_message
+from us_sim.nodes.path_player import PathPlayer
+from us_sim.nodes.session_player import SessionPlayer
+from us_sim.recording.path import ProbePath, write_path
+from us_sim.recording.reader import read_bag
+
+EPOCH = 1_700_000_000_000_000_000
+STEP = 20_000_000
+
+
+@pytest.fixture
+def path(tmp_path):
+    """Ten poses, 20 ms apart."""
+    stamps = EPOCH + STEP * np.arange(10)
+    positions = np.zeros((10, 3))
+    positions[:, 2] = np.arange(10) * 1e-3
+    file = tmp_path / "path.mcap"
+    orientations = np.tile([0.0, 0, 0, 1], (10, 1))
+    write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
+    return file
+
+
+def nanoseconds(message):
+    return Time.from_msg(message.header.stamp).nanoseconds
+
+
+def test_poses_are_played_in_order_at_their_pace_with_new_stamps(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path))
+    bench.spin_until(player.finished.done)
+    bench.spin_until(lambda: len(poses) == 10)
+    assert [round(pose.pose.position.z * 1e3) for pose in poses] == list(range(10))
+    stamps = np.array([nanoseconds(pose) for pose in poses])
+    assert abs(stamps[-1] - player.get_clock().now().nanoseconds) < 10e9
+    assert 0.5 * 9 * STEP < stamps[-1] - stamps[0] < 10 * 9 * STEP
+    assert (np.diff(stamps) > 0).all()
+
+
+def test_recorded_stamps_can_be_kept(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), restamp=False, rate=10.0)
+    bench.spin_until(player.finished.done)
+    bench.spin_until(lambda: len(poses) == 10)
+    assert [nanoseconds(pose) for pose in poses] == [EPOCH + STEP * k for k in range(10)]
+
+
+def test_in_lockstep_the_next_pose_waits_for_the_image(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), lockstep=True)
+    images = bench.publisher(Image, "ultrasound/image")
+    bench.spin_until(lambda: len(poses) == 1)
+    bench.spin_for(10)
+    assert len(poses) == 1
+    pixels = np.zeros((2, 2), np.uint8)
+    for count in range(1, 11):
+        bench.spin_until(lambda count=count: len(poses) == count)
+        images.publish(image_message(pixels, poses[-1].header.stamp, "probe"))
+    bench.spin_until(player.finished.done)
+
+
+def test_a_path_begins_again_when_it_loops(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), loop=True, rate=20.0)
+    bench.spin_until(lambda: len(poses) >= 25)
+    assert not player.finished.done()
+    assert poses[10].pose.position.z == poses[0].pose.position.z
+
+
+def test_nothing_is_played_before_what_is_awaited_is_there(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    bench.make(PathPlayer, path=str(path), await_topics=["ultrasound/image"])
+    bench.spin_for(60)
+    assert not poses
+    bench.peer.create_publisher(Image, "ultrasound/image", 1)
+    bench.spin_until(lambda: len(poses) == 10)
+
+
+def test_a_path_that_cannot_be_read_is_one_sentence(bench, tmp_path):
+    with pytest.raises(BagError, match=r"nowhere\.mcap"):
+        bench.make(PathPlayer, path=str(tmp_path / "nowhere.mcap"))
+
+
+def test_poses_that_cannot_be_told_apart_are_refused_in_lockstep(bench, tmp_path):
+    file = tmp_path / "same.mcap"
+    stamps = np.full(3, EPOCH)
+    orientations = np.tile([0.0, 0, 0, 1], (3, 1))
+    path = ProbePath("/tracker/pose", "patient", stamps, np.zeros((3, 3)), orientations)
+    write_path(file, path)
+    with pytest.raises(BagError, match="neither stamps nor log times rise"):
+        bench.make(PathPlayer, path=str(file), lockstep=True)
+
+
+def test_a_recording_is_published_as_it_was(bench, shared_data):
+    folder = shared_data / "ros2-jazzy" / "bags" / "probe_path_mcap"
+    poses = bench.collect(PoseStamped, "/tracker/pose")
+    player = bench.make(SessionPlayer, path=str(folder), rate=20.0)
+    latched = bench.collect(Int32MultiArray, "/tissue/tetrahedra", latched=True)
+    bench.spin_until(player.finished.done)
+    bag = read_bag(folder)
+    expected = [bag.deserialize(m) for m in bag.messages(["/tracker/pose"])]
+    bench.spin_until(lambda: len(poses) == len(expected) and latched)
+    for received, recorded in zip(poses, expected, strict=True):
+        assert received.pose.position.z == recorded.pose.position.z
+        assert received.header.stamp.nanosec == recorded.header.stamp.nanosec

@@ -1,0 +1,63 @@
+"""The recorder: every topic as soon as it appears, byte for byte, readable at every moment."""
+
+import numpy as np
+import pytest
+from bench import pose_at
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+from us_sim.errors import BagError
+from us_sim.nodes.conversions import image_message
+from us_sim.nodes.session_recorder import SessionRecorder
+from us_sim.recording.reader import read_bag
+
+
+def test_what_is_published_is_recorded_byte_for_byte(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file))
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    bench.peer.create_publisher(String, "early", latched).publish(String(data="before"))
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    images = bench.peer.create_publisher(Image, "ultrasound/image", best_effort)
+    poses = bench.publisher(PoseStamped, "tracker/pose")
+    bench.spin_until(lambda: images.get_subscription_count() > 0)
+    sent = [pose_at(0.001 * k, 1 + k) for k in range(200)]
+    for pose in sent:
+        poses.publish(pose)
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    images.publish(image_message(pixels, sent[0].header.stamp, "probe"))
+    bench.spin_until(lambda: recorder.health.received >= 202)
+    bench.spin_until(lambda: read_bag(file).message_count >= 202)  # while it is still open
+    bench.executor.remove_node(recorder)
+    recorder.destroy_node()
+    bag = read_bag(file)
+    assert bag.complete
+    received = [bytes(message.data) for message in bag.messages(["/tracker/pose"])]
+    assert received == [bytes(serialize_message(pose)) for pose in sent]
+    assert bag.topic("/early").message_count == 1
+    assert bag.topic("/early").qos[0].durability == "transient_local"
+    assert bag.topic("/ultrasound/image").qos[0].reliability == "best_effort"
+    for message in bag.messages():
+        assert message.publish_time <= message.log_time
+
+
+def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
+    chosen = bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), topics=["/wanted"])
+    publishers = [bench.peer.create_publisher(String, name, 10) for name in ("wanted", "other")]
+    bench.spin_until(lambda: publishers[0].get_subscription_count() > 0)
+    bench.spin_for(30)
+    assert publishers[1].get_subscription_count() == 0
+    bench.executor.remove_node(chosen)
+    chosen.destroy_node()
+    assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
+
+
+def test_a_recording_is_not_overwritten(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    file.write_bytes(b"precious")
+    with pytest.raises(BagError, match=r"session\.mcap"):
+        bench.make(SessionRecorder, file=str(file))
+    assert file.read_bytes() == b"precious"

@@ -1,0 +1,182 @@
+"""A plan of node processes, started, followed by what they report, and ended together."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from us_sim.assembly import path_of
+from us_sim.errors import UsSimError
+from us_sim.graph import NodeProcess, Parameters, ProcessGroup, simulation_nodes
+from us_sim.progress import Progress
+from us_sim.scene import Scene
+
+if TYPE_CHECKING:
+    from us_sim.nodes.session_monitor import SessionMonitor
+
+__all__ = ["Monitored", "Plan", "follow", "plan_of"]
+
+SETTLE_S = 1.3
+"""After the path's end: the last images, and each node's last report, which comes every second."""
+START_LIMIT_S = 300.0
+LOOK_AROUND_S = 0.4
+"""To discover whether another simulation is on this ROS domain."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a live run starts."""
+
+    scene: Scene
+    processes: list[NodeProcess]
+    poses: int | None  # in the path that is played
+    duration: float | None  # s
+
+    @property
+    def nodes(self) -> list[str]:
+        return [process.node for process in self.processes]
+
+
+def plan_of(
+    scene: Scene,
+    parameters: Parameters,
+    *,
+    record: Path | None,
+    path: Path | None,
+    duration: float | None = None,
+) -> Plan:
+    parameters = dict(parameters)
+    processes = []
+    if record is not None:
+        settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
+        processes.append(
+            NodeProcess("session_recorder", settings, parameters.pop("session_recorder", {}))
+        )
+    player = parameters.pop("path_player", {}) if path is not None else {}
+    processes += simulation_nodes(scene, parameters)
+    poses = None
+    if path is not None:
+        poses = len(path_of(scene, path, player.get("topic")))
+        topics = ["tracker/pose", "probe/pose", "ultrasound/image"]
+        topics += ["tissue/nodes"] if scene.tissue else []
+        topics += ["skin/nodes"] if scene.skin else []
+        settings = {
+            "path": str(path.expanduser().resolve()),
+            "await_topics": topics,
+            "await_subscriber": "session_recorder" if record is not None else "",
+        }
+        processes.append(NodeProcess("path_player", settings, player))
+    return Plan(scene, processes, poses, duration)
+
+
+class Monitored:
+    """A monitor node in this process, with its own context and executor."""
+
+    def __init__(self, nodes: list[str]) -> None:
+        import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        from us_sim.nodes.session_monitor import SessionMonitor
+
+        self.names = nodes
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node: SessionMonitor = SessionMonitor(context=self._context)
+        self._executor: Any = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def spin(self) -> None:
+        """Take what has come, for at most a tenth of a second."""
+        self._executor.spin_once(timeout_sec=0.1)
+
+    def refuse_company(self) -> None:
+        """Raise UsSimError when a node of one of these names is on the domain already."""
+        until = time.monotonic() + LOOK_AROUND_S
+        while time.monotonic() < until:
+            self.spin()
+        taken = sorted(set(self.names) & set(self.node.get_node_names()))
+        if taken:
+            raise UsSimError(
+                f"{taken[0]} runs already on ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}: "
+                f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"
+            )
+
+    @property
+    def waiting(self) -> list[str]:
+        """Nodes that have not reported yet."""
+        return [name for name in self.names if name not in self.node.reports]
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+
+def follow(plan: Plan, log: Path | None) -> float:
+    """Start the plan's processes and stay with them; seconds until all were ready.
+
+    Raises:
+        UsSimError: a node fails or does not start, or another simulation runs on this domain.
+    """
+    group = ProcessGroup(log)
+    monitor = Monitored(plan.nodes)
+    try:
+        monitor.refuse_company()
+        began = time.monotonic()
+        group.start(plan.processes)
+        with Progress("starting (the first run compiles)", len(plan.nodes), "nodes") as bar:
+            while monitor.waiting:
+                monitor.spin()
+                group.check()
+                waiting = monitor.waiting
+                bar.update(len(plan.nodes) - len(waiting), ", ".join(waiting))
+                if time.monotonic() - began > START_LIMIT_S:
+                    raise UsSimError(f"{', '.join(waiting)} did not start in {START_LIMIT_S:g} s")
+        startup = time.monotonic() - began
+        _stay(plan, group, monitor)
+    finally:
+        group.stop()
+        monitor.close()
+    return startup
+
+
+def _stay(plan: Plan, group: ProcessGroup, monitor: Monitored) -> None:
+    """Until the path is at its end, the time is up, or a node fails."""
+    began = time.monotonic()
+    ended: float | None = None
+    total = plan.poses if plan.poses is not None else plan.duration
+    unit = "poses" if plan.poses is not None else "s"
+    with Progress("running", total, unit) as bar:
+        while True:
+            monitor.spin()
+            group.check()
+            now = time.monotonic()
+            done = monitor.node.count("path_player", "tracker/pose") if plan.poses else now - began
+            if plan.poses is not None and ended is None and not group.is_running("path_player"):
+                ended = now
+            if ended is not None:
+                done = total or done
+            bar.update(min(done, total or done), _status(monitor.node))
+            if plan.duration is not None and now - began > plan.duration:
+                return
+            if ended is not None and now - ended > SETTLE_S:
+                return
+
+
+def _status(monitor: SessionMonitor) -> str:
+    """The images so far, their rate and their age, in words."""
+    slicer = monitor.reports.get("slice_interpolator", {})
+    count = slicer.get("published ultrasound/image")
+    if count is None:
+        return "waiting for poses"
+    return (
+        f"{count} images, {slicer.get('rate_hz', '?')}/s, "
+        f"p99 {slicer.get('latency_p99_ms', '?')} ms"
+    )
