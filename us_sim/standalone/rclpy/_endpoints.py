@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ..messages import deserialize, serialize, type_hash
+from ..messages import CdrError, deserialize, serialize, type_hash
 from ..services import RequestHeader, ServiceClient, ServiceServer
 from ..transport import DdsError, EndpointEvent
 from ._context_handle import ContextHandle
@@ -176,7 +176,7 @@ class SubscriptionHandle(_TopicEndpoint):
         if taken is None:
             return None
         data, info = taken
-        return data if raw else deserialize(data, msg_type), {
+        return data if raw else _message(data, msg_type), {
             "source_timestamp": info.source_timestamp,
             "received_timestamp": info.received_timestamp,
             "publication_sequence_number": None,
@@ -236,7 +236,7 @@ class ClientHandle(_ServiceEndpoint):
         if taken is None:
             return None, None
         data, header = taken
-        return _service_info(header), deserialize(data, response_type)
+        return _service_info(header), _message(data, response_type)
 
     def service_server_is_available(self) -> bool:
         """Whether a service is connected in both directions."""
@@ -266,7 +266,7 @@ class ServiceHandle(_ServiceEndpoint):
         if taken is None:
             return None, None
         data, header = taken
-        return deserialize(data, request_type), _service_info(header)
+        return _message(data, request_type), _service_info(header)
 
     def service_send_response(self, response: Any, request_id: rmw_request_id_t) -> None:
         """Answer a request; nothing happens when the client has gone."""
@@ -286,6 +286,13 @@ def _service_info(header: RequestHeader) -> rmw_service_info_t:
         received_timestamp=header.received_timestamp,
         request_id=_RequestId(header.sequence, header.client, header),
     )
+
+
+def _message(data: bytes, cls: Any) -> Any:
+    try:
+        return deserialize(data, cls)
+    except CdrError as error:
+        raise RCLError(f"failed to take message: {error}") from None
 
 
 def _topic(topic: str, msg_type: Any, qos: QoSProfile) -> tuple[str, str, QoSProfile, str]:

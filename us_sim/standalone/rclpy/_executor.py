@@ -11,9 +11,9 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from ._executor_work import WorkTracker, take_call, waits_for
+from ._executor_work import WorkTracker, take_call
+from ._readiness import ready_entities, time_to_wait
 from ._wake_up import WakeUp
-from .constants import S_TO_NS
 from .context import Context
 from .exceptions import NotInitializedException
 from .task import Future, Task
@@ -220,13 +220,15 @@ class Executor(AbstractContextManager["Executor"]):
                 has_yielded = True
                 yield work
             if not has_yielded:
-                self._wait(nodes_to_use, deadline)
+                rest = time_to_wait(nodes_to_use, self.can_execute, deadline)
+                if rest is None or rest > 0:
+                    self._wake_up.wait(rest)
             if self._is_shutdown:
                 raise ShutdownException()
             if not self._context.ok():
                 raise ExternalShutdownException()
             for node in nodes_to_use:
-                for entity in self._ready_entities(node):
+                for entity in ready_entities(node, self.can_execute):
                     has_yielded = True
                     yield self._work_for(entity, node)
             if not has_yielded and deadline is not None and time.monotonic() >= deadline:
@@ -252,47 +254,6 @@ class Executor(AbstractContextManager["Executor"]):
                         continue
                     self._tasks.remove(work)
                 yield work
-
-    def _wait(self, nodes: "list[Node]", deadline: float | None) -> None:
-        """Wait until something may be ready: data, a trigger, a timer, a task, or the deadline."""
-        timeout = None if deadline is None else deadline - time.monotonic()
-        for node in nodes:
-            for entity in waits_for(node):
-                if self.can_execute(entity):
-                    return
-            for timer in list(node._timers):
-                if timer._canceled or not self.can_execute(timer):
-                    continue
-                if timer._is_due():
-                    return
-                if timer._clock._runs_by_itself():
-                    rest = (timer._next_call - timer._clock._now()) / S_TO_NS
-                    timeout = rest if timeout is None else min(timeout, rest)
-        self._wake_up.wait(timeout)
-
-    def _ready_entities(self, node: "Node") -> Generator[Any, None, None]:
-        """The entities of a node whose callbacks may start, each looked at when its turn comes."""
-        for waitable in list(node._waitables):
-            if waitable.is_ready(None) and self.can_execute(waitable):
-                yield waitable
-        for timer in list(node._timers):
-            if timer._is_due() and self.can_execute(timer):
-                yield timer
-        for subscription in list(node._subscriptions):
-            inbox = subscription._subscription.inbox
-            if inbox.ready and self.can_execute(subscription) and inbox.fetch():
-                yield subscription
-        for guard in list(node._guards):
-            if guard._triggered and self.can_execute(guard):
-                yield guard
-        for client in list(node._clients):
-            inbox = client._client.inbox
-            if inbox.ready and self.can_execute(client) and inbox.fetch():
-                yield client
-        for service in list(node._services):
-            inbox = service._service.inbox
-            if inbox.ready and self.can_execute(service) and inbox.fetch():
-                yield service
 
     def _work_for(self, entity: Any, node: "Node") -> Work:
         entity._executor_event = True

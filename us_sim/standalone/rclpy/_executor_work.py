@@ -1,7 +1,7 @@
-"""What executors do with one entity: see whether it is ready, take its data, call its callback."""
+"""What executors do with one entity: take its data and call its callback."""
 
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,8 @@ from .waitable import Waitable
 
 if TYPE_CHECKING:
     from .executors import Executor
-    from .node import Node
 
-__all__ = ["WorkTracker", "take_call", "waits_for"]
+__all__ = ["WorkTracker", "take_call"]
 
 
 class WorkTracker:
@@ -51,25 +50,6 @@ class WorkTracker:
             timeout_sec = None
         with self._changed:
             return self._changed.wait_for(lambda: not self._threads.keys() - {me}, timeout_sec)
-
-
-def waits_for(node: "Node") -> Generator[Any, None, None]:
-    """The entities of a node, except timers, that are or may be ready."""
-    for waitable in list(node._waitables):
-        if waitable.is_ready(None):
-            yield waitable
-    for subscription in list(node._subscriptions):
-        if subscription._subscription.inbox.ready:
-            yield subscription
-    for guard in list(node._guards):
-        if guard._triggered:
-            yield guard
-    for client in list(node._clients):
-        if client._client.inbox.ready:
-            yield client
-    for service in list(node._services):
-        if service._service.inbox.ready:
-            yield service
 
 
 def take_call(entity: Any, executor: "Executor") -> Callable[[], Any] | None:

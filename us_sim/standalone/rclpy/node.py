@@ -21,7 +21,7 @@ from ._node_graph import NodeGraph
 from ._node_services import NodeServices
 from ._node_timers import NodeTimers
 from ._node_topics import NodeTopics
-from ._rclpy_pybind11 import RCLError
+from ._rclpy_pybind11 import NodeNameNonExistentError, RCLError
 from ._remapping import NAMESPACE, NODE_NAME, SERVICE, TOPIC, remap, remap_node
 from ._rosout import Rosout
 from .clock import Clock, ROSClock
@@ -40,7 +40,9 @@ from .validate_node_name import validate_node_name
 if TYPE_CHECKING:
     from .executors import Executor
 
-__all__ = ["Node"]
+__all__ = ["HIDDEN_NODE_PREFIX", "Node", "NodeNameNonExistentError"]
+
+HIDDEN_NODE_PREFIX = "_"
 
 
 class Node(NodeTopics, NodeServices, NodeTimers, NodeGraph):

@@ -24,6 +24,7 @@ class Publisher:
         callback_group: CallbackGroup,
     ) -> None:
         self._publisher = publisher_impl
+        self._logger = get_logger(publisher_impl.logger_name)
         self.msg_type = msg_type
         self.topic = topic
         self.qos_profile = qos_profile
@@ -45,9 +46,10 @@ class Publisher:
         else:
             raise TypeError(f"Expected {self.msg_type}, got {type(msg)}")
         if not accepted:
-            get_logger(self._publisher.logger_name).warning(
+            self._logger.warning(
                 f"A message on '{self.topic}' was dropped: a reliable subscription "
                 "takes messages too slowly.",
+                throttle_duration_sec=5.0,
             )
 
     def get_subscription_count(self) -> int:
