@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
@@ -17,6 +16,7 @@ from sensor_msgs.msg import Image
 from us_sim.errors import BagError
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.pose import Pose
@@ -39,15 +39,19 @@ class PathPlayer(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("path_player", **kwargs)
-        path = self._declared("path", "", "bag with a PoseStamped topic")
-        topic = self._declared("topic", "", "topic in the bag; empty: the only one of that type")
-        self._rate = self._declared("rate", 1.0, "speed factor", low=0.01, high=100.0)
-        self._loop = self._declared("loop", False, "start again at the end")
-        self._restamp = self._declared("restamp", True, "stamp poses when they are sent")
-        self._lockstep = self._declared("lockstep", False, "wait for each pose's image")
-        self._awaited = self._declared("await_topics", [""], "begin when these are published")
-        self._subscriber = self._declared(
-            "await_subscriber", "", "and this node subscribes to them"
+        path = fixed_parameter(self, "path", "", "bag with a PoseStamped topic")
+        topic = fixed_parameter(
+            self, "topic", "", "topic in the bag; empty: the only one of that type"
+        )
+        self._rate = fixed_parameter(self, "rate", 1.0, "speed factor", within=(0.01, 100.0))
+        self._loop = fixed_parameter(self, "loop", False, "start again at the end")
+        self._restamp = fixed_parameter(self, "restamp", True, "stamp poses when they are sent")
+        self._lockstep = fixed_parameter(self, "lockstep", False, "wait for each pose's image")
+        self._awaited = fixed_parameter(
+            self, "await_topics", [""], "begin when these are published"
+        )
+        self._subscriber = fixed_parameter(
+            self, "await_subscriber", "", "and this node subscribes to them"
         )
         self._path = read_path(path, topic or None)
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
@@ -71,20 +75,6 @@ class PathPlayer(Node):
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
         if self._path.note:
             self.get_logger().warning(self._path.note)
-
-    def _declared(
-        self,
-        name: str,
-        value: Any,
-        description: str,
-        *,
-        low: float | None = None,
-        high: float | None = None,
-    ) -> Any:
-        descriptor = ParameterDescriptor(description=description, read_only=True)
-        if low is not None and high is not None:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-        return self.declare_parameter(name, value, descriptor).value
 
     def _begin(self) -> None:
         """Start once somebody listens and the awaited topics have been there for a while.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -13,6 +12,7 @@ from rclpy.qos import QoSProfile
 from us_sim.errors import SceneError
 from us_sim.nodes.health import Health
 from us_sim.nodes.newest import Newest
+from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
 from us_sim.scene import Scene
 from us_sim.scene_file import load_scene
@@ -30,22 +30,20 @@ class SceneNode(Node):
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        fixed = {"read_only": True}
         self.scene: Scene = load_scene(
-            self._declared("scene", "upper_arm", "scene file, or name of an installed one", fixed),
-            volume=self._declared("volume", "", "volume file that replaces the scene's", fixed),
+            fixed_parameter(self, "scene", "upper_arm", "scene file, or name of an installed one"),
+            volume=fixed_parameter(self, "volume", "", "volume file that replaces the scene's"),
         )
-        self.lockstep: bool = self._declared(
-            "lockstep", False, "work on every message, in order, instead of the newest", fixed
+        self.lockstep: bool = fixed_parameter(
+            self,
+            "lockstep",
+            False,
+            "work on every message, in order, instead of the newest",
         )
-        self.threads: int = self._declared("threads", 1, "for the numerical work", fixed)
+        self.threads: int = fixed_parameter(self, "threads", 1, "for the numerical work")
         if not 1 <= self.threads <= 256:
             raise SceneError(f"threads is {self.threads}; it must be from 1 to 256")
         self.health = Health(self, self.scene.name)
-
-    def _declared(self, name: str, value: Any, description: str, options: dict[str, bool]) -> Any:
-        descriptor = ParameterDescriptor(description=description, **options)
-        return self.declare_parameter(name, value, descriptor).value
 
     def stream(self, message_type: Any, topic: str) -> Publisher:
         """A publisher of what changes with every pose."""

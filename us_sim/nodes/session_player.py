@@ -7,14 +7,13 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
-from us_sim.errors import BagError
 from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
@@ -33,11 +32,9 @@ class SessionPlayer(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_player", **kwargs)
-        path = self._declared("path", "", "bag to play")
-        self._rate = self._declared("rate", 1.0, "speed factor")
-        self._loop = self._declared("loop", False, "start again at the end")
-        if not self._rate > 0:
-            raise BagError(f"rate is {self._rate:g}; it must be more than 0")
+        path = fixed_parameter(self, "path", "", "bag to play")
+        self._rate = fixed_parameter(self, "rate", 1.0, "speed factor", within=(0.01, 100.0))
+        self._loop = fixed_parameter(self, "loop", False, "start again at the end")
         self._bag = read_bag(path)
         self.finished = Future()
         self.health = Health(self, str(path))
@@ -49,10 +46,6 @@ class SessionPlayer(Node):
         self._begun = 0
         self._first = 0
         self._start = self.create_timer(START_S, self._begin)
-
-    def _declared(self, name: str, value: Any, description: str) -> Any:
-        descriptor = ParameterDescriptor(description=description, read_only=True)
-        return self.declare_parameter(name, value, descriptor).value
 
     def _offer(self, topic: str, type_name: str, *, latched: bool) -> None:
         package, _, name = type_name.split("/")

@@ -6,12 +6,12 @@ import importlib
 import sys
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from us_sim.errors import BagError
 from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.recording.writer import BagWriter
 
@@ -31,10 +31,10 @@ class SessionRecorder(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)
-        file = self._declared("file", "session.mcap", "the MCAP file to write")
-        compression = self._declared("compression", "none", "none or zstd")
-        self._topics = {t for t in self._declared("topics", [""], "topics; empty: all") if t}
-        self._excluded = {*self._declared("exclude", [""], "left out"), *NOT_THE_SESSION}
+        file = fixed_parameter(self, "file", "session.mcap", "the MCAP file to write")
+        compression = fixed_parameter(self, "compression", "none", "none or zstd")
+        self._topics = {t for t in fixed_parameter(self, "topics", [""], "topics; empty: all") if t}
+        self._excluded = {*fixed_parameter(self, "exclude", [""], "left out"), *NOT_THE_SESSION}
         self._refused: set[str] = set()
         self._subscribed: set[str] = set()
         self._writer = BagWriter(file, compression=compression)
@@ -43,10 +43,6 @@ class SessionRecorder(Node):
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._flush)
         self.get_logger().info(f"recording to {file}")
-
-    def _declared(self, name: str, value: Any, description: str) -> Any:
-        descriptor = ParameterDescriptor(description=description, read_only=True)
-        return self.declare_parameter(name, value, descriptor).value
 
     def _discover(self) -> None:
         """Subscribe to what has appeared."""
