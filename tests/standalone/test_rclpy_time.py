@@ -187,7 +187,7 @@ def test_use_sim_time_can_be_switched_and_must_be_a_bool(bench) -> None:
     assert not node.get_clock().ros_time_is_active
     assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
     assert node.get_clock().ros_time_is_active
-    assert node.count_subscribers("/clock") == 1
+    assert bench.spin_until(lambda: node.count_subscribers("/clock") == 1)
     assert node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
     assert not node.get_clock().ros_time_is_active
     assert node.get_clock().now().nanoseconds > 10**18

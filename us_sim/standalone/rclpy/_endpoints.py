@@ -69,9 +69,13 @@ class _TopicEndpoint(_Endpoint):
         return self._name
 
     def add_event_listener(self, kind: str, listener: Listener) -> None:
-        """Have a kind of event reported, from the transport's thread."""
+        """Have a kind of event reported, from the transport's thread, once `listen` was called."""
         self._listeners[kind] = listener
-        self._endpoint.on_event = self._dispatch
+
+    def listen(self) -> None:
+        """Report events from now on, those before included."""
+        if self._listeners:
+            self._endpoint.on_event = self._dispatch
 
     def remove_event_listener(self, kind: str) -> None:
         """The counterpart of `add_event_listener`."""

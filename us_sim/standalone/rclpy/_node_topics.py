@@ -79,6 +79,7 @@ class NodeTopics(NodeParts, NodeDeclarations):
             raise
         self._publishers.append(publisher)
         self._waitables.extend(publisher.event_handlers)
+        handle.listen()
         self._local_node.writers.append(handle.gid)
         self._joined()
         return publisher
@@ -134,6 +135,7 @@ class NodeTopics(NodeParts, NodeDeclarations):
         group.add_entity(subscription)
         self._subscriptions.append(subscription)
         self._waitables.extend(subscription.event_handlers)
+        handle.listen()
         self._local_node.readers.append(handle.gid)
         self._joined()
         return subscription
