@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
@@ -21,7 +22,10 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     A node with a ``finished`` future ends when that is done. Bad input is one sentence on stderr
     and exit status 1.
     """
-    rclpy.init(args=args)
+    try:
+        rclpy.init(args=args)
+    except Exception as error:  # what rcl raises for bad arguments differs between its versions
+        return _refused(error)
     node: Any = None
     try:
         node = create()
@@ -32,11 +36,16 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
             rclpy.spin_until_future_complete(node, finished)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except UsSimError as error:
-        print(f"us_sim: {error}", file=sys.stderr, flush=True)
-        return 1
+    except (UsSimError, ParameterException) as error:
+        return _refused(error)
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _refused(error: Exception) -> int:
+    """One sentence on stderr; the exit status for bad input."""
+    print(f"us_sim: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+    return 1

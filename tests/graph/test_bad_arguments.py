@@ -1,0 +1,44 @@
+"""Nodes given what they cannot use: one sentence, status 1, no traceback."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "words"),
+    [
+        ("slice_interpolator", ["-p", "scene:=nowhere"], "there is no scene file nowhere"),
+        ("slice_interpolator", ["-p", "scene:=liver_sweep"], "volume.file: is missing"),
+        (
+            "slice_interpolator",
+            ["-p", "scene:=liver_sweep", "-p", "volume:=BROKEN"],
+            "broken.mha",
+        ),
+        ("tissue_deformer", ["-p", "lockstep:=5"], "lockstep"),
+        ("tissue_deformer", ["-p", "solver:=magic"], "magic"),
+        ("slice_interpolator", ["-p", "threads:=0"], "threads is 0; it must be from 1 to 256"),
+        ("path_player", ["-p", "path:=nowhere.mcap"], "nowhere.mcap"),
+        ("path_player", ["-p", "rate:=-1.0"], "rate"),
+        ("session_recorder", ["-p", "file:=/proc/nowhere/x.mcap"], "/proc/nowhere"),
+        ("session_recorder", ["-p", "compression:=rar"], "rar"),
+        ("probe_tracker", ["-r", "no remapping"], "no remapping"),
+    ],
+)
+def test_a_node_refuses_in_one_sentence(node, arguments, words, tmp_path):
+    volume = tmp_path / "broken.mha"
+    volume.write_bytes(b"ObjectType = Image\nNDims = 3\n")
+    arguments = [argument.replace("BROKEN", str(volume)) for argument in arguments]
+    result = subprocess.run(
+        [sys.executable, "-m", f"us_sim.nodes.{node}", "--ros-args", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 1, result.stderr
+    said = [line for line in result.stderr.splitlines() if line.startswith("us_sim: ")]
+    assert len(said) == 1, result.stderr
+    assert words in said[0]
+    assert "Traceback" not in result.stderr
