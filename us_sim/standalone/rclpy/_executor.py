@@ -55,7 +55,8 @@ class TimeoutObject:
         self.timeout = timeout
 
 
-def _never() -> bool:
+def never() -> bool:
+    """The condition of a wait that nothing but readiness and time ends."""
     return False
 
 
@@ -163,7 +164,7 @@ class Executor(AbstractContextManager["Executor"]):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run one callback, waiting for one to be ready until the time is over."""
-        self._spin_once(timeout_sec, _never)
+        self._spin_once(timeout_sec, never)
 
     def spin_once_until_future_complete(
         self, future: Future, timeout_sec: float | TimeoutObject | None = None
@@ -209,7 +210,7 @@ class Executor(AbstractContextManager["Executor"]):
         self,
         timeout_sec: float | TimeoutObject | None = None,
         nodes: "list[Node] | None" = None,
-        condition: Callable[[], bool] = _never,
+        condition: Callable[[], bool] = never,
     ) -> Generator[Work, None, None]:
         timeout = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
         deadline = None if timeout is None or timeout < 0 else time.monotonic() + timeout

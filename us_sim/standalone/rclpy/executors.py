@@ -13,6 +13,7 @@ from ._executor import (
     TimeoutException,
     TimeoutObject,
     Work,
+    never,
 )
 from .context import Context
 from .task import Task
@@ -77,6 +78,8 @@ class MultiThreadedExecutor(Executor):
     def _spin_once(
         self, timeout_sec: float | TimeoutObject | None, condition: Callable[[], bool]
     ) -> None:
+        if condition is never:
+            condition = self._has_failures
         try:
             work = self.wait_for_ready_callbacks(timeout_sec, None, condition)
         except (
@@ -95,6 +98,9 @@ class MultiThreadedExecutor(Executor):
         if work[0]._exception is not None:
             self._failed.append(work[0])
             self.wake()
+
+    def _has_failures(self) -> bool:
+        return bool(self._failed)
 
     def _raise_failures(self) -> None:
         if self._failed:
