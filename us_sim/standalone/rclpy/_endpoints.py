@@ -1,4 +1,4 @@
-"""What stands behind publishers, subscriptions, clients and services: DDS readers and writers.
+"""What stands behind publishers and subscriptions: DDS writers and readers.
 
 Readers say from the transport's thread that data may be waiting; executors take it in their own.
 """
@@ -8,19 +8,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..messages import CdrError, deserialize, serialize, type_hash
-from ..services import RequestHeader, ServiceClient, ServiceServer
 from ..transport import DdsError, EndpointEvent
 from ._context_handle import ContextHandle
-from ._rclpy_pybind11 import (
-    InvalidHandle,
-    RCLError,
-    rmw_request_id_t,
-    rmw_service_info_t,
-)
+from ._rclpy_pybind11 import InvalidHandle, RCLError
 from .duration import Duration
 from .qos import QoSProfile
 
-__all__ = ["ClientHandle", "NodeLink", "PublisherHandle", "ServiceHandle", "SubscriptionHandle"]
+__all__ = [
+    "Endpoint",
+    "Inbox",
+    "NodeLink",
+    "PublisherHandle",
+    "SubscriptionHandle",
+    "message_of",
+]
 
 Listener = Callable[[EndpointEvent], None]
 
@@ -34,8 +35,8 @@ class NodeLink:
     wake: Callable[[], None]
 
 
-class _Endpoint:
-    """Common to all four: it exists until `destroy`."""
+class Endpoint:
+    """Common to publishers, subscriptions, clients and services: it exists until `destroy`."""
 
     def __init__(self, link: NodeLink, name: str) -> None:
         self.logger_name = link.logger_name
@@ -49,7 +50,7 @@ class _Endpoint:
             raise InvalidHandle("cannot use Destroyable because destruction was requested")
 
 
-class _TopicEndpoint(_Endpoint):
+class _TopicEndpoint(Endpoint):
     """A reader or a writer of a topic, and who listens to what happens to it."""
 
     _endpoint: Any
@@ -132,7 +133,7 @@ class PublisherHandle(_TopicEndpoint):
         return self._endpoint.wait_for_acked(timeout.nanoseconds / 1e9)
 
 
-class _Inbox:
+class Inbox:
     """Serialized data that may be waiting: `ready` says whether to look, `fetch` looks.
 
     What was fetched is kept until it is taken, so that an executor can be sure before it commits.
@@ -170,7 +171,7 @@ class SubscriptionHandle(_TopicEndpoint):
     def __init__(self, link: NodeLink, msg_type: Any, topic: str, qos: QoSProfile) -> None:
         super().__init__(link, topic)
         self._endpoint = link.context.participant.create_reader(*_topic(topic, msg_type, qos))
-        self.inbox = _Inbox(self._endpoint.take, self._wake)
+        self.inbox = Inbox(self._endpoint.take, self._wake)
         self._endpoint.on_data = self.inbox.notify
 
     def take_message(self, msg_type: Any, raw: bool) -> tuple[Any, dict[str, Any]] | None:
@@ -180,7 +181,7 @@ class SubscriptionHandle(_TopicEndpoint):
         if taken is None:
             return None
         data, info = taken
-        return data if raw else _message(data, msg_type), {
+        return data if raw else message_of(data, msg_type), {
             "source_timestamp": info.source_timestamp,
             "received_timestamp": info.received_timestamp,
             "publication_sequence_number": None,
@@ -193,106 +194,8 @@ class SubscriptionHandle(_TopicEndpoint):
         return self._endpoint.matched_count()
 
 
-class _ServiceEndpoint(_Endpoint):
-    """One side of a service: a reader of one topic and a writer of another."""
-
-    _endpoint: ServiceClient | ServiceServer
-    inbox: _Inbox
-
-    @property
-    def gids(self) -> tuple[bytes, bytes]:
-        """Of the reader and of the writer."""
-        return self._endpoint.reader_gid, self._endpoint.writer_gid
-
-    def destroy(self) -> None:
-        """Leave both topics."""
-        if not self._destroyed:
-            self._destroyed = True
-            self._endpoint.close()
-
-
-class ClientHandle(_ServiceEndpoint):
-    """Sends requests and reads responses."""
-
-    def __init__(self, link: NodeLink, srv_type: Any, name: str, qos: QoSProfile) -> None:
-        super().__init__(link, name)
-        self._client = ServiceClient(link.context.participant, name, srv_type.__msgtype__, qos)
-        self._endpoint = self._client
-        self.inbox = _Inbox(self._client.take_response, self._wake)
-        self._client.on_data = self.inbox.notify
-
-    @property
-    def service_name(self) -> str:
-        self._require_existence()
-        return self._name
-
-    def send_request(self, request: Any) -> int:
-        """Send a request; the response will have the same sequence number."""
-        self._require_existence()
-        if not self._context.ok():
-            raise RCLError("failed to send request: the client's context is invalid")
-        return self._client.send_request(serialize(request))
-
-    def take_response(self, response_type: Any) -> tuple[rmw_service_info_t | None, Any]:
-        """A response that came, and to which request."""
-        self._require_existence()
-        taken = self.inbox.take()
-        if taken is None:
-            return None, None
-        data, header = taken
-        return _service_info(header), _message(data, response_type)
-
-    def service_server_is_available(self) -> bool:
-        """Whether a service is connected in both directions."""
-        self._require_existence()
-        return self._client.service_is_ready()
-
-
-class ServiceHandle(_ServiceEndpoint):
-    """Reads requests and sends responses."""
-
-    def __init__(self, link: NodeLink, srv_type: Any, name: str, qos: QoSProfile) -> None:
-        super().__init__(link, name)
-        self._server = ServiceServer(link.context.participant, name, srv_type.__msgtype__, qos)
-        self._endpoint = self._server
-        self.inbox = _Inbox(self._server.take_request, self._wake)
-        self._server.on_data = self.inbox.notify
-
-    @property
-    def name(self) -> str:
-        self._require_existence()
-        return self._name
-
-    def service_take_request(self, request_type: Any) -> tuple[Any, rmw_service_info_t | None]:
-        """A request that came, and whose it is."""
-        self._require_existence()
-        taken = self.inbox.take()
-        if taken is None:
-            return None, None
-        data, header = taken
-        return _message(data, request_type), _service_info(header)
-
-    def service_send_response(self, response: Any, request_id: rmw_request_id_t) -> None:
-        """Answer a request; nothing happens when the client has gone."""
-        self._require_existence()
-        if self._context.ok() and isinstance(request_id, _RequestId):
-            self._server.send_response(serialize(response), request_id.header)
-
-
-@dataclass(frozen=True)
-class _RequestId(rmw_request_id_t):
-    header: Any = None  # RequestHeader
-
-
-def _service_info(header: RequestHeader) -> rmw_service_info_t:
-    return rmw_service_info_t(
-        source_timestamp=header.source_timestamp,
-        received_timestamp=header.received_timestamp,
-        request_id=_RequestId(header.sequence, header.client, header),
-    )
-
-
-def _message(data: bytes, cls: Any) -> Any:
+def message_of(data: bytes, cls: Any) -> Any:
+    """The message that was received; raises RCLError when the bytes are none of the class."""
     try:
         return deserialize(data, cls)
     except CdrError as error:

@@ -11,6 +11,13 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from ._executor_outcomes import (
+    ConditionReachedException,
+    ExternalShutdownException,
+    ShutdownException,
+    TimeoutException,
+    TimeoutObject,
+)
 from ._executor_work import WorkTracker, take_call
 from ._readiness import ready_entities, time_to_wait
 from ._wake_up import WakeUp
@@ -22,37 +29,7 @@ from .utilities import get_default_context
 if TYPE_CHECKING:
     from .node import Node
 
-__all__ = [
-    "ConditionReachedException",
-    "Executor",
-    "ExternalShutdownException",
-    "ShutdownException",
-    "TimeoutException",
-    "TimeoutObject",
-]
-
-
-class TimeoutException(Exception):
-    """Nothing was ready in time."""
-
-
-class ShutdownException(Exception):
-    """The executor was shut down."""
-
-
-class ExternalShutdownException(Exception):
-    """The context was shut down."""
-
-
-class ConditionReachedException(Exception):
-    """What was waited for happened."""
-
-
-class TimeoutObject:
-    """A timeout that its owner may change between waits."""
-
-    def __init__(self, timeout: float):
-        self.timeout = timeout
+__all__ = ["Executor", "Work", "never"]
 
 
 def never() -> bool:

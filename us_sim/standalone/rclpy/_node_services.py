@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from ._endpoints import ClientHandle, ServiceHandle
 from ._node_parts import NodeParts
+from ._service_endpoints import ClientHandle, ServiceHandle
 from ._type_support import require_service_class
 from .callback_groups import CallbackGroup
 from .client import Client

@@ -1,19 +1,25 @@
-"""Executors: they wait until something is ready and run its callback."""
+"""Executors: they wait until something is ready and run its callback.
+
+>>> from us_sim.standalone.rclpy.context import Context
+>>> with Context() as context, SingleThreadedExecutor(context=context) as executor:
+...     task = executor.create_task(max, 3, 5)
+...     executor.spin_once(timeout_sec=1.0)
+>>> task.result()
+5
+"""
 
 import os
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from ._executor import (
+from ._executor import Executor, Work, never
+from ._executor_outcomes import (
     ConditionReachedException,
-    Executor,
     ExternalShutdownException,
     ShutdownException,
     TimeoutException,
     TimeoutObject,
-    Work,
-    never,
 )
 from .context import Context
 from .task import Task
