@@ -20,7 +20,8 @@ FOLDER = Path(__file__).resolve().parent
 def console_scripts() -> list[str]:
     """`us-sim` alone in a wheel; also every node where colcon installs into lib/us_sim.
 
-    colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel, whose scripts all land on PATH.
+    colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel, all of whose scripts
+    land on PATH.
     """
     scripts = ["us-sim = us_sim.cli:main"]
     if {"install", "develop"} & set(sys.argv):

@@ -124,7 +124,7 @@ def test_the_installed_scenes_are_valid(tmp_path):
     volume.touch()
     assert load_scene("upper_arm").tissue is not None
     assert load_scene("liver_sweep", volume=volume).volume.file == str(volume)
-    with pytest.raises(SceneError, match="volume.file: is missing"):
+    with pytest.raises(SceneError, match=r"volume\.file: is missing"):
         load_scene("liver_sweep")
     for file in shared_path("config/scenes").glob("*.yaml"):
         load_scene(file, volume=volume)
