@@ -10,9 +10,11 @@ from us_sim.errors import PoseError
 from us_sim.pose import Pose
 
 numbers = st.floats(-1.0, 1.0)
-poses = st.tuples(
-    st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers, numbers)
-).filter(lambda p: np.linalg.norm(p[1]) > 1e-3).map(lambda p: Pose(*p))
+poses = (
+    st.tuples(st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers, numbers))
+    .filter(lambda p: np.linalg.norm(p[1]) > 1e-3)
+    .map(lambda p: Pose(*p))
+)
 quick = settings(max_examples=50, deadline=None)
 
 
