@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Int32MultiArray
 from visualization_msgs.msg import Marker
@@ -103,6 +103,7 @@ def test_a_marker_has_each_corner_of_each_triangle(frame, count):
     assert marker.header.frame_id == frame
     assert (marker.ns, marker.colors, marker.text) == ("skin", [], "")
     assert marker.pose.orientation.w == 1.0
+    assert len(serialize_message(marker)) == len(surface_marker(vertices, triangles, STAMP, frame))
 
 
 def test_a_mesh_has_vertices_and_triangles():

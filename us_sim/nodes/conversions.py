@@ -6,13 +6,13 @@ element.
 
 from __future__ import annotations
 
+import struct
 from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStamped
 from numpy.typing import NDArray
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Int32MultiArray, MultiArrayDimension
@@ -36,7 +36,13 @@ __all__ = [
     "wrench_message",
 ]
 
-_PLACEHOLDER = np.array([1.25, 2.25, 3.25], dtype="<f8")
+_CDR_LITTLE_ENDIAN = b"\0\1\0\0"
+_EMPTY = (1, b"\0")  # a string
+_MARKER_TAIL = struct.pack(
+    "@II1siII1sI1sIII1sI1sI1sI?",
+    *(0, *_EMPTY, 0, 0, *_EMPTY, *_EMPTY, 0, 0, *_EMPTY, *_EMPTY, *_EMPTY, 0, False),
+)
+"""What a Marker has after its points: colors, textures, text and meshes, all empty."""
 
 
 def pose_from(message: PoseStamped) -> Pose:
@@ -203,34 +209,21 @@ def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer])
 def surface_marker(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], stamp: Time, frame: str
 ) -> bytes:
-    """A skin-coloured TRIANGLE_LIST, serialized.
+    """A skin-coloured TRIANGLE_LIST marker, serialized.
 
-    A marker holds three Point objects a triangle, too slow to make one by one. So a marker of a
-    single point is serialized, and that point replaced by all of them: points are 8-byte aligned
-    and a multiple of 8 bytes long, so what follows stays as it is.
+    It holds three Point objects a triangle, too slow to make one by one. So the CDR is written
+    here: native alignment in `struct` is CDR's, and ``0d`` aligns what follows.
     """
-    marker = Marker()
-    marker.header.stamp = stamp
-    marker.header.frame_id = frame
-    marker.ns = "skin"
-    marker.type = Marker.TRIANGLE_LIST
-    marker.action = Marker.ADD
-    marker.scale.x = marker.scale.y = marker.scale.z = 1.0
-    marker.color.r, marker.color.g, marker.color.b, marker.color.a = 0.85, 0.65, 0.55, 0.9
-    marker.points = [Point(x=_PLACEHOLDER[0], y=_PLACEHOLDER[1], z=_PLACEHOLDER[2])]
-    single = serialize_message(marker)
-    begin = single.index(_PLACEHOLDER.tobytes())
-    count = single.rindex(b"\x01\0\0\0", 0, begin)
-    points = np.ascontiguousarray(vertices[triangles.ravel()], dtype="<f8")
-    return b"".join(
-        [
-            single[:count],
-            len(points).to_bytes(4, "little"),
-            single[count + 4 : begin],
-            points.tobytes(),
-            single[begin + _PLACEHOLDER.nbytes :],
-        ]
+    points = np.ascontiguousarray(vertices[triangles.ravel()], dtype=np.float64)
+    name, place = b"skin\0", frame.encode() + b"\0"
+    identity, scale, colour = (0, 0, 0, 0, 0, 0, 1), (1, 1, 1), (0.85, 0.65, 0.55, 0.9)
+    head = struct.pack(
+        f"@iII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if len(points) else ""),
+        *(stamp.sec, stamp.nanosec, len(place), place, len(name), name),
+        *(0, Marker.TRIANGLE_LIST, Marker.ADD, *identity, *scale, *colour),
+        *(0, 0, False, len(points)),
     )
+    return b"".join([_CDR_LITTLE_ENDIAN, head, points.tobytes(), _MARKER_TAIL])
 
 
 def _points(vertices: NDArray[np.floating]) -> list[Point]:

@@ -1,0 +1,43 @@
+"""What the README shows works as it is written there."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from us_sim.cli import main
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_script_makes_an_image():
+    (script,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    names: dict = {}
+    exec(script, names)
+    assert names["image"].shape == (512, 512)
+    assert names["image"].std() > 20
+    assert names["deformation"].force[2] < 0
+
+
+COMMANDS = sorted(
+    {
+        tuple(shlex.split(command)[1:])
+        for command in re.findall(r"(?:`|&& |^)(us-sim [^`\n|]*)", README, re.MULTILINE)
+    }
+)
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_and_option_exists(words, capsys):
+    verbs = [word for word in words[:2] if word in ("demo", "run", "render", "play", "bag", "info")]
+    with pytest.raises(SystemExit):
+        main([*verbs, "--help"])
+    help_text = capsys.readouterr().out
+    for option in (word.strip("[]") for word in words if word.strip("[").startswith("--")):
+        assert option in help_text
+
+
+def test_pictures_are_there():
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README):
+        assert (Path(__file__).resolve().parents[1] / picture).is_file(), picture
