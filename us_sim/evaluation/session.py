@@ -18,6 +18,7 @@ from us_sim.pose import Pose
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene import Scene
 from us_sim.slicing.row_subdivision import RowSubdivision
+from us_sim.volume.measure import label_area
 
 __all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
 
@@ -123,7 +124,7 @@ class Session:
         for done, stamp in enumerate(chosen, start=1):
             labels = cutter.labels(self.nodes[stamp], probe.plane(self.poses[stamp]))
             for name in vessels:
-                area[name].append(float(np.count_nonzero(labels == numbers[name])) * pixel)
+                area[name].append(label_area(labels, numbers[name], pixel))
             if progress is not None:
                 progress(done / len(chosen))
         first = min(self.poses)

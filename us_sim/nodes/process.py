@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 import rclpy
@@ -22,6 +24,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     A node with a ``finished`` future ends when that is done. Bad input is one sentence on stderr
     and exit status 1.
     """
+    signal.signal(signal.SIGINT, _interrupt_once)
     try:
         rclpy.init(args=args)
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
@@ -42,7 +45,14 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a late one would spoil the exit status
     return 0
+
+
+def _interrupt_once(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+    """Ctrl-C; a second one, such as launch's after the terminal's, must not break off the end."""
+    signal.signal(signal.SIGINT, lambda *_: None)
+    raise KeyboardInterrupt
 
 
 def _refused(error: Exception) -> int:
