@@ -7,6 +7,9 @@ from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from us_sim.assembly import path_of
+from us_sim.errors import UsSimError
+from us_sim.graph import player_settings
 from us_sim.scene_file import load_scene
 from us_sim.share import shared_path
 
@@ -29,16 +32,28 @@ def nodes(context):
             actions.append(LogInfo(msg=f"{part.node} is left out: {part.reason}"))
     if path:
         bag = Path(path).expanduser()
-        bag = bag if bag.exists() else shared_path(f"bags/{path}")
-        awaited = ["probe/pose", "ultrasound/image"]
-        actions.append(node("path_player", {"path": str(bag.resolve()), "await_topics": awaited}))
+        installed = shared_path("bags") / path
+        if installed.exists() and not bag.exists():
+            bag = installed
+        path_of(scene, bag)  # what is wrong with it is better said before anything starts
+        actions.append(node("path_player", player_settings(scene, bag, recorded=bool(record))))
     return actions
 
 
 def node(name, parameters):
-    """A node of this package."""
+    """A node of this package; when it fails, the launch fails."""
+
+    def ended(event, context):
+        if event.returncode and not context.is_shutdown:
+            raise UsSimError(f"{name} ended with status {event.returncode}; see what it said above")
+
     return Node(
-        package="us_sim", executable=name, name=name, parameters=[parameters], output="screen"
+        package="us_sim",
+        executable=name,
+        name=name,
+        parameters=[parameters],
+        output="screen",
+        on_exit=ended,
     )
 
 

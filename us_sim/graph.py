@@ -17,7 +17,14 @@ from typing import IO
 from us_sim.errors import UsSimError
 from us_sim.scene import Scene
 
-__all__ = ["NodeProcess", "Parameters", "ProcessGroup", "keep_on_this_host", "simulation_nodes"]
+__all__ = [
+    "NodeProcess",
+    "Parameters",
+    "ProcessGroup",
+    "keep_on_this_host",
+    "player_settings",
+    "simulation_nodes",
+]
 
 Parameters = dict[str, dict[str, str]]
 """Parameters given by a person: YAML texts by node and name."""
@@ -66,6 +73,18 @@ def simulation_nodes(scene: Scene, parameters: Parameters | None = None) -> list
             f"{', '.join(process.node for process in nodes)}"
         )
     return nodes
+
+
+def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:
+    """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
+    topics = ["tracker/pose", "probe/pose", "ultrasound/image"]
+    topics += ["tissue/nodes"] if scene.tissue else []
+    topics += ["skin/nodes"] if scene.skin else []
+    return {
+        "path": str(path.expanduser().resolve()),
+        "await_topics": topics,
+        "await_subscriber": "session_recorder" if recorded else "",
+    }
 
 
 def keep_on_this_host(*, network: bool) -> None:

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from us_sim.assembly import path_of
 from us_sim.errors import UsSimError
-from us_sim.graph import NodeProcess, Parameters, ProcessGroup, simulation_nodes
+from us_sim.graph import (
+    NodeProcess,
+    Parameters,
+    ProcessGroup,
+    player_settings,
+    simulation_nodes,
+)
 from us_sim.progress import Progress
 from us_sim.scene import Scene
 
@@ -19,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Monitored", "Plan", "follow", "plan_of"]
 
-SETTLE_S = 1.3
+SETTLE_S = 1.2
 """After the path's end: the last images, and each node's last report, which comes every second."""
 START_LIMIT_S = 300.0
 LOOK_AROUND_S = 0.4
@@ -60,14 +66,7 @@ def plan_of(
     poses = None
     if path is not None:
         poses = len(path_of(scene, path, player.get("topic")))
-        topics = ["tracker/pose", "probe/pose", "ultrasound/image"]
-        topics += ["tissue/nodes"] if scene.tissue else []
-        topics += ["skin/nodes"] if scene.skin else []
-        settings = {
-            "path": str(path.expanduser().resolve()),
-            "await_topics": topics,
-            "await_subscriber": "session_recorder" if record is not None else "",
-        }
+        settings = player_settings(scene, path, recorded=record is not None)
         processes.append(NodeProcess("path_player", settings, player))
     return Plan(scene, processes, poses, duration)
 

@@ -1,5 +1,6 @@
 """Ctrl-C at any moment: every process ends within two seconds, and the recording can be read."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -51,6 +52,29 @@ def test_ctrl_c(played_scene, tmp_path, images):
     assert demo.returncode == 130
     assert b"Traceback" not in demo.stderr.read()
     assert image_count(recording) >= images
+
+
+def test_more_than_one_ctrl_c_does_not_break_off_the_end(tmp_path):
+    recording = tmp_path / "session.mcap"
+    command = [sys.executable, "-m", "us_sim.nodes.session_recorder", "--ros-args"]
+    command += ["-p", f"file:={recording}"]
+    node = subprocess.Popen(command, stderr=subprocess.PIPE)
+    try:
+        deadline = time.monotonic() + 30
+        while image_count(recording) < 0:
+            assert node.poll() is None, node.stderr.read().decode()
+            assert time.monotonic() < deadline
+            os.sched_yield()
+        while node.poll() is None:
+            assert time.monotonic() < deadline
+            node.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                node.wait(0.003)
+    finally:
+        node.kill()
+    assert node.returncode == 0
+    assert node.stderr.read() == b""
+    assert (tmp_path / "metadata.yaml").is_file()
 
 
 def image_count(recording: Path) -> int:

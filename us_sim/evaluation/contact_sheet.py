@@ -30,10 +30,11 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     grid = figure.add_gridspec(rows, 3, height_ratios=[1.0, 1.0, 0.55][:rows])
     width, depth = scene.probe.aperture * 1e3, scene.probe.depth * 1e3
     first = min(session.poses)
+    images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
         axes = figure.add_subplot(grid[divmod(i, 3)])
         axes.imshow(
-            session.image(stamp),
+            images[stamp],
             cmap="gray",
             vmin=0,
             vmax=255,

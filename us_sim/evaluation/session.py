@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,17 +90,21 @@ class Session:
         )
         return float(p50), float(p99)
 
-    def image(self, stamp: int) -> NDArray[np.uint8]:
-        """The image with that stamp, (rows, columns).
+    def images_at(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
+        """The images with those stamps, (rows, columns) each, read in one pass.
 
         Raises:
-            BagError: there is none.
+            BagError: there is none with one of the stamps.
         """
+        found: dict[int, NDArray[np.uint8]] = {}
         for message in self.bag.messages(["/ultrasound/image"]):
             decoded: Any = self.bag.deserialize(message)
-            if _stamp(decoded) == stamp:
-                return pixels_from(decoded)
-        raise BagError(f"the session has no image with stamp {stamp}")
+            if _stamp(decoded) in stamps:
+                found[_stamp(decoded)] = pixels_from(decoded)
+        for stamp in stamps:
+            if stamp not in found:
+                raise BagError(f"the session has no image with stamp {stamp}")
+        return found
 
     def lumen_areas(
         self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
