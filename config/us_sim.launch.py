@@ -23,8 +23,10 @@ def nodes(context):
     parameters = {"scene": scene.origin, "volume": scene.volume.file or ""}
     actions = []
     if record:
-        file = str(Path(record).expanduser().resolve())
-        actions.append(node("session_recorder", {"file": file}))
+        file = Path(record).expanduser().resolve()
+        if file.exists():
+            raise UsSimError(f"{file} exists already: choose another name or remove it")
+        actions.append(node("session_recorder", {"file": str(file)}))
     for part in scene.parts():
         if part.needed:
             actions.append(node(part.node, parameters))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 
@@ -99,10 +100,12 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
         count = len(read_path(bag, topic or None))
         process = NodeProcess("path_player", settings | {"topic": topic})
     group = ProcessGroup()
-    monitor = Monitored([process.node])
     try:
-        group.start([process])
-        with Progress("playing", count, "messages") as bar:
+        with (
+            contextlib.closing(Monitored([process.node])) as monitor,
+            Progress("playing", count, "messages") as bar,
+        ):
+            group.start([process])
             while group.is_running(process.node):
                 monitor.spin()
                 report = monitor.node.reports.get(process.node, {})
@@ -112,7 +115,6 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
             bar.update(count)
     finally:
         group.stop()
-        monitor.close()
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from dataclasses import dataclass
@@ -125,25 +126,30 @@ def follow(plan: Plan, log: Path | None) -> float:
         UsSimError: a node fails or does not start, or another simulation runs on this domain.
     """
     group = ProcessGroup(log)
-    monitor = Monitored(plan.nodes)
     try:
-        monitor.refuse_company()
-        began = time.monotonic()
-        group.start(plan.processes)
-        with Progress("starting (the first run compiles)", len(plan.nodes), "nodes") as bar:
-            while monitor.waiting:
-                monitor.spin()
-                group.check()
-                waiting = monitor.waiting
-                bar.update(len(plan.nodes) - len(waiting), ", ".join(waiting))
-                if time.monotonic() - began > START_LIMIT_S:
-                    raise UsSimError(f"{', '.join(waiting)} did not start in {START_LIMIT_S:g} s")
-        startup = time.monotonic() - began
-        _stay(plan, group, monitor)
+        # The monitor goes first: it would wait for what a killed node never acknowledges.
+        with contextlib.closing(Monitored(plan.nodes)) as monitor:
+            monitor.refuse_company()
+            began = time.monotonic()
+            group.start(plan.processes)
+            _await_all(group, monitor, began)
+            startup = time.monotonic() - began
+            _stay(plan, group, monitor)
     finally:
         group.stop()
-        monitor.close()
     return startup
+
+
+def _await_all(group: ProcessGroup, monitor: Monitored, began: float) -> None:
+    """Until every node has reported."""
+    with Progress("starting (the first run compiles)", len(monitor.names), "nodes") as bar:
+        while monitor.waiting:
+            monitor.spin()
+            group.check()
+            waiting = monitor.waiting
+            bar.update(len(monitor.names) - len(waiting), ", ".join(waiting))
+            if time.monotonic() - began > START_LIMIT_S:
+                raise UsSimError(f"{', '.join(waiting)} did not start in {START_LIMIT_S:g} s")
 
 
 def _stay(plan: Plan, group: ProcessGroup, monitor: Monitored) -> None:

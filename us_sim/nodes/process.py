@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
 from collections.abc import Callable
-from types import FrameType
 from typing import Any
 
 import rclpy
@@ -17,6 +17,8 @@ from us_sim.errors import UsSimError
 
 __all__ = ["run_node"]
 
+_ENDINGS = (signal.SIGINT, signal.SIGTERM)
+
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
@@ -24,7 +26,8 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     A node with a ``finished`` future ends when that is done. Bad input is one sentence on stderr
     and exit status 1.
     """
-    signal.signal(signal.SIGINT, _interrupt_once)
+    for number in _ENDINGS:
+        signal.signal(number, _interrupt_once)
     try:
         rclpy.init(args=args)
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
@@ -41,17 +44,25 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         return 0
     except (UsSimError, ParameterException) as error:
         return _refused(error)
+    except Exception:
+        if rclpy.ok():
+            raise
+        return 0  # a compiler, say, that a signal breaks off fails with an error of its own
     finally:
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a late one would spoil the exit status
+        with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
+            rclpy.try_shutdown()
+        for number in _ENDINGS:
+            signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
     return 0
 
 
-def _interrupt_once(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    """Ctrl-C; a second one, such as launch's after the terminal's, must not break off the end."""
-    signal.signal(signal.SIGINT, lambda *_: None)
+def _interrupt_once(*_: object) -> None:
+    """End the node; a second signal, such as launch's after the terminal's, must not disturb it."""
+    for number in _ENDINGS:
+        signal.signal(number, lambda *_: None)
+    sys.unraisablehook = lambda _: None  # a compiler's callback has nobody to pass this on to
     raise KeyboardInterrupt
 
 
