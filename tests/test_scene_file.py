@@ -75,6 +75,11 @@ def test_units_are_si_inside():
         ("skin.file", "nowhere.obj", "skin.file: there is no file .*nowhere.obj"),
         ("tissue.mesh.upper", [1, 1, -1], r"tissue.mesh.upper\[2\]: -1 m is not above"),
         ("tissue.mesh.planes", {"x": [0, 0]}, "tissue.mesh.planes.x: needs two or more rising"),
+        (
+            "tissue.mesh.planes",
+            {"x": [-0.02, 0, 0.01]},
+            "tissue.mesh.planes.x: must be 3 coordinates from -0.02 to 0.02 m",
+        ),
         ("tissue.mesh.planes", {"w": [0, 1]}, "tissue.mesh.planes: unknown axis `w`"),
         ("tissue.mesh", 3, "tissue.mesh: must be a mapping of keys, not 3"),
         ("tissue.solver", "magic", "tissue.solver: 'magic' is not one of fem_cg, msds"),
@@ -108,6 +113,9 @@ def test_a_broken_file_is_named_with_its_line(tmp_path):
         load_scene(file)
     file.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match=r"broken.yaml"):
+        load_scene(file)
+    file.write_text("")
+    with pytest.raises(SceneError, match="is empty; a scene has at least name, volume and probe"):
         load_scene(file)
     file.write_text("just text")
     with pytest.raises(SceneError, match=r"must be a mapping of keys, not 'just text'"):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim import __version__
 from us_sim.errors import UsSimError
+from us_sim.share import find_bag
 
 __all__ = ["main"]
 
@@ -16,6 +18,8 @@ __all__ = ["main"]
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
     parsed = _parser().parse_args(args)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
     try:
         return int(parsed.command(parsed) or 0)
     except UsSimError as error:
@@ -27,6 +31,15 @@ def main(args: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
+
+
+def _interrupt(*_: object) -> None:
+    """End as on Ctrl-C, so that no node outlives the command."""
+    raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -38,7 +51,12 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser("demo", help="press on the virtual arm; images, summary, recording")
     demo.add_argument("scene", nargs="?", default="upper_arm", help="scene file or name")
-    demo.add_argument("--out", type=Path, default=Path("us_sim_demo"), help="folder to write to")
+    demo.add_argument(
+        "--out",
+        type=Path,
+        default=Path("us_sim_demo"),
+        help="folder to write to; default: %(default)s",
+    )
     _scene_options(demo)
     _live_options(demo)
     demo.set_defaults(command=_demo)
@@ -47,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("scene", help="scene file, or name of an installed one")
     run.add_argument("--record", type=Path, metavar="FILE", help="record the session to this MCAP")
     run.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
-    run.add_argument("--path", type=Path, metavar="BAG", help="play this bag's probe path")
+    run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
     _scene_options(run)
     _live_options(run)
@@ -55,13 +73,15 @@ def _parser() -> argparse.ArgumentParser:
 
     render = commands.add_parser("render", help="one image for every pose of a path, repeatably")
     render.add_argument("scene", help="scene file, or name of an installed one")
-    render.add_argument("--path", type=Path, metavar="BAG", help="bag with the probe path")
+    render.add_argument(
+        "--path", type=find_bag, metavar="BAG", help="bag with the probe path; default: the scene's"
+    )
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     _scene_options(render)
     render.set_defaults(command=_render)
 
     play = commands.add_parser("play", help="play a bag's probe path into a running simulation")
-    play.add_argument("bag", type=Path)
+    play.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
     play.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
     play.add_argument("--rate", type=float, default=1.0, help="speed factor")
     play.add_argument("--loop", action="store_true", help="start again at the end")
@@ -106,6 +126,10 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.duration is not None and not args.duration > 0:
         raise UsSimError(f"--duration {args.duration:g}: must be more than 0 seconds")
+    if args.record is not None and args.record.suffix != ".mcap":
+        raise UsSimError(f"--record {args.record}: must be a file that ends in .mcap")
+    if args.record is not None and args.record.exists():
+        raise UsSimError(f"--record {args.record}: exists already; choose another name")
     scene = load_scene(args.scene, volume=args.volume)
     parameters = _parameters(args.param)
     if args.dry_run:
@@ -132,6 +156,8 @@ def _render(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace) -> int:
     from us_sim.live import play
 
+    if not 0.01 <= args.rate <= 100:
+        raise UsSimError(f"--rate {args.rate:g}: must be from 0.01 to 100")
     return play(
         args.bag,
         topic=args.topic,

@@ -8,11 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
+
+from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.scene import Scene
@@ -30,6 +33,7 @@ Parameters = dict[str, dict[str, str]]
 """Parameters given by a person: YAML texts by node and name."""
 
 _PR_SET_PDEATHSIG = 1
+_THIS_PROGRAM = ctypes.CDLL(None)
 STOP_S = 0.8
 """How long nodes may take to end before the recorder is told to; then as long again at most."""
 
@@ -44,7 +48,7 @@ class NodeProcess:
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
-        command = [sys.executable, "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
+        command = [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
         for name, value in self.parameters.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]
         for name, text in self.raw_parameters.items():
@@ -100,25 +104,50 @@ class ProcessGroup:
     """Processes started together, watched, and ended together: the recorder last.
 
     Args:
-        log: where their output goes; None leaves it on this terminal.
+        log: where their output goes; None shows it on this terminal, above any progress.
     """
 
     def __init__(self, log: Path | None = None) -> None:
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._readers: list[threading.Thread] = []
+        self._complaints: dict[str, str] = {}
         self._log_path = log
-        self._log: IO[bytes] | None = log.open("wb") if log else None
+        self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
 
     def start(self, processes: Sequence[NodeProcess]) -> None:
-        """Start each; they end with this process, whatever happens to it."""
+        """Start each from this very package; they end with this process, whatever happens to it."""
+        package = str(Path(__file__).resolve().parents[1])
+        search = [package, os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
         for process in processes:
-            self._processes[process.node] = subprocess.Popen(
+            started = subprocess.Popen(
                 process.command(),
                 stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=self._log,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                env=environment,
                 start_new_session=True,
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
+            self._processes[process.node] = started
+            reader = threading.Thread(target=self._pass_on, args=(process.node, started))
+            self._readers.append(reader)
+        for reader in self._readers:
+            reader.start()
+
+    def _pass_on(self, node: str, process: subprocess.Popen[str]) -> None:
+        """Put a node's lines where they belong; keep the one that says why it cannot work."""
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("us_sim: "):
+                self._complaints[node] = line.removeprefix("us_sim: ").strip()
+            if self._log is not None:
+                self._log.write(line)
+                self._log.flush()
+            elif node not in self._complaints:
+                tqdm.write(line.rstrip(), file=sys.stderr)
 
     def is_running(self, node: str) -> bool:
         """Whether that node was started and has not ended."""
@@ -126,21 +155,14 @@ class ProcessGroup:
         return process is not None and process.poll() is None
 
     def check(self) -> None:
-        """Raise UsSimError when a node has ended with an error."""
-        for node, process in self._processes.items():
+        """Raise UsSimError, in the node's own words, when one has ended with an error."""
+        for (node, process), reader in zip(self._processes.items(), self._readers, strict=True):
             status = process.poll()
             if status:
-                raise UsSimError(self._complaint(node, status))
-
-    def _complaint(self, node: str, status: int) -> str:
-        """What the node said last, if it said it in our words."""
-        if self._log_path is not None:
-            lines = self._log_path.read_text(errors="replace").splitlines()
-            said = [line for line in lines if line.startswith("us_sim: ")]
-            if said:
-                return said[-1].removeprefix("us_sim: ")
-            return f"{node} ended with status {status}; see {self._log_path}"
-        return f"{node} ended with status {status}"
+                reader.join(STOP_S)
+                see = f"; see {self._log_path}" if self._log_path else ""
+                complaint = f"{node} ended with status {status}{see}"
+                raise UsSimError(self._complaints.get(node, complaint))
 
     def stop(self) -> None:
         """End every process: SIGTERM first, the recorder after the others, SIGKILL at the last.
@@ -154,6 +176,8 @@ class ProcessGroup:
             if process.poll() is None:
                 process.kill()
                 process.wait()
+        for reader in self._readers:
+            reader.join(STOP_S)
         if self._log is not None:
             self._log.close()
 
@@ -171,4 +195,4 @@ class ProcessGroup:
 
 
 def _end_with_parent() -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    _THIS_PROGRAM.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import tempfile
 import time
 from pathlib import Path
 
 from us_sim.assembly import volume_of
-from us_sim.errors import UsSimError
+from us_sim.errors import UsSimError, VolumeError
 from us_sim.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
 from us_sim.progress import Progress
 from us_sim.scene import Scene
@@ -53,6 +55,8 @@ def run(
     plan = plan_of(scene, parameters, record=record, path=path, duration=duration)
     prepare_volume(scene)
     follow(plan, log=None)
+    if record is not None:
+        print(f"recorded to {record}")
     return 0
 
 
@@ -110,7 +114,10 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
                 monitor.spin()
                 report = monitor.node.reports.get(process.node, {})
                 done = sum(int(v) for k, v in report.items() if k.startswith("published "))
-                bar.update(min(done, count), report.get("state", "waiting"))
+                state = report.get("state", "starting")
+                domain = os.environ.get("ROS_DOMAIN_ID", "0")
+                where = f" on ROS domain {domain}" if state.startswith("waiting") else ""
+                bar.update(min(done, count), state + where)
             group.check()
             bar.update(count)
     finally:
@@ -124,6 +131,7 @@ def prepare_volume(scene: Scene) -> None:
 
     def show(fraction: float, text: str) -> None:
         if not bar:
+            _require_a_cache()
             bar.append(Progress(f"making {scene.volume_name}", 100, "%"))
         bar[0].update(100 * fraction, text)
 
@@ -132,6 +140,22 @@ def prepare_volume(scene: Scene) -> None:
     finally:
         for shown in bar:
             shown.__exit__(None, None, None)
+
+
+def _require_a_cache() -> None:
+    """Raise VolumeError when what is made would be lost, and made again by every node."""
+    from us_sim.volume.phantom_cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise VolumeError(
+            f"the cache folder {folder} cannot be written ({error.strerror}): set US_SIM_CACHE to "
+            f"a folder that can"
+        ) from error
 
 
 def _report(scene: Scene, out: Path, recording: Path, startup: float, wall: float) -> int:

@@ -12,10 +12,17 @@ import yaml
 
 from us_sim.assembly import path_of
 from us_sim.errors import UsSimError
-from us_sim.graph import NodeProcess, Parameters, keep_on_this_host, simulation_nodes
+from us_sim.graph import (
+    NodeProcess,
+    Parameters,
+    keep_on_this_host,
+    player_settings,
+    simulation_nodes,
+)
 from us_sim.live import prepare_volume
 from us_sim.progress import Progress
 from us_sim.scene import Scene
+from us_sim.supervision import refuse_unknown
 
 __all__ = ["render", "render_scene"]
 
@@ -73,18 +80,24 @@ def render(
 
     context = Context()
     domain = None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100
-    rclpy.init(
-        args=[],
-        context=context,
-        domain_id=domain,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=[],
+            context=context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # what rcl raises differs between its versions
+        raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
         for module, name, settings in _nodes(scene, path, out, parameters or {}):
             nodes.append(_created(module, name, settings, context))
             executor.add_node(nodes[-1])
+        for process in simulation_nodes(scene, parameters):
+            (node,) = (node for node in nodes if node.get_name() == process.node)
+            refuse_unknown(process, node.list_parameters([], 0).names)
         return _spin(executor, nodes, progress)
     finally:
         for node in reversed(nodes):
@@ -104,18 +117,7 @@ def _nodes(
         "compression": "zstd",
         "exclude": ["/diagnostics"],
     }
-    player: dict[str, object] = {
-        "path": str(path),
-        "lockstep": True,
-        "await_topics": [
-            "tracker/pose",
-            "probe/pose",
-            "ultrasound/image",
-            *(["tissue/nodes"] if scene.tissue else []),
-            *(["skin/nodes"] if scene.skin else []),
-        ],
-        "await_subscriber": "session_recorder",
-    }
+    player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [
         ("session_recorder", "SessionRecorder", recorder),
         ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
@@ -138,11 +140,15 @@ def _values(process: NodeProcess) -> dict[str, object]:
 
 
 def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:
+    from rclpy.exceptions import ParameterException
     from rclpy.parameter import Parameter
 
-    node = getattr(importlib.import_module(f"us_sim.nodes.{module}"), name)
+    kind = getattr(importlib.import_module(f"us_sim.nodes.{module}"), name)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
-    return node(context=context, parameter_overrides=overrides)
+    try:
+        return kind(context=context, parameter_overrides=overrides)
+    except ParameterException as error:
+        raise UsSimError(" ".join(str(error).split())) from error
 
 
 def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None]) -> int:

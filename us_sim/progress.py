@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from types import TracebackType
 
@@ -32,7 +33,8 @@ class Progress:
             bar_format=layout,
             mininterval=0.1 if sys.stderr.isatty() else 3.0,
             ascii=not sys.stderr.isatty(),
-            dynamic_ncols=True,
+            miniters=0,
+            ncols=shutil.get_terminal_size((100, 24)).columns,
             leave=True,
         )
 

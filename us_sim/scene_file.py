@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import itertools
+import math
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -91,6 +92,8 @@ def parse_scene(document: object, *, origin: str = "scene", folder: Path | None 
 def _build(cls: type, document: object, origin: str, key: str) -> Any:
     """An instance of the dataclass ``cls`` from a mapping, every key checked."""
     at = f"{origin}: {key + ': ' if key else ''}"
+    if document is None and not key:
+        raise SceneError(f"{origin}: is empty; a scene has at least name, volume and probe")
     if not isinstance(document, dict):
         raise SceneError(f"{at}must be a mapping of keys, not {document!r}")
     fields = {f.name: f for f in dataclasses.fields(cls) if f.metadata}
@@ -186,6 +189,15 @@ def _check_tissue(scene: Scene, tissue: TissueSection, origin: str) -> None:
         ):
             raise SceneError(
                 f"{origin}: tissue.mesh.planes.{name}: needs two or more rising coordinates"
+            )
+        if planes is not None and not (
+            len(planes) == mesh.nodes[axis]
+            and math.isclose(planes[0], mesh.lower[axis], abs_tol=1e-9)
+            and math.isclose(planes[-1], mesh.upper[axis], abs_tol=1e-9)
+        ):
+            raise SceneError(
+                f"{origin}: tissue.mesh.planes.{name}: must be {mesh.nodes[axis]} coordinates from "
+                f"{mesh.lower[axis]:g} to {mesh.upper[axis]:g} m, as nodes, lower and upper say"
             )
     for axis_name in mesh.planes:
         if axis_name not in ("x", "y", "z"):

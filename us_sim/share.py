@@ -9,7 +9,7 @@ from pathlib import Path
 
 from us_sim.errors import UsSimError
 
-__all__ = ["shared_path", "shared_roots"]
+__all__ = ["find_bag", "shared_path", "shared_roots"]
 
 
 def shared_roots() -> Iterator[Path]:
@@ -43,3 +43,13 @@ def shared_path(relative: str) -> Path:
         f"{relative} is not installed with us_sim (looked in "
         f"{', '.join(map(str, roots)) or 'no folder at all'}); install the package again"
     )
+
+
+def find_bag(name: str | Path) -> Path:
+    """The bag at that path, or the installed one of that name."""
+    path = Path(name).expanduser()
+    if not path.exists() and path.name == str(name):
+        for root in shared_roots():
+            if (root / "bags" / path).exists():
+                return root / "bags" / path
+    return path

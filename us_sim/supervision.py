@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,13 +25,15 @@ from us_sim.scene import Scene
 if TYPE_CHECKING:
     from us_sim.nodes.session_monitor import SessionMonitor
 
-__all__ = ["Monitored", "Plan", "follow", "plan_of"]
+__all__ = ["Monitored", "Plan", "follow", "plan_of", "refuse_unknown"]
 
 SETTLE_S = 1.2
 """After the path's end: the last images, and each node's last report, which comes every second."""
 START_LIMIT_S = 300.0
 LOOK_AROUND_S = 0.4
 """To discover whether another simulation is on this ROS domain."""
+ANSWER_S = 5.0
+"""For a node to say which parameters it has."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,12 @@ class Monitored:
 
         self.names = nodes
         self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(
+                args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO
+            )
+        except Exception as error:  # what rcl raises differs between its versions
+            raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
         self.node: SessionMonitor = SessionMonitor(context=self._context)
         self._executor: Any = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -112,11 +120,36 @@ class Monitored:
         """Nodes that have not reported yet."""
         return [name for name in self.names if name not in self.node.reports]
 
+    def refuse_unknown(self, processes: Sequence[NodeProcess]) -> None:
+        """Raise UsSimError when a parameter was given that its node does not have."""
+        from rclpy.parameter_client import AsyncParameterClient
+
+        for process in processes:
+            if not process.raw_parameters:
+                continue
+            client = AsyncParameterClient(self.node, process.node)
+            client.wait_for_services(timeout_sec=ANSWER_S)
+            answer = client.list_parameters()
+            self._executor.spin_until_future_complete(answer, timeout_sec=ANSWER_S)
+            if answer.done():
+                refuse_unknown(process, answer.result().result.names)
+
     def close(self) -> None:
         """Leave the domain."""
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
+
+
+def refuse_unknown(process: NodeProcess, known: Collection[str]) -> None:
+    """Raise UsSimError when a parameter was given by a name that is not among the ``known``."""
+    for name in process.raw_parameters:
+        if name not in known and not name.startswith("qos_overrides."):
+            own = sorted(n for n in known if not n.startswith("qos_overrides."))
+            raise UsSimError(
+                f"--param {process.node}.{name}: {process.node} has no such parameter; it has "
+                f"{', '.join(own)}"
+            )
 
 
 def follow(plan: Plan, log: Path | None) -> float:
@@ -133,6 +166,7 @@ def follow(plan: Plan, log: Path | None) -> float:
             began = time.monotonic()
             group.start(plan.processes)
             _await_all(group, monitor, began)
+            monitor.refuse_unknown(plan.processes)
             startup = time.monotonic() - began
             _stay(plan, group, monitor)
     finally:
@@ -147,7 +181,8 @@ def _await_all(group: ProcessGroup, monitor: Monitored, began: float) -> None:
             monitor.spin()
             group.check()
             waiting = monitor.waiting
-            bar.update(len(monitor.names) - len(waiting), ", ".join(waiting))
+            more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
+            bar.update(len(monitor.names) - len(waiting), ", ".join(waiting[:2]) + more)
             if time.monotonic() - began > START_LIMIT_S:
                 raise UsSimError(f"{', '.join(waiting)} did not start in {START_LIMIT_S:g} s")
 
@@ -162,6 +197,8 @@ def _stay(plan: Plan, group: ProcessGroup, monitor: Monitored) -> None:
         while True:
             monitor.spin()
             group.check()
+            if "rejected disk" in monitor.node.reports.get("session_recorder", {}):
+                raise UsSimError(monitor.node.messages["session_recorder"])
             now = time.monotonic()
             done = monitor.node.count("path_player", "tracker/pose") if plan.poses else now - began
             if plan.poses is not None and ended is None and not group.is_running("path_player"):
@@ -180,7 +217,7 @@ def _status(monitor: SessionMonitor) -> str:
     slicer = monitor.reports.get("slice_interpolator", {})
     count = slicer.get("published ultrasound/image")
     if count is None:
-        return "waiting for poses"
+        return "no image yet"
     return (
         f"{count} images, {slicer.get('rate_hz', '?')}/s, "
         f"p99 {slicer.get('latency_p99_ms', '?')} ms"

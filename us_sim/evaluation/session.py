@@ -166,7 +166,7 @@ class Session:
         return summary
 
     def _recorded(self) -> dict[str, dict[str, int]]:
-        """What publishers last said they had sent by then, beside what was recorded in the end."""
+        """What each publisher last reported to have sent, beside what was recorded in the end."""
         recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
             key.removeprefix("published "): int(value)
@@ -176,7 +176,7 @@ class Session:
             if key.startswith("published ")
         }
         return {
-            topic: {"published": count, "recorded": recorded.get(topic, 0)}
+            topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
             for topic, count in said.items()
         }
 

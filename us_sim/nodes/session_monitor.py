@@ -18,12 +18,14 @@ class SessionMonitor(Node):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_monitor", **kwargs)
         self.reports: dict[str, dict[str, str]] = {}
+        self.messages: dict[str, str] = {}
         self.create_subscription(DiagnosticArray, "diagnostics", self._take, EVERY)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.rsplit("/", 1)[-1]
             self.reports[name] = {item.key: item.value for item in status.values}
+            self.messages[name] = status.message
 
     def count(self, node: str, topic: str) -> int:
         """How many messages ``node`` says it has published (or recorded) on ``topic``."""

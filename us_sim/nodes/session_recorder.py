@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -37,7 +38,13 @@ class SessionRecorder(Node):
         self._excluded = {*fixed_parameter(self, "exclude", [""], "left out"), *NOT_THE_SESSION}
         self._refused: set[str] = set()
         self._subscribed: set[str] = set()
-        self._writer = BagWriter(file, compression=compression)
+        taken = Path(file).with_name("metadata.yaml").exists()
+        if taken:
+            self.get_logger().info(
+                "metadata.yaml in this folder belongs to another recording, so none is written; "
+                "the file can be read and played without"
+            )
+        self._writer = BagWriter(file, compression=compression, sidecar=not taken)
         self.health = Health(self, str(file))
         self.health.state = "recording"
         self.create_timer(0.1, self._discover)
