@@ -217,7 +217,8 @@ def _status(monitor: SessionMonitor) -> str:
     slicer = monitor.reports.get("slice_interpolator", {})
     count = slicer.get("published ultrasound/image")
     if count is None:
-        return "no image yet"
+        heard = int(slicer.get("received", 0))
+        return "nobody subscribes to ultrasound/image" if heard else "waiting for poses"
     return (
         f"{count} images, {slicer.get('rate_hz', '?')}/s, "
         f"p99 {slicer.get('latency_p99_ms', '?')} ms"
