@@ -118,6 +118,20 @@ def test_a_wrong_response_is_an_error_of_the_server(bench) -> None:
         bench.spin_until(lambda: False, seconds=5)
 
 
+@pytest.mark.skipif(rclpy.__name__ == "rclpy", reason="needs the standalone client's insides")
+def test_a_request_of_another_middleware_is_not_answered_and_does_no_harm(bench, capfd) -> None:
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success = request.data
+        return response
+
+    bench.node("server").create_service(SetBool, "switch", answer)
+    client = bench.node("client").create_client(SetBool, "switch")
+    assert ready(bench, client)
+    client._client._client.send_request(b"\0\1\0\0")
+    assert bench.result(client.call_async(SetBool.Request(data=True))).success
+    assert "a request for /switch is not answered" in capfd.readouterr().err
+
+
 def test_the_six_parameter_services(bench) -> None:
     node = bench.node("probe", namespace="left")
     node.declare_parameters("", [("rate", 60.0), ("names", ["vein", "artery"]), ("depth", 3)])

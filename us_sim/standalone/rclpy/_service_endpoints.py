@@ -7,6 +7,7 @@ from ..messages import serialize
 from ..services import RequestHeader, ServiceClient, ServiceServer
 from ._endpoints import Endpoint, Inbox, NodeLink, message_of
 from ._rclpy_pybind11 import RCLError, rmw_request_id_t, rmw_service_info_t
+from .logging import get_logger
 from .qos import QoSProfile
 
 __all__ = ["ClientHandle", "ServiceHandle"]
@@ -83,13 +84,21 @@ class ServiceHandle(_ServiceEndpoint):
         return self._name
 
     def service_take_request(self, request_type: Any) -> tuple[Any, rmw_service_info_t | None]:
-        """A request that came, and whose it is."""
+        """A request that came, and whose it is; bytes that are no request are not one."""
         self._require_existence()
         taken = self.inbox.take()
         if taken is None:
             return None, None
         data, header = taken
-        return message_of(data, request_type), _service_info(header)
+        try:
+            return message_of(data, request_type), _service_info(header)
+        except RCLError as error:
+            get_logger("rclpy").warning(
+                f"a request for {self._name} is not answered: {error}; a client on Fast DDS cannot "
+                f"call a service on Cyclone DDS: set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp there",
+                throttle_duration_sec=5.0,
+            )
+            return None, None
 
     def service_send_response(self, response: Any, request_id: rmw_request_id_t) -> None:
         """Answer a request; nothing happens when the client has gone."""
