@@ -21,6 +21,7 @@ import pytest
         ("slice_interpolator", ["-p", "threads:=0"], "threads is 0; it must be from 1 to 256"),
         ("path_player", ["-p", "path:=nowhere.mcap"], "nowhere.mcap"),
         ("path_player", ["-p", "rate:=-1.0"], "rate"),
+        ("path_player", ["-p", "rate:=1.0"], "parameter `path` is missing; name a bag to play"),
         ("session_recorder", ["-p", "file:=/proc/nowhere/x.mcap"], "/proc/nowhere"),
         ("session_recorder", ["-p", "compression:=rar"], "rar"),
         ("probe_tracker", ["-r", "no remapping"], "no remapping"),

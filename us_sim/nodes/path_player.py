@@ -53,6 +53,8 @@ class PathPlayer(Node):
         self._subscriber = fixed_parameter(
             self, "await_subscriber", "", "and this node subscribes to them"
         )
+        if not path:
+            raise BagError("path_player's parameter `path` is missing; name a bag to play")
         self._path = read_path(path, topic or None)
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0

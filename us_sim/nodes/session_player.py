@@ -12,6 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
+from us_sim.errors import BagError
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
@@ -35,6 +36,8 @@ class SessionPlayer(Node):
         path = fixed_parameter(self, "path", "", "bag to play")
         self._rate = fixed_parameter(self, "rate", 1.0, "speed factor", within=(0.01, 100.0))
         self._loop = fixed_parameter(self, "loop", False, "start again at the end")
+        if not path:
+            raise BagError("session_player's parameter `path` is missing; name a bag to play")
         self._bag = read_bag(path)
         self.finished = Future()
         self.health = Health(self, str(path))
