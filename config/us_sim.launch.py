@@ -11,7 +11,7 @@ from us_sim.assembly import path_of
 from us_sim.errors import UsSimError
 from us_sim.graph import player_settings
 from us_sim.scene_file import load_scene
-from us_sim.share import shared_path
+from us_sim.share import find_bag
 
 
 def nodes(context):
@@ -33,10 +33,7 @@ def nodes(context):
         else:
             actions.append(LogInfo(msg=f"{part.node} is left out: {part.reason}"))
     if path:
-        bag = Path(path).expanduser()
-        installed = shared_path("bags") / path
-        if installed.exists() and not bag.exists():
-            bag = installed
+        bag = find_bag(path)
         path_of(scene, bag)  # what is wrong with it is better said before anything starts
         actions.append(node("path_player", player_settings(scene, bag, recorded=bool(record))))
     return actions

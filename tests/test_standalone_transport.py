@@ -295,15 +295,16 @@ from us_sim.standalone.transport import Participant
 first, second = Participant(int(sys.argv[1])), Participant(int(sys.argv[1]))
 topic = ("rt/busy", "std_msgs::msg::dds_::String_", EndpointQos())
 writer, reader = first.create_writer(*topic), second.create_reader(*topic)
-received = []
+received, enough = [], threading.Event()
 def take():
     while reader.take() is not None:
         received.append(1)
+        if len(received) == 20:
+            enough.set()
         writer.write(bytes.fromhex("00010000 00000000"))
 reader.on_data = take
 writer.write(bytes.fromhex("00010000 00000000"))
-while len(received) < 20:
-    time.sleep(0.001)
+enough.wait()
 print(time.time(), flush=True)
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -144,8 +145,9 @@ class ProcessGroup:
             if line.startswith("us_sim: "):
                 self._complaints[node] = line.removeprefix("us_sim: ").strip()
             if self._log is not None:
-                self._log.write(line)
-                self._log.flush()
+                with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
+                    self._log.write(line)
+                    self._log.flush()
             elif node not in self._complaints:
                 tqdm.write(line.rstrip(), file=sys.stderr)
 
@@ -177,9 +179,11 @@ class ProcessGroup:
                 process.kill()
                 process.wait()
         for reader in self._readers:
-            reader.join(STOP_S)
+            if reader.is_alive():
+                reader.join(STOP_S)
         if self._log is not None:
-            self._log.close()
+            with contextlib.suppress(OSError):
+                self._log.close()
 
     def _terminate(self, nodes: list[str]) -> None:
         waiting = [self._processes[node] for node in nodes]

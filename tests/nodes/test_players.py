@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from mcap.writer import Writer
+from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import Image
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Int32MultiArray, String
 
 from us_sim.errors import BagError
 from us_sim.nodes.conversions import image_message
@@ -98,6 +100,27 @@ def test_poses_that_cannot_be_told_apart_are_refused_in_lockstep(bench, tmp_path
     write_path(file, path)
     with pytest.raises(BagError, match="neither stamps nor log times rise"):
         bench.make(PathPlayer, path=str(file), lockstep=True)
+
+
+def test_what_is_not_cdr_is_left_out_of_a_recording(bench, tmp_path):
+    file = tmp_path / "mixed.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        for topic, encoding in (("/said", "cdr"), ("/other", "json")):
+            channel = writer.register_channel(topic, encoding, schema)
+            data = bytes(serialize_message(String(data="yes")))
+            writer.add_message(channel, EPOCH, data, EPOCH)
+        writer.finish()
+    said = bench.collect(String, "/said")
+    other = bench.collect(String, "/other")
+    player = bench.make(SessionPlayer, path=str(file))
+    bench.spin_until(lambda: player.finished.done() and said)
+    bench.spin_for(10)
+    assert [message.data for message in said] == ["yes"]
+    assert not other
+    assert player.health.problems("topic") == 1
 
 
 def test_a_recording_is_published_as_it_was(bench, shared_data):

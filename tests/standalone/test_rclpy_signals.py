@@ -22,13 +22,15 @@ pytestmark = pytest.mark.skipif(
 )
 
 SPIN = """
-import signal, sys, threading, time
+import signal, sys, threading
 import us_sim.nodes
 import rclpy
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 rclpy.init(args=[], signal_handler_options=getattr(SignalHandlerOptions, sys.argv[2]))
+down = threading.Event()
+rclpy.get_default_context().on_shutdown(down.set)
 node = rclpy.create_node("probe")
 executor = MultiThreadedExecutor(2) if sys.argv[1] == "threads" else None
 say = lambda text: print(text, flush=True)
@@ -42,10 +44,7 @@ except KeyboardInterrupt:
     say("KeyboardInterrupt")
 except ExternalShutdownException:
     say("ExternalShutdownException")
-for _ in range(100):  # rclpy shuts down in a thread of its own
-    if not rclpy.ok():
-        break
-    time.sleep(0.01)
+down.wait(1.0)  # rclpy shuts down in a thread of its own
 say("down" if not rclpy.ok() else "up")
 node.destroy_node()
 rclpy.try_shutdown()

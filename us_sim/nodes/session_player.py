@@ -43,20 +43,26 @@ class SessionPlayer(Node):
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
         for topic in self._bag.topics:
-            self._offer(topic.name, topic.type_name, latched=_is_latched(topic))
+            self._offer(topic)
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._begun = 0
         self._first = 0
         self._start = self.create_timer(START_S, self._begin)
 
-    def _offer(self, topic: str, type_name: str, *, latched: bool) -> None:
-        package, _, name = type_name.split("/")
+    def _offer(self, topic: BagTopic) -> None:
+        if topic.encoding != "cdr":
+            self.health.problem("topic", f"{topic.name} is left out: {topic.encoding} is not CDR")
+            return
+        package, _, name = topic.type_name.split("/")
         try:
             message_type = getattr(importlib.import_module(f"{package}.msg"), name)
         except (ImportError, AttributeError):
-            self.health.problem("topic", f"{topic} is left out: {type_name} is not installed here")
+            self.health.problem(
+                "topic", f"{topic.name} is left out: {topic.type_name} is not installed here"
+            )
             return
+        latched = _is_latched(topic)
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
@@ -64,7 +70,7 @@ class SessionPlayer(Node):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=durability,
         )
-        self._topics[topic] = self.create_publisher(message_type, topic, qos)
+        self._topics[topic.name] = self.create_publisher(message_type, topic.name, qos)
 
     def _begin(self) -> None:
         self._start.cancel()
