@@ -52,6 +52,7 @@ class TetrahedralMesh:
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient
     tetrahedra: NDArray[np.int32]  # (M, 4), indices into nodes
+    planes: tuple[NDArray[np.float64], ...] | None = None  # m, of each axis, of a box mesh
 
     def __post_init__(self) -> None:
         nodes = np.array(self.nodes, dtype=np.float64, order="C")
@@ -153,7 +154,7 @@ def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> T
     tetrahedra = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), shape).reshape(-1, 4)
     mirrored = _volumes(nodes, tetrahedra) < 0
     tetrahedra[mirrored] = tetrahedra[mirrored][:, [0, 1, 3, 2]]
-    return TetrahedralMesh(nodes, tetrahedra)
+    return TetrahedralMesh(nodes, tetrahedra, tuple(planes))
 
 
 def _volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> NDArray[np.float64]:

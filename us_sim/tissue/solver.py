@@ -49,8 +49,11 @@ __all__ = [
 
 #: Where each solver is found; a solver that is not asked for is not imported.
 SOLVERS = {
+    "fem": ("us_sim.tissue.fem", "Fem"),
+    "fem_nonlinear": ("us_sim.tissue.fem_nonlinear", "FemNonlinear"),
     "fem_cg": ("us_sim.tissue.fem_cg", "FemCg"),
     "msds": ("us_sim.tissue.msds", "Msds"),
+    "msds_implicit": ("us_sim.tissue.msds_implicit", "MsdsImplicit"),
 }
 
 # A node that moved by this many times the mesh's longest side has left the tissue.
