@@ -86,7 +86,10 @@ class TissueSection:
     mesh: MeshSection = _given()
     materials: dict[str, MaterialSection] = _given()
     fixed: tuple[str, ...] = _given(default=("bottom",))
-    solver: str = _given(default="fem_cg", choices=("fem_cg", "msds"))
+    solver: str = _given(
+        default="fem",
+        choices=("fem", "fem_nonlinear", "fem_cg", "msds", "msds_implicit"),
+    )
     settings: dict[str, dict[str, Any]] = _given(default_factory=dict)
 
 

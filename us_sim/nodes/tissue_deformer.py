@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
 from us_sim.assembly import tissue_model_of, volume_of
-from us_sim.errors import SceneError, UsSimError
+from us_sim.errors import SceneError, SolverError, UsSimError
 from us_sim.nodes.conversions import (
     cloud_message,
     pose_from,
@@ -22,7 +22,8 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.tissue.solver import SOLVERS, TissueSolver, create_solver
+from us_sim.tissue.solver import SOLVERS
+from us_sim.tissue.switching import SwitchableTissue
 
 __all__ = ["TissueDeformer", "main"]
 
@@ -33,29 +34,28 @@ ALWAYS = Time()
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
 
-    The parameter ``solver`` switches the method while running; the state is carried over.
+    The parameter ``solver`` switches the method while running; the state is carried over. With
+    ``compare_with`` another method runs on the same poses, and diagnostics say how far its nodes
+    are from those published.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tissue_deformer", **kwargs)
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
-        self._settings = self.scene.tissue.settings
-        self._model = tissue_model_of(self.scene, volume_of(self.scene))
-        mesh = self._model.mesh
-        self._solvers: dict[str, TissueSolver] = {}
-        name = self.declare_parameter(
-            "solver",
-            self.scene.tissue.solver,
-            ParameterDescriptor(
-                description="method that deforms the tissue; may change while running",
-                additional_constraints=f"one of {', '.join(SOLVERS)}",
-            ),
-        ).value
-        self.get_logger().info(
-            f"preparing {name} for {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra"
+        model = tissue_model_of(self.scene, volume_of(self.scene))
+        mesh = model.mesh
+        solver = self._method(
+            "solver", self.scene.tissue.solver, f"one of {', '.join(SOLVERS)}", "deforms the tissue"
         )
-        self._solver = self._prepared(name)
+        compared = self._method(
+            "compare_with", "", "another one, or '' for none", "runs on the same poses beside it"
+        )
+        self.get_logger().info(
+            f"preparing {solver} for {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra"
+        )
+        self._tissue = SwitchableTissue(model, solver, self.scene.tissue.settings)
+        self._tissue.compare_with(compared)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._switch)
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
@@ -65,34 +65,41 @@ class TissueDeformer(SceneNode):
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self.newest(PoseStamped, "probe/pose", self._deform)
-        self.health.state = f"ready with {name}"
+        self.health.state = f"ready with {solver}"
         self.get_logger().info(self.health.state)
 
-    def _prepared(self, name: str) -> TissueSolver:
-        """The solver of that name, compiled and ready."""
-        if name not in self._solvers:
-            solver = create_solver(name, self._model, **self._settings.get(name, {}))
-            solver.warm_up()
-            self._solvers[name] = solver
-        return self._solvers[name]
+    def _method(self, name: str, value: str, choices: str, purpose: str) -> str:
+        """Declare a parameter that names a solver and may change while running."""
+        descriptor = ParameterDescriptor(
+            description=f"method that {purpose}; may change while running",
+            additional_constraints=choices,
+        )
+        return str(self.declare_parameter(name, value, descriptor).value)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         """Prepare a named solver before the switch, so that one that cannot be made is refused."""
-        for parameter in parameters:
-            if parameter.name == "solver":
-                try:
-                    self._prepared(parameter.value)
-                except UsSimError as error:
-                    return SetParametersResult(successful=False, reason=str(error))
+        wanted = {"solver": self._tissue.name, "compare_with": self._tissue.compared}
+        wanted |= {p.name: p.value for p in parameters if p.name in wanted}
+        try:
+            self._tissue.prepare(wanted["solver"])
+            if wanted["compare_with"]:
+                self._tissue.prepare(wanted["compare_with"])
+                if wanted["compare_with"] == wanted["solver"]:
+                    raise SolverError(f"{wanted['solver']} cannot be compared with itself")
+        except UsSimError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _switch(self, parameters: list[Parameter]) -> None:
-        for parameter in parameters:
-            if parameter.name == "solver" and parameter.value != self._solver.name:
-                solver = self._prepared(parameter.value)
-                solver.take_over(self._solver.state)
-                self._solver = solver
-                self.get_logger().info(f"switched to {solver.name}")
+        wanted = {p.name: p.value for p in parameters}
+        if "compare_with" in wanted:
+            self._tissue.compare_with("")
+        if wanted.get("solver", self._tissue.name) != self._tissue.name:
+            self._tissue.use(wanted["solver"])
+            self.get_logger().info(f"switched to {self._tissue.name}")
+        if wanted.get("compare_with"):
+            self._tissue.compare_with(wanted["compare_with"])
+            self.get_logger().info(f"comparing with {self._tissue.compared}")
 
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
@@ -101,7 +108,7 @@ class TissueDeformer(SceneNode):
             return
         stamp = message.header.stamp
         try:
-            deformation = self._solver.deform(pose_from(message))
+            deformation = self._tissue.deform(pose_from(message))
         except UsSimError as error:
             self.health.problem("pose", f"{error}; the tissue stays as it was")
             return
@@ -113,11 +120,23 @@ class TissueDeformer(SceneNode):
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
-        self.health.state = self._solver.name
+        self.health.state = self._tissue.name
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
             "contact_nodes": str(len(deformation.contact_nodes)),
             "action": deformation.action,
+            **self._comparison(),
+        }
+
+    def _comparison(self) -> dict[str, str]:
+        """What diagnostics say of the solver beside the one in use."""
+        apart = self._tissue.difference
+        if apart is None:
+            return {}
+        return {
+            "compared_with": self._tissue.compared,
+            "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
+            "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
 
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
