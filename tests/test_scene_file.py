@@ -82,7 +82,7 @@ def test_units_are_si_inside():
         ),
         ("tissue.mesh.planes", {"w": [0, 1]}, "tissue.mesh.planes: unknown axis `w`"),
         ("tissue.mesh", 3, "tissue.mesh: must be a mapping of keys, not 3"),
-        ("tissue.solver", "magic", "tissue.solver: 'magic' is not one of fem_cg, msds"),
+        ("tissue.solver", "magic", "tissue.solver: 'magic' is not one of fem, fem_nonlinear, fem_cg, msds"),
         ("tissue.materials", {}, "tissue.materials: names no material"),
         (
             "tissue.materials.muscle.poisson_ratio",

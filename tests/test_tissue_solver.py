@@ -113,29 +113,6 @@ def test_the_last_good_state_is_kept_when_a_frame_fails(solver, monkeypatch):
     assert "good state" not in after.action
 
 
-def test_switching_back_and_forth_does_not_jump():
-    model = block((9, 5, 5))
-    fem, msds = create_solver("fem_cg", model), create_solver("msds", model)
-    linear = settled(fem, PRESSED).nodes
-    springs = settled(msds, PRESSED).nodes
-    difference = np.linalg.norm(linear - springs, axis=1).max()
-    assert difference > 1e-4
-
-    msds.reset()
-    msds.take_over(fem.state)
-    first = msds.deform(PRESSED)
-    assert np.linalg.norm(first.nodes - linear, axis=1).max() <= 1.05 * difference
-    assert len(first.contact_nodes) > 0
-    np.testing.assert_allclose(settled(msds, PRESSED).nodes, springs, atol=1e-4)
-
-    fem.reset()
-    fem.take_over(msds.state)
-    first = fem.deform(PRESSED)
-    assert np.linalg.norm(first.nodes - springs, axis=1).max() <= 1.05 * difference
-    assert len(first.contact_nodes) > 0
-    np.testing.assert_allclose(settled(fem, PRESSED).nodes, linear, atol=2e-5)
-
-
 def test_a_deformed_tissue_that_is_taken_over_untouched_goes_back(solver):
     other = create_solver("fem_cg", solver.model)
     settled(other, PRESSED, 20)
@@ -173,7 +150,7 @@ def test_a_state_that_moves_held_nodes_is_refused(solver):
 
 
 def test_unknown_names_are_refused_with_the_known_ones():
-    with pytest.raises(SolverError, match="no tissue solver 'magic': name one of fem_cg, msds"):
+    with pytest.raises(SolverError, match="no tissue solver 'magic': name one of fem, fem_n"):
         create_solver("magic", block((3, 3, 3)))
     with pytest.raises(SolverError, match="no setting 'speed': its settings are iterations"):
         create_solver("fem_cg", block((3, 3, 3)), speed=3)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from bench import pose_at
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
@@ -50,7 +51,7 @@ def test_nodes_are_the_solvers_and_carry_the_poses_stamp(bench, deformer, small_
     received = press(bench, publisher, nodes, 0.004, 3)
     assert nodes[-1].header.stamp.sec == 3
     scene = load_scene(small_scene)
-    solver = create_solver("fem_cg", tissue_model_of(scene, volume_of(scene)))
+    solver = create_solver("fem", tissue_model_of(scene, volume_of(scene)))
     expected = solver.deform(Pose([0.0, 0.0, 0.004], [0.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(received, expected.nodes, atol=1e-7)
     bench.spin_until(lambda: wrenches)
@@ -74,12 +75,33 @@ def test_the_solver_is_switched_while_running_without_a_jump(bench, deformer):
     assert node.health.state == "msds"
 
 
+def test_two_methods_run_side_by_side_and_diagnostics_say_how_far_they_are_apart(bench, deformer):
+    node, nodes, _, publisher = deformer
+    statuses = bench.collect(DiagnosticArray, "diagnostics")
+    assert node.set_parameters([Parameter("compare_with", value="fem_cg")])[0].successful
+    for second in range(1, 12):
+        press(bench, publisher, nodes, 0.004, second)
+    values = node.health.values
+    assert values["compared_with"] == "fem_cg"
+    assert 0 < float(values["difference_rms_mm"]) < float(values["difference_max_mm"]) < 4.0
+    statuses.clear()
+    bench.spin_until(
+        lambda: any(v.key == "difference_max_mm" for s in statuses for v in s.status[0].values)
+    )
+    refused = node.set_parameters([Parameter("compare_with", value="fem")])[0]
+    assert not refused.successful
+    assert "itself" in refused.reason
+    assert node.set_parameters([Parameter("compare_with", value="")])[0].successful
+    press(bench, publisher, nodes, 0.004, 13)
+    assert "compared_with" not in node.health.values
+
+
 def test_nothing_is_solved_for_nobody(bench, small_scene):
     node = bench.make(TissueDeformer, scene=str(small_scene), lockstep=True)
     publisher = bench.publisher(PoseStamped, "probe/pose")
     publisher.publish(pose_at(0.004, 1))
     bench.spin_until(lambda: node.health.received == 1)
-    assert node.health.state == "ready with fem_cg"
+    assert node.health.state == "ready with fem"
 
 
 def test_a_broken_pose_is_survived(bench, deformer):
