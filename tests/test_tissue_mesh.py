@@ -9,6 +9,12 @@ from us_sim.tissue.mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 CORNER = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 ONE = np.array([[0, 1, 2, 3]])
+FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+TWO_ABOVE = np.vstack([CORNER, [[0.2, 0.2, 0.5]]])
+THREE = np.vstack([CORNER, [[0.2, 0.2, 0.5], [0, 0, -1]]])
+AT_A_FACE = [[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]]
+# A second corner beyond the tip of the first.
+BOTH = np.vstack([CORNER, CORNER[3] + CORNER[1:]])
 
 
 @pytest.mark.parametrize(
@@ -63,17 +69,43 @@ def test_node_order_is_x_then_y_then_z():
         (CORNER, [[0, 1, 2]], r"tetrahedra have shape \(1, 3\)"),
         (CORNER, np.empty((0, 4), int), "M > 0"),
         (CORNER, ONE.astype(float), "float64: give integer"),
-        (np.where(CORNER == 1, np.nan, CORNER), ONE, "node 1 is not finite"),
+        (
+            np.where(CORNER == 1, np.nan, CORNER),
+            ONE,
+            "3 mesh nodes are not finite, such as node 1 at",
+        ),
         (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
         (CORNER, [[-1, 1, 2, 3]], "name nodes -1 to 3"),
-        (np.vstack([CORNER, [5.0, 5, 5]]), ONE, "node 4 belongs to no tetrahedron"),
-        (CORNER, [[0, 2, 1, 3]], "tetrahedron 0 is flat or inverted"),
-        (CORNER * [1, 1, 0], ONE, "tetrahedron 0 is flat or inverted"),
+        (
+            np.vstack([CORNER, [5.0, 5, 5]]),
+            ONE,
+            "1 mesh node belongs to no tetrahedron, such as node 4",
+        ),
+        (CORNER, [[0, 2, 1, 3]], "1 tetrahedron is inverted, such as tetrahedron 0"),
+        (FLAT, ONE, "1 tetrahedron is flat, such as tetrahedron 0"),
+        (CORNER, [[0, 1, 2, 2]], "1 mesh node belongs to no tetrahedron, such as node 3"),
+        (CORNER[[0, 1, 2, 3, 3]], [[0, 1, 2, 3], [0, 1, 2, 4]], "such as node 4 on node 3"),
+        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "repeated, such as tetrahedron 1, which has"),
+        (TWO_ABOVE, [[0, 1, 2, 3], [0, 1, 2, 4]], "same side of the face they share, such as 0"),
+        (THREE, AT_A_FACE, "1 face belongs to more than two .* one of tetrahedra 0, 1, 2"),
+        (BOTH, [[0, 1, 2, 3], [3, 4, 5, 6]], "2 parts .* 1 node in all, such as node 3 between"),
+        (BOTH[:6], [[0, 1, 2, 3], [2, 4, 5, 3]], "by nodes or edges only, 2 nodes"),
+        (np.zeros((2**21 + 1, 3)), ONE, "give a coarser one, of 2097152 at most"),
     ],
 )
 def test_bad_meshes_are_refused(nodes, tetrahedra, words):
     with pytest.raises(MeshError, match=words):
         TetrahedralMesh(nodes, np.asarray(tetrahedra))
+
+
+def test_parts_are_allowed_and_told_apart():
+    one = block_mesh((3, 3, 3))
+    mesh = TetrahedralMesh(
+        np.vstack([one.nodes, np.add(one.nodes, [1.0, 0, 0])]),
+        np.vstack([one.tetrahedra, one.tetrahedra + 27]),
+    )
+    np.testing.assert_array_equal(mesh.parts, np.repeat([0, 1], 27))
+    assert len(mesh.boundary) == 2 * len(one.boundary)
 
 
 @pytest.mark.parametrize(

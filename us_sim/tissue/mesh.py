@@ -17,17 +17,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
+from us_sim.tissue.mesh_check import EDGES, FACES, check_mesh, face_order, signed_volumes
 
 __all__ = ["TetrahedralMesh", "box_mesh", "uniform_planes"]
-
-# Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise.
-_SMALLEST_VOLUME = 1e-9
-
-# The six edges and the four outward faces of a positively oriented tetrahedron.
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 # Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between.
 _FIVE = np.array(
@@ -45,9 +41,10 @@ _FIVE = np.array(
 class TetrahedralMesh:
     """Nodes and positively oriented tetrahedra; every node belongs to at least one.
 
+    It may be in several parts that touch nowhere.
+
     Raises:
-        MeshError: wrong shapes, nodes that are not finite, indices out of range, an inverted or
-            flat tetrahedron, or a node that no tetrahedron uses.
+        MeshError: as `us_sim.tissue.mesh_check.check_mesh`.
     """
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient
@@ -57,55 +54,34 @@ class TetrahedralMesh:
     def __post_init__(self) -> None:
         nodes = np.array(self.nodes, dtype=np.float64, order="C")
         tetrahedra = np.array(self.tetrahedra, order="C")
-        if nodes.ndim != 2 or nodes.shape[1] != 3:
-            raise MeshError(f"mesh nodes have shape {nodes.shape}: give (N, 3) coordinates")
-        if tetrahedra.ndim != 2 or tetrahedra.shape[1] != 4 or tetrahedra.shape[0] == 0:
-            raise MeshError(f"tetrahedra have shape {tetrahedra.shape}: give (M, 4) indices, M > 0")
-        if not np.issubdtype(tetrahedra.dtype, np.integer):
-            raise MeshError(f"tetrahedra are of type {tetrahedra.dtype}: give integer node indices")
-        bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
-        if len(bad):
-            raise MeshError(f"mesh node {bad[0]} is not finite: {nodes[bad[0]].tolist()}")
-        if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
-            raise MeshError(
-                f"tetrahedra name nodes {tetrahedra.min()} to {tetrahedra.max()}, but the mesh "
-                f"has nodes 0 to {len(nodes) - 1}"
-            )
-        used = np.zeros(len(nodes), dtype=bool)
-        used[tetrahedra] = True
-        if not used.all():
-            raise MeshError(
-                f"mesh node {np.flatnonzero(~used)[0]} belongs to no tetrahedron: remove it"
-            )
+        check_mesh(nodes, tetrahedra)
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "tetrahedra", tetrahedra.astype(np.int32))
-        corners = nodes[tetrahedra]
-        longest = np.linalg.norm(corners[:, _EDGES[:, 0]] - corners[:, _EDGES[:, 1]], axis=2).max(1)
-        bad = np.flatnonzero(self.volumes <= _SMALLEST_VOLUME * longest**3)
-        if len(bad):
-            raise MeshError(
-                f"tetrahedron {bad[0]} is flat or inverted (volume {self.volumes[bad[0]]:.3g} m3): "
-                f"order its nodes so that its volume is positive"
-            )
 
     @cached_property
     def volumes(self) -> NDArray[np.float64]:
-        """(M,) m3, signed volume of each tetrahedron."""
-        return _volumes(self.nodes, self.tetrahedra)
+        """(M,) m3, of each tetrahedron."""
+        return signed_volumes(self.nodes, self.tetrahedra)
 
     @cached_property
     def edges(self) -> NDArray[np.int32]:
         """(E, 2) each edge once, the smaller node first, in lexicographic order."""
-        return np.unique(np.sort(self.tetrahedra[:, _EDGES].reshape(-1, 2), axis=1), axis=0)
+        ends = np.sort(self.tetrahedra[:, EDGES].reshape(-1, 2), axis=1).astype(np.int64)
+        once = np.unique(ends[:, 0] << 32 | ends[:, 1])
+        return np.column_stack([once >> 32, once & 0xFFFFFFFF]).astype(np.int32)
 
     @cached_property
     def boundary(self) -> NDArray[np.int32]:
         """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
-        faces = self.tetrahedra[:, _FACES].reshape(-1, 3)
-        _, first, count = np.unique(
-            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-        )
-        return faces[np.sort(first[count == 1])]
+        order, starts, counts = face_order(self.tetrahedra)
+        return self.tetrahedra[:, FACES].reshape(-1, 3)[np.sort(order[starts[counts == 1]])]
+
+    @cached_property
+    def parts(self) -> NDArray[np.int32]:
+        """(N,) which part each node belongs to, from 0; parts touch nowhere."""
+        count = len(self.nodes)
+        graph = coo_array((np.ones(len(self.edges)), tuple(self.edges.T)), shape=(count, count))
+        return connected_components(graph, directed=False)[1]
 
 
 def uniform_planes(lo: float, hi: float, n: int) -> NDArray[np.float64]:
@@ -152,11 +128,6 @@ def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> T
     offsets[odd, ..., 0] = 1 - offsets[odd, ..., 0]
     corners = cells[:, None, None, :] + offsets
     tetrahedra = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), shape).reshape(-1, 4)
-    mirrored = _volumes(nodes, tetrahedra) < 0
+    mirrored = signed_volumes(nodes, tetrahedra) < 0
     tetrahedra[mirrored] = tetrahedra[mirrored][:, [0, 1, 3, 2]]
     return TetrahedralMesh(nodes, tetrahedra, tuple(planes))
-
-
-def _volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> NDArray[np.float64]:
-    a, b, c, d = np.moveaxis(nodes[tetrahedra], 1, 0)
-    return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
