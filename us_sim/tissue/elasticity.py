@@ -22,7 +22,7 @@ from us_sim.errors import SolverError
 from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 
-__all__ = ["free_stiffness", "require_held", "shape_gradients", "stiffness"]
+__all__ = ["free_stiffness", "lame_stiffness", "require_held", "shape_gradients", "stiffness"]
 
 
 def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
@@ -42,10 +42,18 @@ def stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> bsr_array:
     V (lambda ga gb' + mu gb ga' + mu (ga . gb) I), with g the shape functions' gradients and lambda
     and mu Lame's constants (Zienkiewicz and Taylor, The Finite Element Method 1, 5th ed., 6.2).
     """
-    count = len(mesh.nodes)
     modulus, ratio = materials.young_modulus, materials.poisson_ratio
-    first = modulus * ratio / ((1 + ratio) * (1 - 2 * ratio)) * mesh.volumes
-    second = modulus / (2 * (1 + ratio)) * mesh.volumes
+    first = modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
+    return lame_stiffness(mesh, first, modulus / (2 * (1 + ratio)))
+
+
+def lame_stiffness(
+    mesh: TetrahedralMesh, first: NDArray[np.float64], second: NDArray[np.float64]
+) -> bsr_array:
+    """As `stiffness`, of Lame's constants lambda and mu (M,) Pa themselves."""
+    count = len(mesh.nodes)
+    first = first * mesh.volumes
+    second = second * mesh.volumes
     gradients = shape_gradients(mesh)
     outer = gradients[:, :, None, :, None] * gradients[:, None, :, None, :]
     local = first[:, None, None, None, None] * outer
