@@ -73,8 +73,18 @@ class TetrahedralMesh:
     @cached_property
     def boundary(self) -> NDArray[np.int32]:
         """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
+        return self.tetrahedra[:, FACES].reshape(-1, 3)[self._boundary_faces]
+
+    @cached_property
+    def boundary_tetrahedra(self) -> NDArray[np.int32]:
+        """(F,) the tetrahedron that each triangle of the boundary belongs to."""
+        return (self._boundary_faces // 4).astype(np.int32)
+
+    @cached_property
+    def _boundary_faces(self) -> NDArray[np.intp]:
+        """(F,) face f of tetrahedron t has the number 4 t + f."""
         order, starts, counts = face_order(self.tetrahedra)
-        return self.tetrahedra[:, FACES].reshape(-1, 3)[np.sort(order[starts[counts == 1]])]
+        return np.sort(order[starts[counts == 1]])
 
     @cached_property
     def parts(self) -> NDArray[np.int32]:
