@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["solve_active", "unilateral"]
+__all__ = ["pivot", "solve_active", "unilateral"]
 
 # Block pivots that may fail to improve before pivots are made one at a time.
 _PATIENCE = 5
@@ -56,7 +56,7 @@ def unilateral(
     push = np.zeros(len(gap))
     active = np.array(start, dtype=np.bool_)
     if len(gap):
-        _pivot(np.ascontiguousarray(delassus), np.ascontiguousarray(gap), push, active)
+        pivot(np.ascontiguousarray(delassus), np.ascontiguousarray(gap), push, active)
     return push, active
 
 
@@ -91,8 +91,8 @@ def solve_active(delassus, rhs, index, count, factor, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pivot(delassus, gap, push, active):
-    """Fills push (k,) and active (k,), which comes in as the guess."""
+def pivot(delassus, gap, push, active):
+    """What `unilateral` does: fills push (k,) and active (k,), which comes in as the guess."""
     k = len(gap)
     factor = np.empty((k, k))
     solution = np.empty(k)

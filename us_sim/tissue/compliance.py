@@ -46,6 +46,7 @@ class SurfaceCompliance:
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
     fields: NDArray[np.floating]  # (3S, 3, F), m/N, what each force does to all free nodes
     count: int  # N, nodes of the mesh
+    rounding: float  # unbalanced force that rounding leaves in a field, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; rows without force are not read."""
@@ -93,6 +94,7 @@ def surface_compliance(model: TissueModel) -> SurfaceCompliance:
         np.ascontiguousarray(square + square.T) / 2,
         np.ascontiguousarray(fields),
         count,
+        0.0,
     )
 
 

@@ -1,0 +1,112 @@
+"""The exact linear finite element method: every frame is solved to rounding, not iterated towards.
+
+The stiffness is constant. So what a force on each node that the probe can reach does to the whole
+tissue is computed once (`us_sim.tissue.compliance`); in a frame the forces are found there, as a
+small complementarity problem (`us_sim.tissue.compliant_contact`), and the field is their sum.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.tissue.box import face_nodes
+>>> from us_sim.tissue.fem import Fem
+>>> from us_sim.tissue.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> solver = Fem(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
+>>> deformation.residual < 1e-6, bool(deformation.force[2] < 0)
+(True, True)
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from us_sim.pose import Pose
+from us_sim.tissue.compliance import surface_compliance
+from us_sim.tissue.compliant_contact import CompliantContact
+from us_sim.tissue.contact import wrench_on_probe
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solver import TissueSolver
+
+__all__ = ["Fem"]
+
+# How often nodes that were overlooked, because they were far from the probe, are added.
+_EXTENSIONS = 10
+
+
+class Fem(TissueSolver):
+    """Linear elasticity under a frictionless probe, by the compliance of the reachable surface.
+
+    The residual is what rounding leaves in the stored fields, as measured when they were made, and
+    the forces along the surface where the probe is curved.
+
+    Args:
+        model: at least three fixed nodes that are not on one line in every connected part.
+
+    Raises:
+        SolverError: a setting is out of range, or the tissue is not held.
+    """
+
+    name: ClassVar[str] = "fem"
+
+    def __init__(self, model: TissueModel) -> None:
+        self._compliance = surface_compliance(model)
+        self._reached = self._compliance.nodes
+        self._contact = CompliantContact(
+            model.collider,
+            model.mesh.nodes[self._reached],
+            model.contact_spacing,
+            self._compliance.matrix,
+        )
+        self._displacement = np.zeros_like(model.mesh.nodes)
+        super().__init__(model)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is; a quasi-static solver has no velocity."""
+        return TissueState(self._displacement.copy(), np.zeros_like(self._displacement))
+
+    def _restore(self, state: TissueState) -> None:
+        self._displacement = state.displacement.copy()
+        self._contact.clear()
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        contact, compliance = self._contact, self._compliance
+        action = ""
+        if pose is None:
+            contact.clear()
+        else:
+            solved = contact.press(pose)
+            displacement = compliance.field(contact.forces)
+            for _ in range(_EXTENSIONS):
+                if not contact.overlooked(pose, displacement[self._reached]):
+                    break
+                solved = contact.press_again(pose)
+                displacement = compliance.field(contact.forces)
+            else:
+                solved = False
+            if not solved:
+                action = "the contact did not settle, so the nearest solution found was kept"
+        self._settled = True
+        pushed = np.flatnonzero(contact.forces.any(axis=1))
+        if pose is None or len(pushed) == 0:
+            contact.clear()
+            self._displacement = np.zeros_like(self._displacement)
+            return self._resting()
+        displacement[self._reached[contact.near]] = contact.displacement[contact.near]
+        self._displacement = displacement
+        nodes = self.model.mesh.nodes + displacement
+        touched = self._reached[pushed]
+        forces = contact.forces[pushed]
+        force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        load = float(np.linalg.norm(forces))
+        residual = float(np.hypot(contact.sliding_force / load, compliance.rounding))
+        return Deformation(nodes, touched, force, torque, residual, action)
