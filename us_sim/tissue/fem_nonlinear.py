@@ -1,0 +1,326 @@
+"""Large deformation of nearly incompressible tissue, in real time.
+
+Quasi-static: every frame the elastic energy of `neo_hookean` is made least among the displacements
+that keep out of the probe. A frame predicts by the exact linear answer to the probe's motion (on
+the surface compliance, its contact a complementarity problem) and by what the last frame added to
+that; then Newton steps of a few conjugate-gradient iterations, held on the probe's surface, correct
+it. Motion too large for one prediction is cut into sub-steps, which may go on in later frames; no
+step is taken that turns a tetrahedron inside out, or that lowers neither the unbalanced forces nor
+the energy.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.tissue.box import face_nodes
+>>> from us_sim.tissue.fem_nonlinear import FemNonlinear
+>>> from us_sim.tissue.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> solver = FemNonlinear(model)
+>>> for _ in range(20):
+...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
+>>> deformation.residual <= 1e-5, deformation.action
+(True, '')
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.pose import Pose
+from us_sim.tissue.complementarity import unilateral
+from us_sim.tissue.compliance import surface_compliance
+from us_sim.tissue.contact import GAP_TOLERANCE, push_out, wrench_on_probe
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity import require_held
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.newton import Newton
+from us_sim.tissue.solver import TissueSolver, require_count, require_number, same_pose
+from us_sim.tissue.sub_steps import between, motion
+
+__all__ = ["FemNonlinear"]
+
+# One prediction carries the tissue this part of its smallest extent: 5 mm of 0.1 m.
+_STRIDE = 0.05
+
+# A prediction takes the time of so many iterations.
+_PREDICTION = 3
+
+# Conjugate-gradient iterations of one Newton step, and of a sub-step that others follow.
+_NEWTON, _PASSING = 6, 4
+
+# A sub-step is halved so often before the probe is not followed any further in this frame.
+_HALVINGS = 4
+
+# m. On taking over, a node this near the probe is taken to be pushed.
+_NEAR = 1e-4
+
+
+class FemNonlinear(TissueSolver):
+    """Stable neo-Hookean finite elements with frictionless contact, by Newton's method.
+
+    The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
+    probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
+    of the contact forces, in double precision and of the displacement that is returned.
+
+    Args:
+        model: at least three fixed nodes that are not on one line in every connected part.
+        iterations: of the conjugate gradients in an ordinary frame.
+        frame_tolerance: residual down to which a frame goes on after those.
+        most_iterations: in any frame; what is then left to do waits for the next.
+        tolerance: residual at which the tissue under an unmoved probe has settled.
+
+    Raises:
+        SolverError: a setting is out of range, or the tissue is not held.
+    """
+
+    name: ClassVar[str] = "fem_nonlinear"
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        iterations: int = 6,
+        frame_tolerance: float = 0.03,
+        most_iterations: int = 36,
+        tolerance: float = 1e-5,
+    ) -> None:
+        require_count("fem_nonlinear.iterations", iterations)
+        require_count("fem_nonlinear.most_iterations", most_iterations)
+        require_number("fem_nonlinear.frame_tolerance", frame_tolerance, 0.0, 1.0)
+        require_number("fem_nonlinear.tolerance", tolerance, 0.0, 1.0)
+        require_held(model.mesh, model.fixed)
+        super().__init__(model)
+        self._iterations = iterations
+        self._most_iterations = max(most_iterations, iterations)
+        self._frame_tolerance = frame_tolerance
+        self._tolerance = tolerance
+        self._surface = model.movable_contact_nodes
+        box = model.collider.offset_box
+        self._lever = float(np.linalg.norm(box[:3]) + box[3])
+        self._stride = _STRIDE * float(np.ptp(model.mesh.nodes, axis=0).min())
+        self._newton = Newton(model)
+        if len(self._surface):
+            self._compliance = surface_compliance(model)
+        self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
+        self._forget()
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is; a quasi-static solver has no velocity."""
+        displacement = self._newton.displacement.T.copy()
+        return TissueState(displacement, np.zeros_like(displacement))
+
+    def _restore(self, state: TissueState) -> None:
+        self._newton.rest()
+        self._forget()
+        if state.displacement.any():
+            self._newton.displacement = np.ascontiguousarray(state.displacement.T)
+            self._taken_over = True
+
+    def _forget(self) -> None:
+        self._followed: Pose | None = None  # the pose that the tissue is at
+        self._retreat = 0.0  # m, by which it is still kept off the probe there
+        self._taken_over = False
+        self._correction: NDArray[np.float64] | None = None  # (3, N) m, nonlinear part of a frame
+        self._motion = np.zeros(6)  # m, of the probe in that frame
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        newton = self._newton
+        depth = self._depth(pose, self.model.mesh.nodes[self._surface])
+        if pose is None or depth <= GAP_TOLERANCE:
+            # Nothing reaches the undeformed tissue: it is the solution.
+            newton.rest()
+            self._forget()
+            self._settled = True
+            return self._resting()
+        actions = []
+        if self._taken_over:
+            self._adopt(pose)
+        anew = math.ceil(depth / self._stride)
+        if self._followed is None or anew < self._steps_to(pose):
+            if self._followed is not None:
+                actions.append("began anew from rest")
+            newton.rest()
+            self._forget()
+            self._followed, self._retreat = pose, depth
+        imbalance, load = newton.imbalance, newton.load
+        taken = self._follow(pose)
+        if taken > 1:
+            actions.append(f"sub-stepped {taken} times")
+        if taken == 0:
+            self._improve(self._followed, self._retreat, self._iterations, self._most_iterations)
+        progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
+        return self._outcome(pose, progress, actions)
+
+    def _depth(self, pose: Pose | None, points: NDArray[np.float64]) -> float:
+        """How deep (m) the probe is in points (C, 3), at least 0."""
+        if pose is None or len(points) == 0:
+            return 0.0
+        gap, _ = push_out(self.model.collider, pose, points, self.model.contact_spacing)
+        return max(0.0, -float(gap.min()))
+
+    def _adopt(self, pose: Pose) -> None:
+        """Go on from another solver's displacement, or from rest where that is of no use."""
+        newton = self._newton
+        self._taken_over = False
+        if newton.tissue.smallest_volume_ratio(newton.displacement) <= 0.0:
+            return
+        self._followed, self._retreat = pose, self._depth(pose, newton.surface)
+        newton.contact.look(pose, self._retreat, newton.surface)
+        newton.contact.touched = newton.contact.gap < _NEAR
+        newton.settle_on(pose, self._retreat)
+
+    def _steps_to(self, pose: Pose) -> int:
+        """Into how many steps the rest of the way is cut."""
+        assert self._followed is not None
+        if same_pose(self._followed, pose) and self._retreat == 0.0:
+            return 0
+        way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+        return max(1, math.ceil(max(way, self._retreat) / self._stride - 1e-6))
+
+    def _follow(self, pose: Pose) -> int:
+        """Step towards the pose as far as the frame's iterations go; returns the steps taken."""
+        newton, budget = self._newton, self._most_iterations
+        taken = halvings = 0
+        ordinary = self._steps_to(pose) == 1
+        if not ordinary:
+            self._correction = None
+        while (steps := self._steps_to(pose)) and budget > 0:
+            assert self._followed is not None
+            share = 0.5**halvings / steps
+            target, retreat = between(self._followed, pose, share), self._retreat * (1 - share)
+            good = newton.snapshot()
+            least = self._iterations if share == 1.0 else _PASSING
+            used = self._attempt(target, retreat, least, max(budget - _PREDICTION, 1), ordinary)
+            budget -= _PREDICTION + abs(used)
+            if used < 0:
+                newton.restore(good)
+                self._correction = None
+                halvings += 1
+                if halvings > _HALVINGS:
+                    break
+            else:
+                self._followed, self._retreat = target, retreat
+                taken += 1
+        return taken
+
+    def _attempt(self, pose: Pose, retreat: float, least: int, most: int, ordinary: bool) -> int:
+        """One step; how many iterations it took, or -1 when it came out inside out."""
+        newton = self._newton
+        assert self._followed is not None
+        start = newton.displacement.copy()
+        inverted = newton.tissue.inverted(start)
+        step = motion(self._followed, pose, self._lever)
+        if self._correction is not None and (length := float(self._motion @ self._motion)) > 0:
+            likeness = min(max(float(step @ self._motion) / length, 0.0), 1.0)
+            newton.displacement = start + likeness * self._correction
+        self._field[:] = 0.0
+        self._predict(pose, retreat)
+        newton.displacement = newton.displacement + self._field
+        newton.settle_on(pose, retreat)
+        if not newton.tissue.inverted(newton.displacement) <= inverted:
+            return -1
+        used = self._improve(pose, retreat, least, most)
+        if ordinary:
+            self._correction = newton.displacement - start - self._field
+            self._motion = step
+        return used
+
+    def _improve(self, pose: Pose, retreat: float, least: int, most: int) -> int:
+        """Newton steps with so many iterations in all; how many were used."""
+        newton, used = self._newton, 0
+        while newton.imbalance > 0.0:
+            left = least - used
+            if left <= 0 and newton.imbalance > self._frame_tolerance * newton.load:
+                left = most - used
+            if left <= 0:
+                break
+            spent, better = newton.step(pose, retreat, min(left, _NEWTON))
+            used += max(spent, 1)
+            if not better:
+                break
+        return used
+
+    def _predict(self, pose: Pose, retreat: float) -> None:
+        """Fill the field with the linear answer to the probe's new pose, and say who touches it."""
+        contact = self._newton.contact
+        load = np.where(contact.touched[:, None], self._newton.force[:, self._surface].T, 0.0)
+        contact.look(pose, retreat, self._newton.surface)
+        near = np.flatnonzero(contact.touched | (contact.gap < 2 * self._stride))
+        near = near[np.isfinite(contact.gap[near])]
+        delassus, gap = _normal_problem(
+            self._compliance.matrix,
+            near,
+            np.flatnonzero(load.any(axis=1)),
+            contact.normal,
+            contact.gap,
+            load,
+        )
+        push, active = unilateral(delassus, gap, contact.touched[near] | (gap < 0))
+        change = -load
+        change[near] += push[:, None] * contact.normal[near]
+        contact.touched[:] = False
+        contact.touched[near[active]] = True
+        self._compliance.add_field(change, self._field)
+
+    def _outcome(self, pose: Pose, progress: bool, actions: list[str]) -> Deformation:
+        newton = self._newton
+        assert self._followed is not None
+        behind = self._steps_to(pose) > 0
+        kept = newton.snapshot()
+        if behind:
+            newton.weigh_on(pose)
+            actions.append(f"the tissue is {1e3 * self._depth(pose, newton.surface):.2g} mm behind")
+        contact = newton.contact
+        residual = newton.imbalance / newton.load if newton.load else float(newton.imbalance > 0)
+        self._settled = not progress or (residual <= self._tolerance and not behind)
+        if not progress and residual > self._tolerance:
+            actions.append("no step led any further")
+        nodes = self.model.mesh.nodes + newton.displacement.T
+        pushed = contact.push > 0
+        touched = self._surface[pushed]
+        forces = contact.push[pushed, None] * contact.normal[pushed]
+        force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        newton.restore(kept)
+        return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal_problem(compliance, near, loaded, normal, gap, load):
+    """Delassus matrix (K, K) of ``near`` nodes, and gaps (K,) with the loads taken off."""
+    count = len(near)
+    delassus = np.empty((count, count))
+    opened = np.empty(count)
+    for i in range(count):
+        a = near[i]
+        opened[i] = gap[a]
+        for m in range(len(loaded)):
+            b = loaded[m]
+            for d in range(3):
+                r = compliance[3 * a + d]
+                s = r[3 * b] * load[b, 0] + r[3 * b + 1] * load[b, 1] + r[3 * b + 2] * load[b, 2]
+                opened[i] -= normal[a, d] * s
+        for j in range(i + 1):
+            b = near[j]
+            total = 0.0
+            for d in range(3):
+                r = compliance[3 * a + d]
+                total += normal[a, d] * (
+                    r[3 * b] * normal[b, 0]
+                    + r[3 * b + 1] * normal[b, 1]
+                    + r[3 * b + 2] * normal[b, 2]
+                )
+            delassus[i, j] = total
+            delassus[j, i] = total
+    return delassus, opened

@@ -1,0 +1,115 @@
+"""Nodes that slide on the probe's surface without friction, in large deformation.
+
+>>> import numpy as np
+>>> from us_sim.collider import Sphere
+>>> from us_sim.pose import Pose
+>>> from us_sim.tissue.sliding_contact import SlidingContact
+>>> contact = SlidingContact(Sphere(0.03), 0.01)
+>>> positions = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
+>>> contact.clear(2)
+>>> contact.hold(Pose(position=[0.0, 0.0, 0.01]), 0.0, positions)
+>>> contact.touched, positions[0]
+(array([ True, False]), array([0.  , 0.  , 0.01]))
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.collider import Collider
+from us_sim.pose import Pose
+from us_sim.tissue.contact import GAP_TOLERANCE, only_forward, push_out
+
+__all__ = ["SlidingContact"]
+
+# A touched node beside a small rounding stays so until it is this part of the spacing away: pressed
+# down it moves out of the probe's way, and would come up and under it again without end.
+_SKIRT = 0.25
+
+# m. Where the push direction is not the surface's normal, one projection does not end on it.
+_EXACT, _PROJECTIONS = 1e-9, 4
+
+
+class SlidingContact:
+    """The active set of a large-deformation solver: who touches the probe, where, how hard.
+
+    Args:
+        collider: the probe's shape.
+        spacing: m, between neighbours among the nodes that it can touch.
+    """
+
+    def __init__(self, collider: Collider, spacing: float) -> None:
+        self._collider = collider
+        self._spacing = spacing
+        self._forward = only_forward(collider, spacing)
+        self.clear(0)
+
+    def clear(self, count: int) -> None:
+        """Touch none of ``count`` nodes."""
+        self.touched = np.zeros(count, dtype=bool)  # (C,)
+        self.gap = np.full(count, np.inf)  # (C,) m
+        self.normal = np.zeros((count, 3))  # (C, 3), direction in which the probe pushes
+        self.push = np.zeros(count)  # (C,) N, of the probe along the normal, negative when it pulls
+
+    def copy(self) -> SlidingContact:
+        """A snapshot to come back to."""
+        other = SlidingContact(self._collider, self._spacing)
+        other.touched, other.gap = self.touched.copy(), self.gap.copy()
+        other.normal, other.push = self.normal.copy(), self.push.copy()
+        return other
+
+    def look(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
+        """Measure gaps and normals at ``positions`` (C, 3).
+
+        Args:
+            pose: of the probe.
+            retreat: m, by which all gaps are taken to be wider than they are.
+            positions: m, frame ``patient``.
+        """
+        margin = np.where(self.touched, _SKIRT * self._spacing, 0.0)
+        gap, self.normal = push_out(self._collider, pose, positions, self._spacing, margin)
+        self.gap = gap + retreat
+        self.touched &= np.isfinite(gap)
+
+    def hold(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
+        """Add the nodes that the probe has entered, and move all touched ones onto it, in place."""
+        self.look(pose, retreat, positions)
+        for _ in range(_PROJECTIONS):
+            self.touched |= self.gap < -GAP_TOLERANCE
+            off = self.touched & (np.abs(self.gap) > _EXACT)
+            if not off.any():
+                return
+            positions[off] -= self.gap[off, None] * self.normal[off]
+            self.look(pose, retreat, positions)
+
+    def weigh(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the probe does not balance of the forces (C, 3) N that hold the nodes: (C, 3) N.
+
+        Along the normal a touched node is pushed, not pulled.
+        """
+        self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
+        return force - np.maximum(self.push, 0.0)[:, None] * self.normal
+
+    def release(self) -> None:
+        """Let go whom the probe would have to pull."""
+        self.touched &= self.push >= 0.0
+        self.push[~self.touched] = 0.0
+
+    def curvature(self, pose: Pose, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, 3, 3) 1/m, how the surface's normal turns as each touched node moves along it.
+
+        Where the collider is round about a point, a line or a plane, the normal turns in three, two
+        or no directions away from it; a push along a fixed direction does not turn.
+        """
+        count = int(self.touched.sum())
+        if self._forward:
+            return np.zeros((count, 3, 3))
+        rotation, box = pose.rotation, self._collider.offset_box
+        local = (positions[self.touched] - pose.position) @ rotation
+        local[:, 2] += box[2] + box[3]
+        round_about = np.abs(local) >= box[:3]
+        normal = self.normal[self.touched]
+        turn = np.einsum("ij,kj,mj->kim", rotation, round_about.astype(float), rotation)
+        turn -= normal[:, :, None] * normal[:, None, :]
+        return turn / box[3]
