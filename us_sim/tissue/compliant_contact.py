@@ -3,8 +3,8 @@
 Newton's method: at every round the probe is replaced by its tangent planes where the nodes now are,
 the linear complementarity problem between pushes and gaps is solved exactly, and the nodes are
 moved. On a curved probe the planes turn with them, which Anderson's mixing of the last rounds
-takes into account (D. G. Anderson, Iterative procedures for nonlinear integral equations, J. ACM 12,
-1965), so that a few rounds bring the gaps below a nanometre.
+takes into account (D. G. Anderson, Iterative procedures for nonlinear integral equations, J. ACM
+12, 1965), so that a few rounds bring the gaps below a nanometre.
 
 >>> import numpy as np
 >>> from us_sim.collider import Sphere

@@ -85,13 +85,13 @@ class TissueSolver(ABC):
         """
         if self._settled and same_pose(probe_pose, self._pose):
             return self._last
-        good, settled = self.state, self._settled
+        good = self.state
         deformation = self._advance(probe_pose)
         if self._is_plausible(deformation):
             self._pose = probe_pose
         else:
             self._restore(good)
-            self._settled = settled
+            self._settled = False  # so that the next frame tries again
             deformation = replace(
                 self._last,
                 action="the frame came out not finite or far away, so the last good state was kept",
