@@ -31,6 +31,7 @@ from us_sim.tissue.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity import shape_gradients
 from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
+from us_sim.tissue.neo_hookean_cells import CellSums
 from us_sim.tissue.neo_hookean_tetrahedra import TetrahedraSums
 
 __all__ = ["NeoHookean"]
@@ -54,13 +55,14 @@ class NeoHookean:
     ) -> None:
         self.dtype = np.dtype(dtype)
         self._count = len(mesh.nodes)
-        self._sums = TetrahedraSums(mesh, materials, self.dtype)
+        kind = TetrahedraSums if mesh.planes is None else CellSums
+        self._sums: TetrahedraSums | CellSums = kind(mesh, materials, self.dtype)
         weight = bulk_shares(materials).nodal * mesh.volumes / 4
         total = np.bincount(mesh.tetrahedra.ravel(), np.repeat(weight, 4), self._count)
         self._averaged = bool(total.any())
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
-        self._nodal = np.zeros(self._count, dtype=self.dtype)
+        self._nodal = np.zeros(self._count if self._averaged else 0, dtype=self.dtype)
         self._nodal_blocks = _nodal_blocks(mesh, weight, total).astype(self.dtype)
         self.linearise(np.zeros((3, self._count), dtype=self.dtype))
 

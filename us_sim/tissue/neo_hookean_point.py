@@ -25,6 +25,9 @@ from __future__ import annotations
 from numba import njit
 
 __all__ = [
+    "INLINED",
+    "LOOP",
+    "block",
     "cofactor_change",
     "cofactor_slope",
     "energy_density",
@@ -34,14 +37,9 @@ __all__ = [
     "volume_change",
 ]
 
-# Contraction to fused multiply-adds; NaN stays NaN.
-INLINED = {
-    "forceinline": True,
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"contract", "nsz"},
-}
+# How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
+LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+INLINED = {**LOOP, "forceinline": True}
 
 
 @njit(**INLINED)
@@ -151,4 +149,25 @@ def stress_slope(h, c, d, shear, k, rise):
         (shear * d[6] + k * e[6]) + rise * c[6],
         (shear * d[7] + k * e[7]) + rise * c[7],
         (shear * d[8] + k * e[8]) + (rise * c[8] + rise),
+    )
+
+
+@njit(**INLINED)
+def block(g, c, shear, bulk):
+    """(xx, xy, xz, yy, yz, zz) of mu g.g I + bulk (cof F g)(cof F g)', c being cof F - I.
+
+    This is how a node with the shape gradient g resists its own displacement; the rest of the
+    stress has no part in it.
+    """
+    x = (c[0] * g[0] + c[1] * g[1] + c[2] * g[2]) + g[0]
+    y = (c[3] * g[0] + c[4] * g[1] + c[5] * g[2]) + g[1]
+    z = (c[6] * g[0] + c[7] * g[1] + c[8] * g[2]) + g[2]
+    plain = shear * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    return (
+        plain + bulk * x * x,
+        bulk * x * y,
+        bulk * x * z,
+        plain + bulk * y * y,
+        bulk * y * z,
+        plain + bulk * z * z,
     )

@@ -28,6 +28,8 @@ from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.neo_hookean_point import (
     INLINED,
+    LOOP,
+    block,
     cofactor_change,
     energy_density,
     inner,
@@ -46,6 +48,9 @@ _SHEAR, _ELEMENT, _NODAL, _CONSTANTS = 9, 10, 11, 12
 
 # Rows of what the tangent needs: gradient of the displacement, and V (p - mu).
 _K, _TANGENT = 9, 10
+
+# Rows of the buffer: the field at four nodes, the nodes' sums, and from here what comes out.
+_OUT = 16
 
 
 class TetrahedraSums:
@@ -66,7 +71,7 @@ class TetrahedraSums:
         # Places beyond the last tetrahedron name node 0 and have no stiffness.
         self._nodes = _in_lanes(mesh.tetrahedra.astype(np.uint32))
         self._tangent = np.zeros((len(self._nodes), _TANGENT * _LANES), dtype=dtype)
-        self._lanes = np.zeros((2, 24 * _LANES), dtype=dtype)
+        self._lanes = np.zeros((_OUT + 24) * _LANES, dtype=dtype)
 
     def energy(self, displacement: NDArray) -> float:
         """J, of the tetrahedra's own share."""
@@ -112,9 +117,6 @@ def _in_lanes(rows: NDArray) -> NDArray:
     return np.ascontiguousarray(lanes).reshape(chunks, -1)
 
 
-_LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-
-
 @njit(**INLINED)
 def _gather(field, nodes, lanes):
     """Rows 3 b + axis of lanes: the field (3, N) at the b-th node of each tetrahedron."""
@@ -140,7 +142,7 @@ def _scatter(lanes, nodes, field):
     for axis in range(3):
         values = field[axis]
         for corner in range(4):
-            added = lanes[(3 * corner + axis) * _LANES : (3 * corner + axis + 1) * _LANES]
+            added = lanes[(_OUT + 3 * corner + axis) * _LANES :]
             at = nodes[corner * _LANES : (corner + 1) * _LANES]
             for w in range(_LANES):
                 values[at[w]] += added[w]
@@ -152,7 +154,7 @@ def _scatter_scalar(lanes, nodes, values):
     for corner in range(4):
         at = nodes[corner * _LANES : (corner + 1) * _LANES]
         for w in range(_LANES):
-            values[at[w]] += lanes[w]
+            values[at[w]] += lanes[_OUT * _LANES + w]
 
 
 @njit(**INLINED)
@@ -183,25 +185,25 @@ def _gradient(field, constants, w):
 
 
 @njit(**INLINED)
-def _put_row(px, py, pz, constants, w, out, axis):
+def _put_row(px, py, pz, constants, w, lanes, axis):
     """Along one axis, the force of a row of the stress times volume at all four nodes."""
     a = px * constants[w] + py * constants[_LANES + w] + pz * constants[2 * _LANES + w]
     b = px * constants[3 * _LANES + w] + py * constants[4 * _LANES + w]
     b += pz * constants[5 * _LANES + w]
     c = px * constants[6 * _LANES + w] + py * constants[7 * _LANES + w]
     c += pz * constants[8 * _LANES + w]
-    out[axis * _LANES + w] = -(a + b + c)
-    out[(3 + axis) * _LANES + w] = a
-    out[(6 + axis) * _LANES + w] = b
-    out[(9 + axis) * _LANES + w] = c
+    lanes[(_OUT + axis) * _LANES + w] = -(a + b + c)
+    lanes[(_OUT + 3 + axis) * _LANES + w] = a
+    lanes[(_OUT + 6 + axis) * _LANES + w] = b
+    lanes[(_OUT + 9 + axis) * _LANES + w] = c
 
 
 @njit(**INLINED)
-def _put_forces(p, constants, w, out):
+def _put_forces(p, constants, w, lanes):
     """Rows 3 b + axis of out: the force of the stress p, times volume, at the b-th node."""
-    _put_row(p[0], p[1], p[2], constants, w, out, 0)
-    _put_row(p[3], p[4], p[5], constants, w, out, 1)
-    _put_row(p[6], p[7], p[8], constants, w, out, 2)
+    _put_row(p[0], p[1], p[2], constants, w, lanes, 0)
+    _put_row(p[3], p[4], p[5], constants, w, lanes, 1)
+    _put_row(p[6], p[7], p[8], constants, w, lanes, 2)
 
 
 @njit(**INLINED)
@@ -242,156 +244,151 @@ def _stored(rows, w):
     )
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _energy(displacement, nodes, constants, lanes):
     total = 0.0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(displacement, nodes[chunk], into)
+        _gather(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(_LANES):
-            h = _gradient(into, rows, w)
-            out[w] = energy_density(h, rows[_SHEAR * _LANES + w], rows[_ELEMENT * _LANES + w])
+            h = _gradient(lanes, rows, w)
+            lanes[_OUT * _LANES + w] = energy_density(
+                h, rows[_SHEAR * _LANES + w], rows[_ELEMENT * _LANES + w]
+            )
         for w in range(_LANES):
-            total += out[w]
+            total += lanes[_OUT * _LANES + w]
     return total
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _volume_ratios(displacement, nodes, constants, lanes):
     smallest = np.inf
     inverted = 0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(displacement, nodes[chunk], into)
+        _gather(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(_LANES):
-            out[w] = 1 + volume_change(_gradient(into, rows, w))
+            lanes[_OUT * _LANES + w] = 1 + volume_change(_gradient(lanes, rows, w))
         for w in range(_LANES):
             if rows[_SHEAR * _LANES + w] > 0:
-                if not out[w] >= smallest:
-                    smallest = out[w]
-                if not out[w] > 0:
+                if not lanes[_OUT * _LANES + w] >= smallest:
+                    smallest = lanes[_OUT * _LANES + w]
+                if not lanes[_OUT * _LANES + w] > 0:
                     inverted += 1
     return smallest, inverted
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _volume_changes(displacement, nodes, constants, lanes, nodal):
     nodal[:] = 0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(displacement, nodes[chunk], into)
+        _gather(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(_LANES):
-            h = _gradient(into, rows, w)
-            out[w] = rows[_NODAL * _LANES + w] * volume_change(h)
-        _scatter_scalar(out, nodes[chunk], nodal)
+            h = _gradient(lanes, rows, w)
+            lanes[_OUT * _LANES + w] = rows[_NODAL * _LANES + w] * volume_change(h)
+        _scatter_scalar(lanes, nodes[chunk], nodal)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _forces(displacement, nodal, nodes, constants, lanes, forces):
     forces[:, :] = 0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(displacement, nodes[chunk], into)
-        _gather_scalar(nodal, nodes[chunk], into)
+        _gather(displacement, nodes[chunk], lanes)
+        if len(nodal):
+            _gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(_LANES):
-            h = _gradient(into, rows, w)
-            pressure = rows[_ELEMENT * _LANES + w] * volume_change(h) + _nodal_sum(into, rows, w)
-            _put_forces(stress(h, rows[_SHEAR * _LANES + w], pressure), rows, w, out)
-        _scatter(out, nodes[chunk], forces)
+            h = _gradient(lanes, rows, w)
+            pressure = rows[_ELEMENT * _LANES + w] * volume_change(h) + _nodal_sum(lanes, rows, w)
+            _put_forces(stress(h, rows[_SHEAR * _LANES + w], pressure), rows, w, lanes)
+        _scatter(lanes, nodes[chunk], forces)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
-    into = lanes[0]
     for chunk in range(len(nodes)):
-        _gather(displacement, nodes[chunk], into)
-        _gather_scalar(nodal, nodes[chunk], into)
+        _gather(displacement, nodes[chunk], lanes)
+        if len(nodal):
+            _gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(_LANES):
-            h = _gradient(into, rows, w)
+            h = _gradient(lanes, rows, w)
             _keep(h, kept, w)
-            pressure = rows[_ELEMENT * _LANES + w] * volume_change(h) + _nodal_sum(into, rows, w)
+            pressure = rows[_ELEMENT * _LANES + w] * volume_change(h) + _nodal_sum(lanes, rows, w)
             kept[_K * _LANES + w] = pressure - rows[_SHEAR * _LANES + w]
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _volume_slopes(change, nodes, constants, tangent, lanes, nodal):
     nodal[:] = 0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(change, nodes[chunk], into)
+        _gather(change, nodes[chunk], lanes)
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(_LANES):
-            d = _gradient(into, rows, w)
+            d = _gradient(lanes, rows, w)
             c = cofactor_change(_stored(kept, w))
-            out[w] = rows[_NODAL * _LANES + w] * (inner(c, d) + (d[0] + d[4] + d[8]))
-        _scatter_scalar(out, nodes[chunk], nodal)
+            lanes[_OUT * _LANES + w] = rows[_NODAL * _LANES + w] * (
+                inner(c, d) + (d[0] + d[4] + d[8])
+            )
+        _scatter_scalar(lanes, nodes[chunk], nodal)
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
     product[:, :] = 0
-    into, out = lanes[0], lanes[1]
     for chunk in range(len(nodes)):
-        _gather(change, nodes[chunk], into)
-        _gather_scalar(nodal, nodes[chunk], into)
+        _gather(change, nodes[chunk], lanes)
+        if len(nodal):
+            _gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(_LANES):
-            d = _gradient(into, rows, w)
+            d = _gradient(lanes, rows, w)
             h = _stored(kept, w)
             c = cofactor_change(h)
             rise = rows[_ELEMENT * _LANES + w] * (inner(c, d) + (d[0] + d[4] + d[8]))
-            rise += _nodal_sum(into, rows, w)
+            rise += _nodal_sum(lanes, rows, w)
             slope = stress_slope(h, c, d, rows[_SHEAR * _LANES + w], kept[_K * _LANES + w], rise)
-            _put_forces(slope, rows, w, out)
-        _scatter(out, nodes[chunk], product)
+            _put_forces(slope, rows, w, lanes)
+        _scatter(lanes, nodes[chunk], product)
 
 
 @njit(**INLINED)
-def _put_block(gx, gy, gz, c, shear, element, out, row, w):
-    """The block of a node with shape gradient g: V (mu g.g I + element (cof F g) (cof F g)')."""
-    x = (c[0] * gx + c[1] * gy + c[2] * gz) + gx
-    y = (c[3] * gx + c[4] * gy + c[5] * gz) + gy
-    z = (c[6] * gx + c[7] * gy + c[8] * gz) + gz
-    plain = shear * (gx * gx + gy * gy + gz * gz)
-    out[row * _LANES + w] = plain + element * x * x
-    out[(row + 1) * _LANES + w] = element * x * y
-    out[(row + 2) * _LANES + w] = element * x * z
-    out[(row + 3) * _LANES + w] = plain + element * y * y
-    out[(row + 4) * _LANES + w] = element * y * z
-    out[(row + 5) * _LANES + w] = plain + element * z * z
+def _put_block(b, lanes, corner, w):
+    """Rows 6 corner to 6 corner + 5 from _OUT on."""
+    row = (_OUT + 6 * corner) * _LANES + w
+    lanes[row] = b[0]
+    lanes[row + _LANES] = b[1]
+    lanes[row + 2 * _LANES] = b[2]
+    lanes[row + 3 * _LANES] = b[3]
+    lanes[row + 4 * _LANES] = b[4]
+    lanes[row + 5 * _LANES] = b[5]
 
 
-@njit(**_LOOP)
+@njit(**LOOP)
 def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
     blocks[:, :] = 0
-    out = lanes[0]
     for chunk in range(len(nodes)):
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(_LANES):
             c = cofactor_change(_stored(kept, w))
             shear, element = rows[_SHEAR * _LANES + w], rows[_ELEMENT * _LANES + w]
-            ax, ay, az = rows[w], rows[_LANES + w], rows[2 * _LANES + w]
-            bx, by, bz = rows[3 * _LANES + w], rows[4 * _LANES + w], rows[5 * _LANES + w]
-            cx, cy, cz = rows[6 * _LANES + w], rows[7 * _LANES + w], rows[8 * _LANES + w]
-            _put_block(
-                -(ax + bx + cx), -(ay + by + cy), -(az + bz + cz), c, shear, element, out, 0, w
-            )
-            _put_block(ax, ay, az, c, shear, element, out, 6, w)
-            _put_block(bx, by, bz, c, shear, element, out, 12, w)
-            _put_block(cx, cy, cz, c, shear, element, out, 18, w)
+            x = (rows[w], rows[_LANES + w], rows[2 * _LANES + w])
+            y = (rows[3 * _LANES + w], rows[4 * _LANES + w], rows[5 * _LANES + w])
+            z = (rows[6 * _LANES + w], rows[7 * _LANES + w], rows[8 * _LANES + w])
+            o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
+            _put_block(block(o, c, shear, element), lanes, 0, w)
+            _put_block(block(x, c, shear, element), lanes, 1, w)
+            _put_block(block(y, c, shear, element), lanes, 2, w)
+            _put_block(block(z, c, shear, element), lanes, 3, w)
         for corner in range(4):
             at = nodes[chunk, corner * _LANES : (corner + 1) * _LANES]
             for entry in range(6):
                 values = blocks[entry]
-                added = out[(6 * corner + entry) * _LANES :]
+                added = lanes[(_OUT + 6 * corner + entry) * _LANES :]
                 for w in range(_LANES):
                     values[at[w]] += added[w]
