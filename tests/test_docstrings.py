@@ -30,6 +30,7 @@ def test_examples(name):
         "us_sim.collider",
         "us_sim.tissue.fem_cg",
         "us_sim.tissue.msds",
+        "us_sim.tissue.msds_implicit",
         "us_sim.skin.membrane",
         "us_sim.slicing.row_subdivision",
         "us_sim.volume.phantom",

@@ -1,16 +1,15 @@
-"""Algorithm 1, the Voigt element and the limit of the time step against what theory says."""
+"""Algorithm 1, the fitted springs and the Voigt element against what theory says."""
 
 import math
 
 import numpy as np
 import pytest
-from scipy.linalg import eigh
-from tissue_block import SOFT, block, block_mesh
+from tissue_block import SOFT, block_mesh
 
-from us_sim.errors import SolverError
-from us_sim.tissue.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity import stiffness
+from us_sim.tissue.materials import Material, TissueMaterials, uniform_material
 from us_sim.tissue.mesh import TetrahedralMesh
-from us_sim.tissue.springs import SpringNetwork, springs_of, stabilised, step_limit
+from us_sim.tissue.springs import SpringNetwork, fitted_springs, springs_of
 
 MESH = block_mesh((4, 3, 3))
 SPRINGS = springs_of(MESH, uniform_material(MESH, SOFT))
@@ -76,96 +75,72 @@ def test_springs_between_held_nodes_are_dropped():
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_highest_frequency_is_the_dense_eigenvalue(held):
+def test_the_factor_gives_the_derivative_of_the_forces(held):
     fixed = (MESH.nodes[:, 2] == 0.1) & held
-    mass = np.random.default_rng(3).uniform(0.01, 0.1, len(MESH.nodes))
-    # Differences of the forces themselves: an independent linearisation.
-    count, step = MESH.nodes.size, 1e-7
-    still = np.zeros_like(MESH.nodes)
-    matrix = np.empty((count, count))
-    for i in range(count):
-        moved = np.zeros(count)
-        moved[i] = step
-        moved = moved.reshape(-1, 3)
-        change = SPRINGS.forces(MESH.nodes - moved, still) - SPRINGS.forces(
-            MESH.nodes + moved, still
-        )
-        matrix[:, i] = change.ravel() / (2 * step)
-    free = np.repeat(~fixed, 3)
-    squares = eigh(
-        (matrix + matrix.T)[np.ix_(free, free)] / 2,
-        np.diag(np.repeat(mass, 3)[free]),
-        eigvals_only=True,
+    springs = SPRINGS.without(fixed)
+    factor = springs.factor(MESH.nodes)
+    move = np.random.default_rng(3).normal(0, 1e-7, MESH.nodes.shape)
+    still = np.zeros_like(move)
+    change = springs.forces(MESH.nodes - move, still) - springs.forces(MESH.nodes + move, still)
+    linear = (factor.T @ (factor @ move.ravel())).reshape(-1, 3)
+    np.testing.assert_allclose(linear, change / 2, atol=1e-6 * abs(linear).max())
+
+
+def test_fitted_springs_on_a_regular_tetrahedron():
+    # Edge a = 0.1 m: V = a**3 / 72**0.5, six edges, k = 15 mu V / 6 a**2 = mu a 15 / 6 / 72**0.5.
+    nodes = 0.1 / math.sqrt(8) * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    mesh = TetrahedralMesh(
+        nodes, [[0, 1, 2, 3]] if np.linalg.det(nodes[1:] - nodes[0]) > 0 else [[0, 1, 3, 2]]
     )
-    frequency = SPRINGS.highest_frequency(MESH.nodes, mass, fixed)
-    assert frequency == pytest.approx(math.sqrt(squares[-1]), rel=1e-3)
-    bound = 2 * (SPRINGS.node_stiffness(len(mass)) / mass)[~fixed].max()
-    assert frequency**2 < bound
+    materials = uniform_material(mesh, Material(10e3, 0.25, 1000.0))
+    springs = fitted_springs(mesh, materials)
+    np.testing.assert_allclose(springs.stiffness, 4e3 * 0.1 * 15 / 6 / math.sqrt(72))
+    np.testing.assert_allclose(springs.lame_constant(mesh), 4e3)
+    # There springs and elasticity agree on a swelling exactly, node by node.
+    swollen = (1e-6 * nodes).ravel()
+    factor = springs.factor(mesh.nodes)
+    elastic = stiffness(mesh, materials) @ swollen
+    np.testing.assert_allclose(factor.T @ (factor @ swollen), elastic, rtol=1e-9)
 
 
-def test_a_few_free_nodes_have_a_frequency_too():
-    fixed = np.ones(len(MESH.nodes), dtype=bool)
-    fixed[:2] = False
-    assert SPRINGS.highest_frequency(MESH.nodes, np.ones(len(MESH.nodes)), fixed) > 0
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.45, 0.4999])
+@pytest.mark.parametrize("shape", [(4, 3, 3), (9, 5, 7)])
+def test_fitted_springs_store_the_energy_of_elasticity_whatever_the_spacing(shape, ratio):
+    mesh = block_mesh(shape)
+    springs = fitted_springs(mesh, uniform_material(mesh, Material(10e3, ratio, 1000.0)))
+    shear = 10e3 / (2 * (1 + max(ratio, 0.25)))
+    quarter = uniform_material(mesh, Material(2.5 * shear, 0.25, 1000.0))
+    matrix, factor = stiffness(mesh, quarter), springs.factor(mesh.nodes)
+    swollen = 1e-3 * mesh.nodes.ravel()
+    energy = ((factor @ swollen) ** 2).sum()
+    assert energy == pytest.approx(swollen @ (matrix @ swollen), rel=1e-9)
+    random = np.random.default_rng(0)
+    ratios = []
+    for _ in range(50):  # any other strain on average over its orientations
+        turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        strained = 1e-3 * (mesh.nodes @ turn @ np.diag([1.0, -0.4, 0.0]) @ turn.T).ravel()
+        ratios.append(((factor @ strained) ** 2).sum() / (strained @ (matrix @ strained)))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("damping_factor", [0.0, 1e-3, 0.1])
-def test_the_observed_limit_of_stability_is_the_predicted_one(damping_factor):
-    springs = springs_of(MESH, uniform_material(MESH, SOFT), damping_factor=damping_factor)
-    fixed = MESH.nodes[:, 2] == 0.1
-    mass = block((4, 3, 3)).lumped_mass
-    limit = step_limit(springs.highest_frequency(MESH.nodes, mass, fixed), damping_factor)
-
-    def grows(step: float) -> bool:
-        """Symplectic Euler from a disturbance so small that the springs stay linear."""
-        velocity = np.random.default_rng(0).normal(0, 1e-9, MESH.nodes.shape) / step
-        velocity[fixed] = 0.0
-        positions = MESH.nodes.copy()
-        for _ in range(1500):
-            force = springs.forces(positions, velocity)
-            force[fixed] = 0.0
-            velocity += step * force / mass[:, None]
-            positions += step * velocity
-            if abs(positions - MESH.nodes).max() > 1e-5:
-                return True
-        return False
-
-    assert not grows(0.98 * limit)
-    assert grows(1.02 * limit)
+def test_without_a_volume_term_the_fit_keeps_youngs_modulus():
+    soft, quarter = (uniform_material(MESH, Material(10e3, nu, 1e3)) for nu in (0.45, 0.25))
+    kept = fitted_springs(MESH, soft, with_volume=False)
+    np.testing.assert_allclose(kept.stiffness, fitted_springs(MESH, quarter).stiffness)
 
 
-def test_step_limit_solves_its_equation():
-    for frequency, damping_factor in ((10.0, 0.0), (1e3, 0.1), (1e6, 0.1), (5.0, 2.0)):
-        step = step_limit(frequency, damping_factor)
-        span = step**2 + 2 * damping_factor * step
-        assert span == pytest.approx(4 / frequency**2, rel=1e-12)
-
-
-def test_a_stable_step_leaves_the_masses_alone():
-    model = block((4, 3, 3))
-    mass, substeps, action = stabilised(model, SPRINGS, 1e-6, 0.1, "mass_scaling", 100)
-    np.testing.assert_array_equal(mass, model.lumped_mass)
-    assert (substeps, action) == (1, "")
-
-
-def test_masses_are_scaled_where_needed_and_it_is_said():
-    model = block((4, 3, 3))
-    mass, substeps, action = stabilised(model, SPRINGS, 0.01, 0.1, "mass_scaling", 100)
-    assert substeps == 1
-    assert (mass >= model.lumped_mass).all()
-    frequency = SPRINGS.highest_frequency(MESH.nodes, mass, model.fixed)
-    assert 0.01 < step_limit(frequency, 0.1) < 0.03
-    factor = (mass / model.lumped_mass)[~model.fixed]
-    assert action.startswith(f"masses scaled {factor.min():.0f} to {factor.max():.0f} times")
-
-
-def test_substeps_are_counted_or_refused():
-    model = block((4, 3, 3))
-    mass, substeps, action = stabilised(model, SPRINGS, 0.01, 0.1, "substeps", 100)
-    np.testing.assert_array_equal(mass, model.lumped_mass)
-    assert substeps > 1
-    frequency = SPRINGS.highest_frequency(MESH.nodes, mass, model.fixed)
-    assert 0.01 / substeps < step_limit(frequency, 0.1) < 4 * 0.01 / substeps
-    assert action.startswith(f"{substeps} sub-steps a step")
-    with pytest.raises(SolverError, match=f"needs {substeps} sub-steps"):
-        stabilised(model, SPRINGS, 0.01, 0.1, "substeps", substeps - 1)
+def test_what_algorithm_1_hides_is_a_length():
+    # The same block in cells half as large: fitted springs halve, Algorithm 1's stay.
+    coarse, fine = block_mesh((5, 3, 3)), block_mesh((9, 5, 5))
+    total = []
+    for mesh in (coarse, fine):
+        materials = uniform_material(mesh, SOFT)
+        total.append(
+            (
+                springs_of(mesh, materials).lame_constant(mesh) @ mesh.volumes,
+                fitted_springs(mesh, materials).lame_constant(mesh) @ mesh.volumes,
+            )
+        )
+    assert total[1][0] == pytest.approx(2 * total[0][0], rel=0.01)
+    assert total[1][1] == pytest.approx(total[0][1], rel=1e-9)
+    assert total[1][1] == pytest.approx(10e3 / 2.9 * 0.002, rel=1e-9)  # mu times 2 l

@@ -19,10 +19,10 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
@@ -31,13 +31,16 @@ from us_sim.tissue.contact import only_forward, push_out
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solver import TissueSolver, require_count, require_number
-from us_sim.tissue.springs import springs_of, stabilised
+from us_sim.tissue.springs import SpringNetwork, fitted_springs, springs_of
+from us_sim.tissue.step_limit import highest_frequency, stabilised, step_limit
 from us_sim.tissue.symplectic_euler import advance_frame
+from us_sim.tissue.tangling import Tangling
+from us_sim.tissue.volume_term import VolumeTerm, volume_term
 
 __all__ = ["Msds"]
 
-# Frames that a released tissue is given to untangle by itself.
-_PATIENCE = 10
+# s. Motion is watched for at least as long before the tissue counts as settled.
+_REST_TIME = 0.2
 
 # m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
@@ -49,7 +52,7 @@ class Msds(TissueSolver):
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
     so either each mass is raised to what the asked step needs or each step is divided. Both follow
     the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
-    turn and stretch.
+    turn and stretch (`us_sim.tissue.step_limit`).
 
     The probe moves from the last pose to the new one over the frame. A node that would enter it
     loses its velocity towards it, which is the measured push, and is put onto its surface.
@@ -64,9 +67,15 @@ class Msds(TissueSolver):
         time_step: s.
         stiffness_factor: m, spring constant over Young's modulus.
         damping_factor: s, damping constant over spring constant.
-        stabilisation: ``mass_scaling`` or ``substeps``.
+        stiffness: of the springs: ``algorithm_1``, the paper's, or ``fitted`` to the elasticity of
+            the same mesh, which needs no stiffness_factor.
+        volume: whether tetrahedra resist changes of volume as the material does, and not only as
+            springs do, which have Poisson's ratio 1/4.
+        stabilisation: ``mass_scaling``, ``substeps``, or ``none``: a step beyond the limit then
+            ends in frames of which only the last good state is kept.
         maximum_substeps: of one step; more are refused.
-        rest_tolerance: m, motion in a frame below which the tissue counts as settled.
+        rest_tolerance: m, motion in a frame (in 0.2 s, or in damping_factor, if these are longer)
+            below which the tissue counts as settled.
 
     Raises:
         SolverError: a setting is out of range, or too many sub-steps would be needed.
@@ -80,6 +89,8 @@ class Msds(TissueSolver):
         *,
         steps: int = 20,
         time_step: float = 0.01,
+        stiffness: str = "algorithm_1",
+        volume: bool = False,
         stiffness_factor: float = 0.002,
         damping_factor: float = 0.1,
         stabilisation: str = "mass_scaling",
@@ -93,20 +104,25 @@ class Msds(TissueSolver):
         require_number("msds.rest_tolerance", rest_tolerance, 0.0)
         if damping_factor != 0:
             require_number("msds.damping_factor", damping_factor, 0.0)
-        if stabilisation not in ("mass_scaling", "substeps"):
+        if stabilisation not in ("mass_scaling", "substeps", "none"):
             raise SolverError(
-                f"msds.stabilisation is {stabilisation!r}: choose mass_scaling or substeps"
+                f"msds.stabilisation is {stabilisation!r}: choose mass_scaling, substeps or none"
             )
         super().__init__(model)
         self._steps = steps
         self._rest_tolerance = rest_tolerance
-        springs = springs_of(model.mesh, model.materials, stiffness_factor, damping_factor)
-        self._springs = springs.without(model.fixed)
+        self._damping_factor = damping_factor
+        self._springs, self._volume = spring_tissue(
+            "msds", model, stiffness, volume, stiffness_factor, damping_factor
+        )
+        self._volume_arrays = (*self._volume.arrays, np.empty_like(self._volume.rest_volume))
+        self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
         self.mass, self._substeps, self._action = stabilised(
-            model, self._springs, time_step, damping_factor, stabilisation, maximum_substeps
+            model, self._factors, time_step, damping_factor, stabilisation, maximum_substeps
         )  # mass: (N,) kg, as simulated
         self._time_step = time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
+        self._tangling = Tangling(model)
         self._forward = only_forward(model.collider, model.contact_spacing)
 
         self._positions = model.mesh.nodes.copy()
@@ -114,6 +130,14 @@ class Msds(TissueSolver):
         self._force = np.zeros_like(self._positions)
         self._normal = np.zeros((len(model.movable_contact_nodes), 3))
         self._restore(self.state)
+
+    @property
+    def step_limit(self) -> float:
+        """s, the longest stable step of small oscillations with the masses as simulated."""
+        if self.model.fixed.all():
+            return math.inf
+        frequency = highest_frequency(self._factors, self.mass, self.model.fixed)
+        return step_limit(frequency, self._damping_factor)
 
     @property
     def state(self) -> TissueState:
@@ -126,7 +150,7 @@ class Msds(TissueSolver):
         self._velocity[self.model.fixed] = 0.0
         self._touched = np.zeros(len(self._normal), dtype=bool)
         self._heaviest = 0.0  # N, largest norm of contact forces since the tissue was at rest
-        self._frames_free = 0
+        self._tangling.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._touched.any() and not self._entered(pose):
@@ -161,6 +185,8 @@ class Msds(TissueSolver):
             self._touched,
             self._normal,
             wrench,
+            self._volume_arrays,
+            self._damping_factor,
         )
         return self._outcome(pose, wrench[0], wrench[1])
 
@@ -203,6 +229,7 @@ class Msds(TissueSolver):
         still = np.zeros_like(self._velocity)
         action = self._put_back_if_tangled()
         unbalanced = self._springs.forces(self._positions, still)
+        unbalanced += self._volume.forces(self._positions, still)
         unbalanced[self.model.fixed] = 0.0
         along = np.einsum("ij,ij->i", unbalanced[movable], self._normal)
         push = np.where(self._touched, np.maximum(-along, 0.0), 0.0)
@@ -213,11 +240,12 @@ class Msds(TissueSolver):
         reference = load or self._heaviest
         residual = imbalance / reference if reference else 0.0
 
-        frame = self._steps * self._substeps * self._time_step
+        frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
         speed = np.abs(self._velocity).max()
         acceleration = np.abs(unbalanced * self._inverse_mass[:, None]).max()
         self._settled = bool(
-            max(speed * frame, acceleration * frame**2) < self._rest_tolerance
+            max(speed * max(frame, self._damping_factor), acceleration * frame**2)
+            < self._rest_tolerance
             and not self._entered(pose)
         )
         if self._settled:
@@ -231,45 +259,37 @@ class Msds(TissueSolver):
         )
 
     def _put_back_if_tangled(self) -> str:
-        """What was done about tetrahedra turned inside out, after what was done for stability.
-
-        Springs know lengths and not volumes: pressed beyond the mesh's spacing, a node can pass
-        through a face and then rests on the wrong side. Under the probe that is only said; once it
-        is gone, the undeformed tissue is known to be the state of rest.
-        """
-        self._frames_free = 0 if self._touched.any() else self._frames_free + 1
-        inverted = _count_inverted(self._positions, self.model.mesh.tetrahedra)
-        if inverted == 0:
-            return self._action
-        said = [self._action] if self._action else []
-        if self._frames_free < _PATIENCE or not self.model.fixed.any():
-            return "; ".join([*said, f"{inverted} tetrahedra are inside out"])
-        self._positions[:] = self.model.mesh.nodes
-        self._velocity[:] = 0.0
-        return "; ".join(
-            [*said, f"{inverted} tetrahedra stayed inside out, so the tissue was put back to rest"]
-        )
+        """What was done about tetrahedra turned inside out, after what was done for stability."""
+        words, hopeless = self._tangling.judge(self._positions, bool(self._touched.any()))
+        if hopeless:
+            self._positions[:] = self.model.mesh.nodes
+            self._velocity[:] = 0.0
+        return "; ".join(filter(None, [self._action, words]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _count_inverted(nodes, tetrahedra):
-    """How many tetrahedra (M, 4) have no positive volume."""
-    count = 0
-    for t in range(len(tetrahedra)):
-        a = tetrahedra[t, 0]
-        b = tetrahedra[t, 1]
-        c = tetrahedra[t, 2]
-        d = tetrahedra[t, 3]
-        bx = nodes[b, 0] - nodes[a, 0]
-        by = nodes[b, 1] - nodes[a, 1]
-        bz = nodes[b, 2] - nodes[a, 2]
-        cx = nodes[c, 0] - nodes[a, 0]
-        cy = nodes[c, 1] - nodes[a, 1]
-        cz = nodes[c, 2] - nodes[a, 2]
-        dx = nodes[d, 0] - nodes[a, 0]
-        dy = nodes[d, 1] - nodes[a, 1]
-        dz = nodes[d, 2] - nodes[a, 2]
-        volume = bx * (cy * dz - cz * dy) + by * (cz * dx - cx * dz) + bz * (cx * dy - cy * dx)
-        if volume <= 0.0:
-            count += 1
-    return count
+def spring_tissue(
+    solver: str,
+    model: TissueModel,
+    stiffness: str,
+    volume: bool,
+    stiffness_factor: float,
+    damping_factor: float,
+) -> tuple[SpringNetwork, VolumeTerm]:
+    """The springs, without those between fixed nodes, and the volume term that settings ask for.
+
+    Raises:
+        SolverError: a setting is out of range.
+    """
+    if stiffness not in ("algorithm_1", "fitted"):
+        raise SolverError(f"{solver}.stiffness is {stiffness!r}: choose algorithm_1 or fitted")
+    if not isinstance(volume, bool):
+        raise SolverError(f"{solver}.volume is {volume!r}: give true or false")
+    mesh, materials = model.mesh, model.materials
+    if stiffness == "fitted":
+        springs = fitted_springs(mesh, materials, damping_factor, with_volume=volume)
+    else:
+        springs = springs_of(mesh, materials, stiffness_factor, damping_factor)
+    term = VolumeTerm.nothing(len(mesh.nodes))
+    if volume:
+        term = volume_term(mesh, materials, springs, damping_factor)
+    return springs.without(model.fixed), term

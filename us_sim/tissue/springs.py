@@ -1,4 +1,4 @@
-"""Springs and dampers along the edges of a tetrahedral mesh, and how long a step they allow.
+"""Springs and dampers along the edges of a tetrahedral mesh.
 
 >>> from us_sim.tissue.materials import Material, uniform_material
 >>> from us_sim.tissue.mesh import box_mesh, uniform_planes
@@ -19,17 +19,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.linalg import eigsh
 
-from us_sim.errors import SolverError
 from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
 
-__all__ = ["SpringNetwork", "spring_forces", "springs_of", "stabilised", "step_limit"]
+__all__ = ["SpringNetwork", "fitted_springs", "spring_forces", "springs_of"]
 
-# Masses and sub-steps stay this far from the bound on stability.
-_MARGIN = 1.05
+# The six edges of a tetrahedron.
+_CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,46 +61,25 @@ class SpringNetwork:
             self.edges[kept], self.stiffness[kept], self.damping[kept], self.rest_length[kept]
         )
 
-    def node_stiffness(self, count: int) -> NDArray[np.float64]:
-        """(N,) N/m, sum of the springs at each of ``count`` nodes."""
-        total = np.zeros(count)
-        np.add.at(total, self.edges, self.stiffness[:, None])
-        return total
+    def lame_constant(self, mesh: TetrahedralMesh) -> NDArray[np.float64]:
+        """(M,) Pa, the mu, and lambda, that the springs around each tetrahedron amount to.
 
-    def highest_frequency(
-        self,
-        nodes: NDArray[np.float64],
-        mass: NDArray[np.float64],
-        fixed: NDArray[np.bool_],
-    ) -> float:
-        """1/s, the largest circular frequency of small undamped oscillations around ``nodes``.
-
-        By Lanczos iterations on the linearised network with masses (N,) kg.
+        As a material whose springs point everywhere alike: sum of k L**2 / 15 over its volume. A
+        spring's share in a tetrahedron goes by volume.
         """
-        number = np.where(fixed, -1, np.cumsum(~fixed) - 1)
-        count = int((~fixed).sum())
-        root = np.sqrt(mass[~fixed])
+        place = _edges_of_tetrahedra(mesh)
+        around = np.bincount(place.ravel(), np.repeat(mesh.volumes, 6), len(self.edges))
+        return (self.stiffness * self.rest_length**2 / around)[place].sum(axis=1) / 15
+
+    def factor(self, nodes: NDArray[np.float64]) -> csr_array:
+        """B (E, 3N), (N/m)^0.5, such that B'B is the stiffness around unstretched ``nodes``."""
         along = nodes[self.edges[:, 1]] - nodes[self.edges[:, 0]]
-        along /= np.linalg.norm(along, axis=1)[:, None]
-        blocks = self.stiffness[:, None, None] * along[:, :, None] * along[:, None, :]
-        rows, columns, entries = [], [], []
-        for a, b, sign in ((0, 0, 1.0), (1, 1, 1.0), (0, 1, -1.0), (1, 0, -1.0)):
-            i, j = number[self.edges[:, a]], number[self.edges[:, b]]
-            free = (i >= 0) & (j >= 0)
-            i, j = i[free], j[free]
-            scaled = sign * blocks[free] / (root[i] * root[j])[:, None, None]
-            rows.append(np.broadcast_to(3 * i[:, None, None] + np.arange(3)[:, None], scaled.shape))
-            columns.append(np.broadcast_to(3 * j[:, None, None] + np.arange(3), scaled.shape))
-            entries.append(scaled)
-        place = tuple(np.concatenate([p.ravel() for p in part]) for part in (rows, columns))
-        matrix = csr_array(
-            (np.concatenate([e.ravel() for e in entries]), place), shape=(3 * count, 3 * count)
-        )
-        if 3 * count <= 30:
-            return math.sqrt(np.linalg.eigvalsh(matrix.toarray())[-1])
-        start = np.random.default_rng(0).standard_normal(3 * count)
-        largest = eigsh(matrix, k=1, which="LA", v0=start, tol=1e-4, return_eigenvectors=False)
-        return math.sqrt(largest[0])
+        along *= (np.sqrt(self.stiffness) / np.linalg.norm(along, axis=1))[:, None]
+        count = len(self.edges)
+        columns = (3 * self.edges[:, :, None] + np.arange(3)).reshape(count, 6)
+        rows = np.repeat(np.arange(count), 6)
+        entries = np.concatenate([-along, along], axis=1).ravel()
+        return csr_array((entries, (rows, columns.ravel())), shape=(count, 3 * len(nodes)))
 
 
 def springs_of(
@@ -116,84 +92,61 @@ def springs_of(
 
     Args:
         mesh, materials: of the tissue.
-        stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge.
+        stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge. The
+            paper gives it as a bare number, but it is a length: the right one grows with the mesh's
+            spacing, as `fitted_springs` shows.
         damping_factor: s, damping constant over spring constant.
     """
-    corners = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-    ends = np.sort(mesh.tetrahedra[:, corners].reshape(-1, 2).astype(np.int64), axis=1)
+    return _network(mesh, stiffness_factor * materials.young_modulus, damping_factor)
+
+
+def fitted_springs(
+    mesh: TetrahedralMesh,
+    materials: TissueMaterials,
+    damping_factor: float = 0.1,
+    *,
+    with_volume: bool = True,
+) -> SpringNetwork:
+    """Springs as stiff as the linear elasticity of the same mesh, whatever its spacing.
+
+    Equal springs k along a tetrahedron's six edges of lengths L store sum(k L**2) e**2 / 2 in a
+    swelling by the strain e, a material with lambda = mu stores 15 mu V e**2 / 2; averaged over
+    all orientations, any other strain gives the same k = 15 mu V / sum(L**2), since a symmetric
+    fourth-order tensor has one invariant under rotations that is not zero (the springs of G. Lame
+    and A. Cauchy; A. van Gelder, Approximate Simulation of Elastic Membranes by Triangulated Spring
+    Meshes, J. Graphics Tools 3, 1998, does likewise by edge). With mu = E / 2 (1 + nu) the length
+    that Algorithm 1 hides in its constant is 15 V / (2 (1 + nu) sum(L**2)).
+
+    Args:
+        mesh, materials: of the tissue.
+        damping_factor: s, damping constant over spring constant.
+        with_volume: a volume term will add what lambda lacks, so that mu is to be met. Without
+            it, and below Poisson's ratio 1/4, Young's modulus is met, with the springs' own 1/4.
+    """
+    ratio = np.maximum(materials.poisson_ratio, 0.25) if with_volume else 0.25
+    shear = materials.young_modulus / (2 * (1 + ratio))
+    ends = mesh.nodes[mesh.tetrahedra][:, _CORNERS]
+    squares = ((ends[:, :, 1] - ends[:, :, 0]) ** 2).sum(axis=(1, 2))
+    return _network(mesh, 15 * shear * mesh.volumes / squares, damping_factor)
+
+
+def _network(
+    mesh: TetrahedralMesh, stiffness: NDArray[np.float64], damping_factor: float
+) -> SpringNetwork:
+    """Six equal springs of stiffness (M,) N/m in each tetrahedron; duplicates merge."""
+    merged = np.zeros(len(mesh.edges))
+    np.add.at(merged, _edges_of_tetrahedra(mesh), stiffness[:, None])
+    rest_length = np.empty(len(mesh.edges))
+    _lengths(mesh.edges, mesh.nodes, rest_length)
+    return SpringNetwork(mesh.edges, merged, damping_factor * merged, rest_length)
+
+
+def _edges_of_tetrahedra(mesh: TetrahedralMesh) -> NDArray[np.intp]:
+    """(M, 6) indices into the mesh's edges."""
+    ends = np.sort(mesh.tetrahedra[:, _CORNERS].astype(np.int64), axis=2)
     count = len(mesh.nodes)
     known = mesh.edges[:, 0].astype(np.int64) * count + mesh.edges[:, 1]
-    place = np.searchsorted(known, ends[:, 0] * count + ends[:, 1])
-    stiffness = np.zeros(len(known))
-    np.add.at(stiffness, place, np.repeat(stiffness_factor * materials.young_modulus, 6))
-    rest_length = np.empty(len(known))
-    _lengths(mesh.edges, mesh.nodes, rest_length)
-    return SpringNetwork(mesh.edges, stiffness, damping_factor * stiffness, rest_length)
-
-
-def step_limit(frequency: float, damping_factor: float) -> float:
-    """s, the longest stable step of symplectic Euler for stiffness-proportional damping.
-
-    A mode of circular frequency w with damping constant b times its stiffness is stable as long as
-    dt**2 + 2 b dt < 4 / w**2.
-
-    Args:
-        frequency: w, 1/s.
-        damping_factor: b, s.
-    """
-    span = 4 / frequency**2
-    return span / (damping_factor + math.sqrt(damping_factor**2 + span))
-
-
-def stabilised(
-    model: TissueModel,
-    springs: SpringNetwork,
-    time_step: float,
-    damping_factor: float,
-    stabilisation: str,
-    maximum_substeps: int,
-) -> tuple[NDArray[np.float64], int, str]:
-    """Masses (N,) kg and number of sub-steps that make a step stable, and what was done, in words.
-
-    Whether a step is stable, and what it needs, is judged by w**2 <= 2 max(sum of a node's springs
-    over its mass), which holds however the springs turn and stretch. The limit in the words is the
-    one of small oscillations around rest.
-
-    Args:
-        model: whose lumped masses are simulated where possible.
-        springs: its network.
-        time_step: s, asked for.
-        damping_factor: s, damping constant over spring constant.
-        stabilisation: ``mass_scaling`` or ``substeps``.
-        maximum_substeps: of one step.
-
-    Raises:
-        SolverError: more sub-steps than allowed.
-    """
-    mass, free = model.lumped_mass, ~model.fixed
-    stiffness = springs.node_stiffness(len(mass))
-    span = time_step**2 + 2 * damping_factor * time_step
-    needed = 0.5 * _MARGIN * span * stiffness
-    if not (needed > mass)[free].any():
-        return mass, 1, ""
-    limit = step_limit(
-        springs.highest_frequency(model.mesh.nodes, mass, model.fixed), damping_factor
-    )
-    unstable = f"steps beyond {1e3 * limit:.2g} ms are unstable"
-    if stabilisation == "mass_scaling":
-        scaled = np.maximum(mass, needed)
-        factor = (scaled / mass)[free]
-        low, high = factor.min(), factor.max()
-        return scaled, 1, f"masses scaled {low:.0f} to {high:.0f} times: unscaled, {unstable}"
-    bound = math.sqrt(2 * _MARGIN * (stiffness / mass)[free].max())
-    substeps = math.ceil(time_step / step_limit(bound, damping_factor))
-    if substeps > maximum_substeps:
-        raise SolverError(
-            f"msds needs {substeps} sub-steps for each step of {1e3 * time_step:g} ms, more than "
-            f"maximum_substeps = {maximum_substeps}: use stabilisation mass_scaling, or lower "
-            f"damping_factor"
-        )
-    return mass, substeps, f"{substeps} sub-steps a step: undivided, {unstable}"
+    return np.searchsorted(known, ends[:, :, 0] * count + ends[:, :, 1])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

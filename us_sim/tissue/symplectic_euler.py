@@ -6,12 +6,14 @@ drifts on at the speed it was given.
 >>> import numpy as np
 >>> from us_sim.collider import Sphere
 >>> from us_sim.tissue.symplectic_euler import advance_frame
+>>> from us_sim.tissue.volume_term import VolumeTerm
 >>> edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
 >>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
 >>> advance_frame(
 ...     edges, 100.0 * one, 0.1 * one, one, np.ones(2), positions, velocity, np.zeros((2, 3)),
 ...     0.01, 1, 20, Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)),
 ...     np.empty(0, np.int32), np.empty(0, bool), np.empty((0, 3)), np.zeros((2, 3)),
+...     (*VolumeTerm.nothing(2).arrays, np.empty(0)), 0.0,
 ... )
 >>> positions.round(6).tolist()
 [[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
@@ -23,6 +25,7 @@ from numba import njit
 
 from us_sim.tissue.contact import pushing_gap
 from us_sim.tissue.springs import spring_forces
+from us_sim.tissue.volume_term import add_volume_forces
 
 __all__ = ["advance_frame"]
 
@@ -48,16 +51,21 @@ def advance_frame(
     touched,
     normal,
     wrench,
+    volume,
+    damping_factor,
 ):
     """Moves positions and velocity (N, 3) by ``steps`` of ``substeps`` each, symplectic Euler.
 
     The probe is at rotations (steps, 3, 3) and origins (steps, 3), or nowhere when these are empty.
     Fills touched (C,) and normal (C, 3) of the reachable (C,) nodes as they are in the last
-    sub-step, and wrench (2, 3) with the mean force and torque on the probe in its frame.
+    sub-step, and wrench (2, 3) with the mean force and torque on the probe in its frame. A volume
+    term is given by its `VolumeTerm.arrays` and a float64 array of their length to write on.
     """
     for step in range(steps):
         for _sub in range(substeps):
             spring_forces(edges, stiffness, damping, rest_length, positions, velocity, force)
+            if len(volume[0]) > 0:
+                add_volume_forces(*volume, damping_factor, positions, velocity, force)
             for i in range(len(positions)):
                 for axis in range(3):
                     v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]
