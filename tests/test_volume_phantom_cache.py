@@ -199,7 +199,7 @@ def test_who_waits_for_another_is_told(cache, monkeypatch):
     cache.mkdir()
     other = FileLock(cache / "small.lock")
     other.acquire()
-    monkeypatch.setattr("us_sim.volume.phantom_cache._WAIT", 0.01)
+    monkeypatch.setattr("us_sim.cache._WAIT", 0.01)
     told = []
 
     def waiting() -> None:

@@ -1,0 +1,165 @@
+"""Arrays kept in the user's cache folder, memory-mapped and shared by processes.
+
+An entry is a folder of .npy files and a description with their checksums. It is written beside its
+place and renamed there, so it is whole or absent; a lock lets one process make it while others
+wait; and what is damaged all the same is noticed and made again.
+
+>>> import os, tempfile
+>>> import numpy as np
+>>> from us_sim.cache import Form, kept
+>>> form = Form("square.json", lambda x: ({"x": x}, {}), lambda arrays, facts: arrays["x"])
+>>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
+...     made = kept("square", form, lambda: np.eye(2))
+...     again = kept("square", form, lambda: 1 / 0)
+...     bool((made == again).all())
+True
+>>> del os.environ["US_SIM_CACHE"]
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import platformdirs
+from filelock import FileLock, Timeout
+from numpy.typing import NDArray
+
+from us_sim.errors import UsSimError
+
+__all__ = ["Form", "cache_folder", "kept"]
+
+Thing = TypeVar("Thing")
+
+_WAIT = 0.5  # s, between two words to the person who waits for another process
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Form(Generic[Thing]):
+    """How a thing is laid down as arrays and facts, and made from them again."""
+
+    description: str  # file name of the facts and checksums
+    pack: Callable[[Thing], tuple[dict[str, NDArray], dict[str, Any]]]  # arrays, facts for JSON
+    unpack: Callable[[dict[str, NDArray], dict[str, Any]], Thing]
+
+
+class _DamagedError(Exception):
+    """An entry is there and cannot be used."""
+
+
+def cache_folder() -> Path:
+    """Where things are kept: US_SIM_CACHE, or the user's cache folder on this system."""
+    given = os.environ.get("US_SIM_CACHE")
+    return Path(given) if given else platformdirs.user_cache_path("us_sim")
+
+
+def kept(
+    key: str,
+    form: Form[Thing],
+    make: Callable[[], Thing],
+    waiting: Callable[[], None] | None = None,
+) -> Thing:
+    """The thing kept under a key, made and kept first if it is not there.
+
+    Where the cache folder cannot be written, the thing is made, used from memory, and a warning
+    says so.
+
+    Args:
+        key: a file name that says all that decides the thing's bytes.
+        form: how it is laid down.
+        make: makes the thing; called by one process at a time.
+        waiting: called every half second while another process makes it.
+    """
+    entry = cache_folder() / key
+    found = _loaded(entry, form, warn=False)
+    if found is not None:
+        return found
+    try:
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(entry.with_name(f"{key}.lock"))
+        while not lock.is_locked:
+            try:
+                lock.acquire(timeout=_WAIT)
+            except Timeout:
+                if waiting is not None:
+                    waiting()
+    except OSError as error:
+        _logger.warning("%s cannot be written (%s), so nothing is kept there", entry.parent, error)
+        return make()
+    try:
+        found = _loaded(entry, form, warn=True)
+        if found is not None:
+            return found
+        made = make()
+        try:
+            _store(entry, form, made)
+        except OSError as error:
+            _logger.warning("%s cannot be written (%s), so it is not kept", entry, error)
+            return made
+        found = _loaded(entry, form, warn=True)
+        return made if found is None else found
+    finally:
+        lock.release()
+
+
+def _loaded(entry: Path, form: Form[Thing], *, warn: bool) -> Thing | None:
+    """The entry's thing, or None where it is absent or damaged."""
+    try:
+        return _load(entry, form)
+    except FileNotFoundError:
+        return None
+    except _DamagedError as error:
+        if warn:
+            _logger.warning("%s is damaged (%s), so it is made again", entry, error)
+        return None
+
+
+def _load(entry: Path, form: Form[Thing]) -> Thing:
+    if not entry.exists():
+        raise FileNotFoundError(entry)
+    try:
+        facts = json.loads((entry / form.description).read_text(encoding="utf-8"))
+        arrays = {}
+        for name, checksum in facts["crc32"].items():
+            # A plain array over the map: a subclass would slow kernels and surprise callers.
+            arrays[name] = np.asarray(np.load(entry / f"{name}.npy", mmap_mode="r"))
+            if zlib.crc32(np.ascontiguousarray(arrays[name])) != checksum:
+                raise _DamagedError(f"the checksum of {name} is wrong")
+        return form.unpack(arrays, facts)
+    except (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise _DamagedError(str(error)) from error
+    except UsSimError as error:
+        raise _DamagedError(str(error)) from error
+
+
+def _store(entry: Path, form: Form[Thing], thing: Thing) -> None:
+    """Write an entry; the caller holds its lock."""
+    for left_over in entry.parent.glob(f"{entry.name}.partial-*"):
+        shutil.rmtree(left_over, ignore_errors=True)
+    partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))
+    try:
+        arrays, facts = form.pack(thing)
+        checksums = {}
+        for name, array in arrays.items():
+            np.save(partial / f"{name}.npy", array)
+            checksums[name] = zlib.crc32(np.ascontiguousarray(array))
+        description = json.dumps({**facts, "crc32": checksums}, indent=1)
+        (partial / form.description).write_text(description, encoding="utf-8")
+        if entry.is_dir():
+            shutil.rmtree(entry)
+        elif entry.exists():
+            entry.unlink()
+        partial.rename(entry)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
