@@ -71,7 +71,8 @@ class FemNonlinear(TissueSolver):
 
     The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
     probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
-    of the contact forces, in double precision and of the displacement that is returned.
+    of the contact forces (without any, over the largest there were), in double precision and of
+    the displacement that is returned.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -110,6 +111,7 @@ class FemNonlinear(TissueSolver):
         self._lever = float(np.linalg.norm(box[:3]) + box[3])
         self._stride = _STRIDE * float(np.ptp(model.mesh.nodes, axis=0).min())
         self._newton = Newton(model)
+        self._heaviest = 0.0  # N, norm of the contact forces, the largest there were
         if len(self._surface):
             self._compliance = surface_compliance(model)
         self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
@@ -283,7 +285,9 @@ class FemNonlinear(TissueSolver):
             newton.weigh_on(pose)
             actions.append(f"the tissue is {1e3 * self._depth(pose, newton.surface):.2g} mm behind")
         contact = newton.contact
-        residual = newton.imbalance / newton.load if newton.load else float(newton.imbalance > 0)
+        self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
+        reference = newton.load or self._heaviest
+        residual = newton.imbalance / reference if reference else 0.0
         self._settled = not progress or (residual <= self._tolerance and not behind)
         if not progress and residual > self._tolerance:
             actions.append("no step led any further")

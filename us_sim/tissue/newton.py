@@ -46,6 +46,9 @@ _SINGLE_CONTRAST = 1e4
 # A step is halved so often before it is given up.
 _BACKTRACKS = 6
 
+# Where the probe pushes along one direction, a step may leave so much more imbalance.
+_SLIDE = 1.5
+
 # Each step ends when its preconditioned residual has fallen to this part: the next one sees the
 # true slope again.
 _FORCING = 1e-2
@@ -188,11 +191,19 @@ class Newton:
                     return True
                 if energy is None:
                     energy = self.tissue.energy(before.displacement)
-                if self.tissue.energy(self.displacement) < energy:
+                if self._descends(before, length * change, energy):
                     return True
             length /= 2
         self.restore(before)
         return False
+
+    def _descends(self, before: _Snapshot, change: NDArray[np.float64], energy: float) -> bool:
+        if not self.contact.forward:
+            return self.tissue.energy(self.displacement) < energy
+        # A push that is not along the surface's normal does work as nodes slide, and there is no
+        # energy to make least: the steps do so for nodes held where they are, again and again.
+        slid = self.tissue.energy(before.displacement + change) < energy
+        return slid and self.imbalance < _SLIDE * before.imbalance
 
     def _hold(self, pose: Pose, retreat: float) -> None:
         surface = self.surface

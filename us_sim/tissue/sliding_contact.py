@@ -42,7 +42,8 @@ class SlidingContact:
     def __init__(self, collider: Collider, spacing: float) -> None:
         self._collider = collider
         self._spacing = spacing
-        self._forward = only_forward(collider, spacing)
+        #: Whether the probe pushes along one direction, not along its surface's normal.
+        self.forward = only_forward(collider, spacing)
         self.clear(0)
 
     def clear(self, count: int) -> None:
@@ -103,7 +104,7 @@ class SlidingContact:
         or no directions away from it; a push along a fixed direction does not turn.
         """
         count = int(self.touched.sum())
-        if self._forward:
+        if self.forward:
             return np.zeros((count, 3, 3))
         rotation, box = pose.rotation, self._collider.offset_box
         local = (positions[self.touched] - pose.position) @ rotation
