@@ -23,18 +23,35 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
+from threadpoolctl import threadpool_limits
 
-from us_sim.tissue.averaged_pressure import averaged_pressure
+from us_sim.cache import Form, kept
+from us_sim.progress import Progress
+from us_sim.tissue.averaged_pressure import AveragedPressure, averaged_pressure
+from us_sim.tissue.condensation import condense
 from us_sim.tissue.elasticity import require_held
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["SurfaceCompliance", "surface_compliance"]
+
+# Counts as part of the cache's key: raise it when the bytes change.
+_VERSION = 1
+
+# Numbers in the fields. With fewer, single precision would save no time worth its rounding.
+_DOUBLE = 4_000_000
+
+# Numbers in the fields from which on making them takes a second, and keeping them pays.
+_KEPT = 12_000_000
+
+# Forces by which the rounding of the fields is measured.
+_SAMPLES = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,58 +61,145 @@ class SurfaceCompliance:
     nodes: NDArray[np.int32]  # (S,), the model's movable contact nodes
     free: NDArray[np.int32]  # (F,), nodes that are not fixed, ascending
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
-    fields: NDArray[np.floating]  # (3S, 3, F), m/N, what each force does to all free nodes
+    fields: NDArray[np.floating]  # (3S, 3 F), m/N, by axis, what each force does to all free nodes
     count: int  # N, nodes of the mesh
     rounding: float  # unbalanced force that rounding leaves in a field, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; rows without force are not read."""
-        total = np.zeros((3, len(self.free)))
-        self._sum(forces, total)
-        displacement[:, self.free] += total.astype(displacement.dtype)
+        displacement[:, self.free] += self._sum(forces).astype(displacement.dtype)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, what forces (S, 3) N do to every node."""
         displacement = np.zeros((self.count, 3))
-        total = np.zeros((3, len(self.free)))
-        self._sum(forces, total)
-        displacement[self.free] = total.T
+        displacement[self.free] = self._sum(forces).T
         return displacement
 
-    def _sum(self, forces: NDArray[np.float64], total: NDArray[np.float64]) -> None:
+    def _sum(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3, F) m."""
+        total = np.zeros((3, len(self.free)))
         rows = np.flatnonzero(forces.ravel())
-        _add_rows(
-            self.fields.reshape(len(self.fields), -1), rows, forces.ravel()[rows], total.reshape(-1)
-        )
+        _add_rows(self.fields, rows, forces.ravel()[rows], total.reshape(-1))
+        return total
 
 
 def surface_compliance(model: TissueModel) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
+    What takes long is kept in the user's cache folder, under a hash of mesh, materials, fixed and
+    contact nodes.
+
     Raises:
-        SolverError: the tissue is not held.
+        SolverError: the tissue is not held, or its moduli are too different.
     """
     require_held(model.mesh, model.fixed)
+    touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
+    if 9 * touched * free < _KEPT:
+        return _made(model, None)
+    bar: list[Progress] = []
+
+    def show(fraction: float, text: str = "") -> None:
+        if not bar:
+            bar.append(Progress("solving for the tissue's compliance", 100, "%"))
+        bar[0].update(100 * fraction, text)
+
+    try:
+        return kept(
+            _key(model),
+            _FORM,
+            lambda: _made(model, show),
+            lambda: show(0.0, "waiting for another process that does"),
+        )
+    finally:
+        for shown in bar:
+            shown.__exit__(None, None, None)
+
+
+def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
     nodes = model.movable_contact_nodes
-    count = len(model.mesh.nodes)
     free = np.flatnonzero(~model.fixed).astype(np.int32)
-    kept = np.repeat(~model.fixed, 3)
-    matrix = averaged_pressure(model.mesh, model.materials).stiffness[kept][:, kept]
-    place = np.cumsum(~model.fixed) - 1
-    touched = (3 * place[nodes][:, None] + np.arange(3)).ravel()
-    loads = np.zeros((3 * len(free), len(touched)))
-    loads[touched, np.arange(len(touched))] = 1.0
-    solved = splu(matrix.tocsc()).solve(loads) if loads.size else loads
-    fields = solved.T.reshape(-1, len(free), 3).transpose(0, 2, 1).astype(np.float32)
-    square = solved[touched]
+    system = averaged_pressure(model.mesh, model.materials)
+    number = np.cumsum(~model.fixed) - 1
+    # Products of matrices this small take longer on several threads.
+    with threadpool_limits(1, user_api="blas"):
+        condensed = condense(
+            model.mesh,
+            system,
+            model.fixed,
+            nodes,
+            report=show and (lambda done: show(0.6 * done)),
+        )
+        shape = (3 * len(nodes), 3, len(free))
+        small = np.prod(shape) < _DOUBLE
+        fields = np.zeros(shape, np.float64 if small else np.float32)
+        done = 0
+        for part, moved in condensed.fields():
+            fields[:, :, number[part]] = moved.reshape(len(part), 3, -1).transpose(2, 1, 0)
+            done += len(part)
+            if show:
+                show(0.6 + 0.4 * done / len(free))
+    flat = fields.reshape(len(fields), -1)
+    made = SurfaceCompliance(nodes, free, condensed.compliance, flat, len(model.mesh.nodes), 0.0)
     return SurfaceCompliance(
-        nodes,
-        free,
-        np.ascontiguousarray(square + square.T) / 2,
-        np.ascontiguousarray(fields),
-        count,
-        0.0,
+        nodes, free, condensed.compliance, flat, made.count, _rounding(made, system, model.fixed)
     )
+
+
+def _rounding(made: SurfaceCompliance, system: AveragedPressure, fixed: NDArray[np.bool_]) -> float:
+    """The unbalanced force of single forces and of all together, over their norm."""
+    random = np.random.Generator(np.random.PCG64(0))
+    loads = [np.zeros((len(made.nodes), 3)) for _ in range(min(_SAMPLES, 3 * len(made.nodes)))]
+    for load in loads:
+        load.flat[random.integers(load.size)] = 1.0
+    if loads:
+        loads += [np.tile(axis, (len(made.nodes), 1)) for axis in np.eye(3)]
+    worst = 0.0
+    for load in loads:
+        moved = made.field(load).ravel()
+        volume = system.coupling @ moved
+        balance = system.element @ moved + system.coupling.T @ (volume / system.capacity)
+        balance = balance.reshape(-1, 3)
+        balance[made.nodes] -= load
+        balance[fixed] = 0.0
+        worst = max(worst, float(np.linalg.norm(balance) / np.linalg.norm(load)))
+    return worst
+
+
+def _key(model: TissueModel) -> str:
+    digest = hashlib.sha256(str(_VERSION).encode())
+    materials = model.materials
+    for array in (
+        model.mesh.nodes,
+        model.mesh.tetrahedra,
+        materials.young_modulus,
+        materials.poisson_ratio,
+        model.fixed,
+        model.movable_contact_nodes,
+    ):
+        digest.update(f"{array.dtype} {array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return f"compliance-{digest.hexdigest()[:24]}"
+
+
+def _pack(made: SurfaceCompliance) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    arrays: dict[str, NDArray] = {
+        "nodes": made.nodes,
+        "free": made.free,
+        "matrix": made.matrix,
+        "fields": made.fields,
+    }
+    return arrays, {"count": made.count, "rounding": made.rounding}
+
+
+def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceCompliance:
+    return SurfaceCompliance(
+        **{name: arrays[name] for name in ("nodes", "free", "matrix", "fields")},
+        count=int(facts["count"]),
+        rounding=float(facts["rounding"]),
+    )
+
+
+_FORM = Form("compliance.json", _pack, _unpack)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
