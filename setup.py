@@ -61,6 +61,7 @@ setup(
         "platformdirs>=4",
         "PyYAML>=6",
         "rosbags>=0.10.9",
+        "scikit-image>=0.20",
         "scipy>=1.11",
         "SimpleITK>=2.3",
         "threadpoolctl>=3",

@@ -81,8 +81,26 @@ def test_units_are_si_inside():
             "tissue.mesh.planes.x: must be 3 coordinates from -0.02 to 0.02 m",
         ),
         ("tissue.mesh.planes", {"w": [0, 1]}, "tissue.mesh.planes: unknown axis `w`"),
+        ("tissue.mesh.upper", None, "tissue.mesh.upper: is missing; give the corners of a box, or"),
+        ("tissue.mesh.file", "liver.msh", "tissue.mesh: has both `file` and `lower`; keep one"),
+        ("tissue.mesh", {"file": "liver.msh"}, "tissue.mesh.file: there is no file .*liver.msh"),
+        ("tissue.mesh.unit", "1 mm", "`unit`, `pose` and `margin` are for a mesh from a `file`"),
+        ("structures", "vein", "structures: must be a mapping of keys, not 'vein'"),
+        ("structures", {"vein": {"color": [1, 0, 0]}}, "structures.vein: unknown key `color`; did"),
+        ("structures", {"vein": {"colour": [1, 0, 2]}}, r"vein.colour\[2\]: 2 is outside"),
+        ("structures", {"a": {"file": "a.stl"}}, "structures.a.file: there is no file .*a.stl"),
+        (
+            "structures",
+            {"a": {"file": "a", "label": "b"}},
+            "structures.a: has both `file` and `lab",
+        ),
+        ("structures", {"a": {"unit": "1 mm"}}, "structures.a: `unit` and `pose` are for a surf"),
         ("tissue.mesh", 3, "tissue.mesh: must be a mapping of keys, not 3"),
-        ("tissue.solver", "magic", "tissue.solver: 'magic' is not one of fem, fem_nonlinear, fem_cg, msds"),
+        (
+            "tissue.solver",
+            "magic",
+            "tissue.solver: 'magic' is not one of fem, fem_nonlinear, fem_cg, msds",
+        ),
         ("tissue.materials", {}, "tissue.materials: names no material"),
         (
             "tissue.materials.muscle.poisson_ratio",
@@ -97,6 +115,20 @@ def test_each_mistake_is_one_sentence_with_file_and_key(key, value, words):
         parse_scene(changed(key, value), origin="my.yaml")
     assert str(caught.value).startswith("my.yaml: ")
     assert "\n" not in str(caught.value)
+
+
+def test_structures_may_be_a_list_or_have_no_more_than_a_name():
+    for given in (["vein", "artery"], {"vein": None, "artery": {}}):
+        scene = parse_scene(changed("structures", given))
+        assert list(scene.structures) == ["vein", "artery"]
+        assert scene.structures["vein"].label is None
+    assert parse_scene(COMPLETE).structures == {}
+
+
+def test_structures_need_a_tissue():
+    document = changed("tissue", None) | {"structures": ["vein"]}
+    with pytest.raises(SceneError, match=r"my\.yaml: structures: need `tissue` to carry them"):
+        parse_scene(document, origin="my.yaml")
 
 
 def test_a_collider_needs_its_own_dimensions_and_no_others():

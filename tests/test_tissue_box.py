@@ -6,8 +6,10 @@ from tissue_block import SOFT, block, block_mesh
 
 from us_sim.collider import Sphere
 from us_sim.errors import MeshError
-from us_sim.tissue.box import FACES, face_nodes, nodes_in_label
+from us_sim.tissue.box import FACES, face_nodes, facing_nodes, nodes_in_label
 from us_sim.tissue.materials import uniform_material
+from us_sim.tissue.mesh import TetrahedralMesh
+from us_sim.tissue.mesh_file import read_mesh
 from us_sim.tissue.model import TissueModel
 
 
@@ -33,6 +35,39 @@ def test_faces_are_the_planes_they_are_named_after(face, axis, value):
 def test_sides_are_all_but_top_and_bottom():
     mesh = block_mesh((6, 5, 4))
     assert len(face_nodes(mesh, "sides")) == 4 * (6 * 5 - 4 * 3)
+
+
+def unstructured(nodes=(6, 5, 4)):
+    """The block's mesh as if a file had brought it."""
+    block = block_mesh(nodes)
+    return TetrahedralMesh(block.nodes, block.tetrahedra)
+
+
+def test_faces_of_a_box_from_a_file_are_the_same():
+    for face in FACES:
+        expected = face_nodes(block_mesh((6, 5, 4)), face)
+        np.testing.assert_array_equal(face_nodes(unstructured(), face), expected)
+    top = face_nodes(block_mesh((6, 5, 4)), "top")
+    np.testing.assert_array_equal(facing_nodes(unstructured()), top)
+
+
+def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data):
+    organ, _ = read_mesh(shared_data / "meshes-sofa" / "liver2.msh", metres_per_unit=0.03)
+    low, high = organ.nodes.min(axis=0), organ.nodes.max(axis=0)
+    bottom = face_nodes(organ, "bottom")
+    deepest = organ.nodes[organ.boundary].reshape(-1, 3)[:, 2] > high[2] - 0.05 * (high - low)[2]
+    np.testing.assert_array_equal(bottom, np.unique(organ.boundary.ravel()[deepest]))
+    assert len(face_nodes(organ, "bottom", margin=0.03)) > len(bottom) > 3
+    assert len(face_nodes(organ, "bottom", margin=1e-9)) == 1
+
+
+def test_what_looks_at_the_probe_is_the_near_half_of_an_organ(shared_data):
+    cylinder, _ = read_mesh(shared_data / "meshes-sofa" / "truthcylinder1.msh", 1e-3)
+    x, _, z = (cylinder.nodes - cylinder.nodes.mean(axis=0))[facing_nodes(cylinder)].T
+    radius = np.ptp(cylinder.nodes[:, 2]) / 2
+    # Its axis is y: what looks at the probe is the half of the mantle with z < 0.
+    assert z.max() < 0.02 * radius
+    np.testing.assert_allclose(np.hypot(x, z), radius, rtol=0.05)
 
 
 def test_an_unknown_face_is_refused():

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError, SceneError
 from us_sim.pose import Pose
-from us_sim.scene import Scene, TissueSection
+from us_sim.scene import PoseSection, Scene, TissueSection
 
 if TYPE_CHECKING:
     from us_sim.collider import Collider
@@ -58,11 +58,9 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
         volume = cached_phantom(
             scene.volume.phantom, scene.volume.seed, scene.volume.voxel_size, progress
         )
-    patient_from_volume = Pose(
-        np.array(scene.volume.pose.position), np.array(scene.volume.pose.orientation)
-    )
+    patient_from_volume = _pose(scene.volume.pose).matrix
     return dataclasses.replace(
-        volume, index_to_patient=patient_from_volume.matrix @ volume.index_to_patient
+        volume, index_to_patient=patient_from_volume @ volume.index_to_patient
     )
 
 
@@ -127,11 +125,17 @@ def collider_of(scene: Scene) -> Collider:
     return shape(**given)
 
 
-def tissue_model_of(scene: Scene, volume: Volume) -> TissueModel:
+def tissue_model_of(
+    scene: Scene, volume: Volume, note: Callable[[str], None] | None = None
+) -> TissueModel:
     """Mesh, materials, fixed nodes and collider of the scene's tissue.
 
+    Args:
+        note: called with a sentence on each thing about the mesh that was repaired or is unusual.
+
     Raises:
-        SceneError: a label of the volume has no material, or a material or fixed part is unknown.
+        SceneError: a label of the volume has no material, or a material, fixed part or structure
+            is unknown.
         MeshError, MaterialError: the mesh or a material cannot be used.
     """
     from us_sim.tissue.model import TissueModel
@@ -139,11 +143,19 @@ def tissue_model_of(scene: Scene, volume: Volume) -> TissueModel:
     section = scene.tissue
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
-    mesh = _box(section)
-    fixed = _fixed_nodes(scene, section, mesh, volume)
-    from us_sim.tissue.box import face_nodes
+    if scene.structures:
+        from us_sim.structures import require_labels
 
-    contact = np.setdiff1d(face_nodes(mesh, "top"), np.flatnonzero(fixed)).astype(np.int32)
+        require_labels(scene, volume)
+    mesh, remarks = _mesh(section)
+    if note is not None:
+        for remark in remarks:
+            note(f"tissue mesh: {remark}")
+    fixed = _fixed_nodes(scene, section, mesh, volume)
+    from us_sim.tissue.box import face_nodes, facing_nodes
+
+    touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top")
+    contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
         materials=_materials(scene, section, mesh, volume),
@@ -178,16 +190,32 @@ def membrane_of(scene: Scene) -> SkinMembrane:
     )
 
 
-def _box(section: TissueSection) -> TetrahedralMesh:
+def _mesh(section: TissueSection) -> tuple[TetrahedralMesh, tuple[str, ...]]:
+    """The mesh, and what there is to say about it."""
+    given = section.mesh
+    if given.file:
+        from us_sim.tissue.mesh_file import read_mesh
+
+        mesh, remarks = read_mesh(Path(given.file), given.unit, _pose(given.pose))
+        parts = int(mesh.parts.max()) + 1
+        if parts > 1:
+            remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
+        return mesh, remarks
     from us_sim.tissue.mesh import box_mesh, uniform_planes
 
+    assert given.lower is not None
+    assert given.upper is not None
     planes = [
-        np.array(section.mesh.planes[axis])
-        if axis in section.mesh.planes
-        else uniform_planes(section.mesh.lower[i], section.mesh.upper[i], section.mesh.nodes[i])
+        np.array(given.planes[axis])
+        if axis in given.planes
+        else uniform_planes(given.lower[i], given.upper[i], given.nodes[i])
         for i, axis in enumerate("xyz")
     ]
-    return box_mesh(*planes)
+    return box_mesh(*planes), ()
+
+
+def _pose(section: PoseSection) -> Pose:
+    return Pose(np.array(section.position), np.array(section.orientation))
 
 
 def _materials(scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volume: Volume) -> Any:
@@ -227,7 +255,7 @@ def _fixed_nodes(
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
     for name in section.fixed:
         if name in FACES:
-            fixed[face_nodes(mesh, name)] = True
+            fixed[face_nodes(mesh, name, section.mesh.margin)] = True
         elif name in numbers and volume.labels is not None:
             fixed[nodes_in_label(mesh, volume.labels, volume.patient_to_index, numbers[name])] = (
                 True

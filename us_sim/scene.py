@@ -21,6 +21,7 @@ __all__ = [
     "Scene",
     "SkinSection",
     "SliceSection",
+    "StructureSection",
     "TissueSection",
     "TrackerSection",
     "VolumeSection",
@@ -71,12 +72,20 @@ class MeshSection:
     """A box of tetrahedra in ``patient``: its corners, and the number of nodes along each axis.
 
     ``planes`` may give the node coordinates along an axis one by one, to put them where they count.
+
+    Or a mesh from a ``file``, in this ``unit``, with its own frame at ``pose`` in ``patient``;
+    ``margin`` is how near to a face of its bounding box a node of its boundary belongs to that
+    face (a twentieth of the size along that axis where it is not given).
     """
 
-    lower: tuple[float, float, float] = _given(_POSITION)
-    upper: tuple[float, float, float] = _given(_POSITION)
+    lower: tuple[float, float, float] | None = _given(_POSITION, default=None)
+    upper: tuple[float, float, float] | None = _given(_POSITION, default=None)
     nodes: tuple[int, int, int] = _given(Quantity("number", 2, 400), default=(20, 10, 10))
     planes: dict[str, tuple[float, ...]] = _given(_POSITION, default_factory=dict)
+    file: str | None = _given(default=None)
+    unit: float = _given(Quantity("length", 1e-9, 1e3), default=1.0)
+    pose: PoseSection = _given(default=PoseSection())
+    margin: float | None = _given(Quantity("length", 1e-6, 1.0), default=None)
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,21 @@ class TissueSection:
         choices=("fem", "fem_nonlinear", "fem_cg", "msds", "msds_implicit"),
     )
     settings: dict[str, dict[str, Any]] = _given(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StructureSection:
+    """A surface in the tissue that goes with it: around a label of the volume, or from a file.
+
+    ``label`` is the structure's own name unless it is given. A file's surface is in this ``unit``,
+    with its own frame at ``pose`` in ``patient``. ``colour`` is red, green, blue.
+    """
+
+    label: str | None = _given(default=None)
+    file: str | None = _given(default=None)
+    unit: float = _given(Quantity("length", 1e-9, 1e3), default=1.0)
+    pose: PoseSection = _given(default=PoseSection())
+    colour: tuple[float, float, float] | None = _given(Quantity("number", 0.0, 1.0), default=None)
 
 
 @dataclass(frozen=True)
@@ -163,6 +187,7 @@ class Scene:
     volume: VolumeSection = _given()
     probe: ProbeSection = _given()
     tissue: TissueSection | None = _given(default=None)
+    structures: dict[str, StructureSection] = _given(default_factory=dict)
     skin: SkinSection | None = _given(default=None)
     slice: SliceSection = _given(default=SliceSection())
     tracker: TrackerSection = _given(default=TrackerSection())

@@ -21,7 +21,7 @@ import yaml
 
 from us_sim.errors import SceneError
 from us_sim.quantity import Quantity
-from us_sim.scene import Scene, TissueSection, VolumeSection
+from us_sim.scene import PoseSection, Scene, TissueSection, VolumeSection
 from us_sim.share import shared_roots
 
 __all__ = ["find_scene", "load_scene", "parse_scene"]
@@ -77,16 +77,29 @@ def parse_scene(document: object, *, origin: str = "scene", folder: Path | None 
     Raises:
         SceneError: see :func:`load_scene`.
     """
-    scene: Scene = _build(Scene, document, origin, "")
+    scene: Scene = _build(Scene, _with_named_structures(document), origin, "")
     scene = dataclasses.replace(scene, origin=origin)
     _check_volume(scene.volume, origin)
     if scene.tissue is not None:
         _check_tissue(scene, scene.tissue, origin)
+    _check_structures(scene, origin)
     if scene.skin is not None and scene.probe.collider is None:
         raise SceneError(
             f"{origin}: probe.collider: is missing, and the skin needs one to press it"
         )
     return _resolve_files(scene, origin, folder or Path.cwd())
+
+
+def _with_named_structures(document: object) -> object:
+    """Structures that have nothing but a name may be a list of names, or keys without a value."""
+    if not isinstance(document, dict) or "structures" not in document:
+        return document
+    given = document["structures"]
+    if isinstance(given, list) and all(isinstance(name, str) for name in given):
+        given = dict.fromkeys(given)
+    if isinstance(given, dict):
+        given = {name: {} if value is None else value for name, value in given.items()}
+    return document | {"structures": given}
 
 
 def _build(cls: type, document: object, origin: str, key: str) -> Any:
@@ -177,6 +190,21 @@ def _check_tissue(scene: Scene, tissue: TissueSection, origin: str) -> None:
     if not tissue.materials:
         raise SceneError(f"{origin}: tissue.materials: names no material")
     mesh = tissue.mesh
+    box = {"lower": mesh.lower, "upper": mesh.upper, "planes": mesh.planes or None}
+    if mesh.file is not None:
+        for key, value in box.items():
+            if value is not None:
+                raise SceneError(f"{origin}: tissue.mesh: has both `file` and `{key}`; keep one")
+        return
+    if mesh.lower is None or mesh.upper is None:
+        missing = "lower" if mesh.lower is None else "upper"
+        raise SceneError(
+            f"{origin}: tissue.mesh.{missing}: is missing; give the corners of a box, or a `file`"
+        )
+    if mesh.unit != 1.0 or mesh.pose != PoseSection() or mesh.margin is not None:
+        raise SceneError(
+            f"{origin}: tissue.mesh: `unit`, `pose` and `margin` are for a mesh from a `file` only"
+        )
     for axis, name in enumerate("xyz"):
         if mesh.lower[axis] >= mesh.upper[axis]:
             raise SceneError(
@@ -204,6 +232,17 @@ def _check_tissue(scene: Scene, tissue: TissueSection, origin: str) -> None:
             raise SceneError(f"{origin}: tissue.mesh.planes: unknown axis `{axis_name}`")
 
 
+def _check_structures(scene: Scene, origin: str) -> None:
+    if scene.structures and scene.tissue is None:
+        raise SceneError(f"{origin}: structures: need `tissue` to carry them, and it is missing")
+    for name, given in scene.structures.items():
+        key = f"{origin}: structures.{name}"
+        if given.file and given.label:
+            raise SceneError(f"{key}: has both `file` and `label`; keep one")
+        if not given.file and (given.unit != 1.0 or given.pose != PoseSection()):
+            raise SceneError(f"{key}: `unit` and `pose` are for a surface from a `file` only")
+
+
 def _resolve_files(scene: Scene, origin: str, folder: Path) -> Scene:
     """``scene`` with absolute, existing paths."""
 
@@ -223,6 +262,18 @@ def _resolve_files(scene: Scene, origin: str, folder: Path) -> Scene:
     if scene.skin is not None and scene.skin.file:
         skin = dataclasses.replace(scene.skin, file=existing("skin.file", scene.skin.file))
         scene = dataclasses.replace(scene, skin=skin)
+    if scene.tissue is not None and scene.tissue.mesh.file:
+        file = existing("tissue.mesh.file", scene.tissue.mesh.file)
+        mesh = dataclasses.replace(scene.tissue.mesh, file=file)
+        scene = dataclasses.replace(scene, tissue=dataclasses.replace(scene.tissue, mesh=mesh))
+    if scene.structures:
+        structures = {
+            name: dataclasses.replace(
+                given, file=given.file and existing(f"structures.{name}.file", given.file)
+            )
+            for name, given in scene.structures.items()
+        }
+        scene = dataclasses.replace(scene, structures=structures)
     if scene.path:
         scene = dataclasses.replace(scene, path=existing("path", scene.path))
     return scene

@@ -5,13 +5,14 @@ from array import array
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Int32MultiArray
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.nodes.conversions import (
@@ -21,6 +22,7 @@ from us_sim.nodes.conversions import (
     pixels_from,
     pose_from,
     pose_message,
+    structure_markers,
     surface_marker,
     tetrahedra_from,
     tetrahedra_message,
@@ -126,3 +128,28 @@ def test_what_does_not_fit_is_refused():
         pixels_from(Image(encoding="rgb8"))
     with pytest.raises(VolumeError, match="holds 0 bytes"):
         pixels_from(Image(encoding="mono8", height=2, width=2, step=2))
+
+
+@quick
+@given(
+    st.lists(
+        st.tuples(st.text("abcdefg", max_size=9), points, st.integers(0, 5), st.integers(0, 2**16)),
+        max_size=4,
+    ),
+    st.text("xyz", max_size=5),
+)
+def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
+    expected = MarkerArray()
+    given_ones = []
+    for name, vertices, count, seed in surfaces:
+        random = np.random.default_rng(seed)
+        triangles = random.integers(0, len(vertices), (count, 3))
+        colour = (0.25, 0.5, 0.75, 1.0)
+        given_ones.append((name, colour, vertices, triangles))
+        marker = Marker(ns=name, type=Marker.TRIANGLE_LIST, action=Marker.ADD)
+        marker.header.stamp, marker.header.frame_id = STAMP, frame
+        marker.scale.x = marker.scale.y = marker.scale.z = marker.pose.orientation.w = 1.0
+        marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in vertices[triangles.ravel()].tolist()]
+        expected.markers.append(marker)
+    assert structure_markers(given_ones, STAMP, frame) == serialize_message(expected)

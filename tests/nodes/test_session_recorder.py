@@ -56,6 +56,19 @@ def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
     assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
 
 
+def test_structures_are_recorded_only_by_name(bench, tmp_path):
+    structures = bench.peer.create_publisher(String, "tissue/structures", 10)
+    other = bench.peer.create_publisher(String, "tissue/nodes", 10)
+    bench.make(SessionRecorder, file=str(tmp_path / "all.mcap"))
+    bench.spin_until(lambda: other.get_subscription_count() > 0)
+    bench.spin_for(30)
+    assert structures.get_subscription_count() == 0
+    named = tmp_path / "named" / "one.mcap"
+    named.parent.mkdir()
+    bench.make(SessionRecorder, file=str(named), topics=["/tissue/structures"])
+    bench.spin_until(lambda: structures.get_subscription_count() > 0)
+
+
 def test_a_recording_is_not_overwritten(bench, tmp_path):
     file = tmp_path / "session.mcap"
     file.write_bytes(b"precious")

@@ -8,6 +8,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
+from visualization_msgs.msg import MarkerArray
 
 from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError
@@ -15,6 +16,7 @@ from us_sim.nodes.conversions import tetrahedra_from, vectors_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.pose import Pose
 from us_sim.scene_file import load_scene
+from us_sim.structures import structures_of
 from us_sim.tissue.solver import create_solver
 
 
@@ -102,6 +104,93 @@ def test_nothing_is_solved_for_nobody(bench, small_scene):
     publisher.publish(pose_at(0.004, 1))
     bench.spin_until(lambda: node.health.received == 1)
     assert node.health.state == "ready with fem"
+
+
+@pytest.fixture
+def scene_with_structures(small_scene, tmp_path):
+    file = tmp_path / "structures.yaml"
+    file.write_text(small_scene.read_text() + "structures: [vein, bone]\n")
+    return file
+
+
+def test_structures_are_where_the_tissue_has_carried_them(bench, scene_with_structures):
+    node = bench.make(
+        TissueDeformer,
+        scene=str(scene_with_structures),
+        lockstep=True,
+        structure_triangles=5000,
+        marker_rate=0.5,
+    )
+    markers = bench.collect(MarkerArray, "tissue/structures")
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    for topic in ("tissue/structures", "tissue/nodes"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    for second in (1, 2, 3):
+        press(bench, publisher, nodes, 0.006, second)
+    bench.spin_until(lambda: len(markers) >= 2)
+    assert [m.markers[0].header.stamp.sec for m in markers] == [1, 3]  # a marker every two seconds
+    scene = load_scene(scene_with_structures)
+    volume = volume_of(scene)
+    mesh = tissue_model_of(scene, volume).mesh
+    expected = list(structures_of(scene, volume, mesh, 5000))
+    total = sum(len(made.surface.triangles) for made in expected)
+    assert total == pytest.approx(5000, rel=0.1)
+    assert node.health.values["structures"] == f"vein, bone: {total} triangles"
+    for marker, made in zip(markers[-1].markers, expected, strict=True):
+        assert (marker.ns, marker.header.frame_id, marker.type) == (made.name, "patient", 11)
+        assert marker.color.b == np.float32(made.colour[2])
+        points = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3, 3)
+        vertices, _ = made.surface.deform(vectors_from(nodes[-1]))
+        np.testing.assert_allclose(points, vertices[made.surface.triangles], atol=2e-8)
+    assert np.abs(vertices - made.surface.vertices).max() > 1e-5  # something moved
+
+
+def test_structures_are_made_for_nobody_and_live_beside_the_deforming(bench, scene_with_structures):
+    node = bench.make(TissueDeformer, scene=str(scene_with_structures), structure_triangles=2000)
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/nodes") > 0)
+    press(bench, publisher, nodes, 0.004, 1)
+    assert node.health.values["structures"] == "not made, nobody subscribes"
+    markers = bench.collect(MarkerArray, "tissue/structures")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/structures") > 0)
+    second = 2
+    while not markers:
+        press(bench, publisher, nodes, 0.004, second)
+        second += 1
+    assert [marker.ns for marker in markers[0].markers] == ["vein", "bone"]
+
+
+def test_a_structure_that_cannot_be_made_is_said_and_the_tissue_goes_on(
+    bench, tmp_path, small_scene
+):
+    (tmp_path / "far.obj").write_text("v 9 9 9\nv 9 9 8\nv 9 8 8\nf 1 2 3\n")
+    file = tmp_path / "far.yaml"
+    file.write_text(small_scene.read_text() + "structures: {clip: {file: far.obj}}\n")
+    node = bench.make(TissueDeformer, scene=str(file), lockstep=True)
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    markers = bench.collect(MarkerArray, "tissue/structures")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    for topic in ("tissue/structures", "tissue/nodes"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    press(bench, publisher, nodes, 0.004, 1)
+    press(bench, publisher, nodes, 0.004, 2)
+    assert node.health.problems("structures") == 1
+    assert (
+        "structures.clip: 3 of the surface's 3 vertices lie outside"
+        in node.health.values["structures"]
+    )
+    assert not markers
+
+
+def test_a_structure_without_its_label_is_refused_at_once(bench, tmp_path, small_scene):
+    file = tmp_path / "unknown.yaml"
+    file.write_text(small_scene.read_text() + "structures: [kidney]\n")
+    with pytest.raises(
+        SceneError, match=r"structures\.kidney: the volume has no label `kidney`; it"
+    ):
+        bench.make(TissueDeformer, scene=str(file))
 
 
 def test_a_broken_pose_is_survived(bench, deformer):

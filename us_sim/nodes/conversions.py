@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -28,6 +29,7 @@ __all__ = [
     "pixels_from",
     "pose_from",
     "pose_message",
+    "structure_markers",
     "surface_marker",
     "tetrahedra_from",
     "tetrahedra_message",
@@ -35,6 +37,9 @@ __all__ = [
     "vectors_from",
     "wrench_message",
 ]
+
+Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], NDArray[np.integer]]
+"""A marker's namespace, its red, green, blue and alpha, (V, 3) m vertices and (T, 3) triangles."""
 
 _CDR_LITTLE_ENDIAN = b"\0\1\0\0"
 _EMPTY = (1, b"\0")  # a string
@@ -209,21 +214,37 @@ def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer])
 def surface_marker(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], stamp: Time, frame: str
 ) -> bytes:
-    """A skin-coloured TRIANGLE_LIST marker, serialized.
+    """A skin-coloured TRIANGLE_LIST marker, serialized."""
+    skin = ("skin", (0.85, 0.65, 0.55, 0.9), vertices, triangles)
+    return b"".join([_CDR_LITTLE_ENDIAN, *_marker(skin, stamp, frame, 0)])
+
+
+def structure_markers(surfaces: Sequence[Surface], stamp: Time, frame: str) -> bytes:
+    """A MarkerArray with a TRIANGLE_LIST of each surface in its own namespace, serialized."""
+    parts = [_CDR_LITTLE_ENDIAN, struct.pack("@I", len(surfaces))]
+    for surface in surfaces:
+        parts += _marker(surface, stamp, frame, sum(map(len, parts[1:])))
+    return b"".join(parts)
+
+
+def _marker(surface: Surface, stamp: Time, frame: str, offset: int) -> list[bytes]:
+    """The parts of a serialized TRIANGLE_LIST marker that begins at that offset of a message.
 
     It holds three Point objects a triangle, too slow to make one by one. So the CDR is written
     here: native alignment in `struct` is CDR's, and ``0d`` aligns what follows.
     """
-    points = np.ascontiguousarray(vertices[triangles.ravel()], dtype=np.float64)
-    name, place = b"skin\0", frame.encode() + b"\0"
-    identity, scale, colour = (0, 0, 0, 0, 0, 0, 1), (1, 1, 1), (0.85, 0.65, 0.55, 0.9)
+    namespace, colour, vertices, triangles = surface
+    points = vertices.astype(np.float64)[triangles.ravel()]
+    name, place = namespace.encode() + b"\0", frame.encode() + b"\0"
+    identity, scale = (0, 0, 0, 0, 0, 0, 1), (1, 1, 1)
+    before = offset % 8
     head = struct.pack(
-        f"@iII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if len(points) else ""),
+        f"@{before}xiII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if len(points) else ""),
         *(stamp.sec, stamp.nanosec, len(place), place, len(name), name),
         *(0, Marker.TRIANGLE_LIST, Marker.ADD, *identity, *scale, *colour),
         *(0, 0, False, len(points)),
     )
-    return b"".join([_CDR_LITTLE_ENDIAN, head, points.tobytes(), _MARKER_TAIL])
+    return [head[before:], points.tobytes(), _MARKER_TAIL]
 
 
 def _points(vertices: NDArray[np.floating]) -> list[Point]:

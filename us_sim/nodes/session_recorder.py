@@ -27,7 +27,8 @@ class SessionRecorder(Node):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
     Parameters: ``file`` (.mcap), ``compression`` (none or zstd), ``topics`` (full names; empty:
-    all), ``exclude``.
+    all), ``exclude``. The surfaces of ``tissue/structures`` are recorded only where ``topics``
+    names them: they are large, and follow from ``tissue/nodes``.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -36,6 +37,7 @@ class SessionRecorder(Node):
         compression = fixed_parameter(self, "compression", "none", "none or zstd")
         self._topics = {t for t in fixed_parameter(self, "topics", [""], "topics; empty: all") if t}
         self._excluded = {*fixed_parameter(self, "exclude", [""], "left out"), *NOT_THE_SESSION}
+        self._excluded |= {self.resolve_topic_name("tissue/structures")} - self._topics
         self._refused: set[str] = set()
         self._subscribed: set[str] = set()
         taken = Path(file).with_name("metadata.yaml").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -25,6 +25,9 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.tissue.solver import SOLVERS
 from us_sim.tissue.switching import SwitchableTissue
 
+if TYPE_CHECKING:
+    from us_sim.nodes.structure_markers import StructureMarkers
+
 __all__ = ["TissueDeformer", "main"]
 
 ALWAYS = Time()
@@ -33,6 +36,8 @@ ALWAYS = Time()
 
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
+
+    ``tissue/structures`` too where the scene has structures, see `StructureMarkers`.
 
     The parameter ``solver`` switches the method while running; the state is carried over. With
     ``compare_with`` another method runs on the same poses, and diagnostics say how far its nodes
@@ -43,7 +48,7 @@ class TissueDeformer(SceneNode):
         super().__init__("tissue_deformer", **kwargs)
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
-        model = tissue_model_of(self.scene, volume_of(self.scene))
+        model = tissue_model_of(self.scene, volume_of(self.scene), self.get_logger().info)
         mesh = model.mesh
         solver = self._method(
             "solver", self.scene.tissue.solver, f"one of {', '.join(SOLVERS)}", "deforms the tissue"
@@ -64,6 +69,11 @@ class TissueDeformer(SceneNode):
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
+        self._structures: StructureMarkers | None = None
+        if self.scene.structures:
+            from us_sim.nodes.structure_markers import StructureMarkers
+
+            self._structures = StructureMarkers(self, mesh)
         self.newest(PoseStamped, "probe/pose", self._deform)
         self.health.state = f"ready with {solver}"
         self.get_logger().info(self.health.state)
@@ -104,9 +114,10 @@ class TissueDeformer(SceneNode):
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
         felt = self._wrench.get_subscription_count() > 0
-        if not (wanted or felt):
-            return
         stamp = message.header.stamp
+        shown = self._structures is not None and self._structures.is_due(stamp)
+        if not (wanted or felt or shown):
+            return
         try:
             deformation = self._tissue.deform(pose_from(message))
         except UsSimError as error:
@@ -120,12 +131,15 @@ class TissueDeformer(SceneNode):
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
+        if self._structures is not None and shown:
+            self._structures.publish(deformation.nodes, stamp)
         self.health.state = self._tissue.name
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
             "contact_nodes": str(len(deformation.contact_nodes)),
             "action": deformation.action,
             **self._comparison(),
+            **({"structures": self._structures.state} if self._structures else {}),
         }
 
     def _comparison(self) -> dict[str, str]:

@@ -1,0 +1,105 @@
+"""Surfaces of labels: closed, outward, of the labels' own volume; and labels that have none."""
+
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import VolumeError
+from us_sim.volume.label_surface import label_surface, spacing_for
+from us_sim.volume.phantom import cached_phantom
+from us_sim.volume.volume import Volume
+
+
+def labelled(mask, affine=None, label=3):
+    labels = np.where(mask, np.uint8(label), np.uint8(1))
+    placed = np.diag([1e-3, 1e-3, 1e-3, 1.0]) if affine is None else affine
+    return Volume(np.zeros_like(labels), placed, labels=labels, label_names={1: "fat", 3: "vein"})
+
+
+def enclosed(vertices, triangles):
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[triangles], 1, 0)
+    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+
+
+def require_closed(triangles):
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    there = {tuple(edge) for edge in edges.tolist()}
+    assert len(there) == len(edges)
+    assert all((b, a) in there for a, b in there)
+
+
+@given(
+    radius=st.floats(5.0, 12.0),
+    steps=st.tuples(*[st.floats(0.5e-3, 1.5e-3)] * 3),
+    mirrored=st.booleans(),
+    seed=st.integers(0, 2**16),
+)
+@settings(max_examples=12, deadline=None)
+def test_a_ball_keeps_its_volume_and_faces_outwards(radius, steps, mirrored, seed):
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    turn[:, 0] *= np.sign(np.linalg.det(turn)) * (-1 if mirrored else 1)
+    affine = np.eye(4)
+    affine[:3, :3] = turn * steps
+    affine[:3, 3] = [0.1, -0.2, 0.3]
+    mask = ((np.indices((32, 32, 32)) - 15.3) ** 2).sum(axis=0) < radius**2
+    volume = labelled(mask, affine)
+    vertices, triangles = label_surface(volume, 3)
+    require_closed(triangles)
+    assert enclosed(vertices, triangles) == pytest.approx(mask.sum() * np.prod(steps), rel=0.01)
+    centre = affine[:3, :3] @ np.full(3, 15.3) + affine[:3, 3]
+    np.testing.assert_allclose(vertices.mean(axis=0), centre, atol=0.3 * max(steps))
+
+
+def test_structures_of_the_arm_keep_their_volume_within_the_triangles_allowed():
+    arm = cached_phantom("upper_arm", seed=1, voxel_size=0.6e-3)
+    numbers = {name: label for label, name in arm.label_names.items()}
+    labels = [numbers[name] for name in ("vein", "artery", "nerve", "bone")]
+    for allowed in (30_000, 15_000):
+        spacing = spacing_for(arm, labels, allowed)
+        count = 0
+        for label in labels:
+            vertices, triangles = label_surface(arm, label, spacing)
+            count += len(triangles)
+            voxels = np.count_nonzero(arm.labels == label) * 0.6e-3**3
+            assert enclosed(vertices, triangles) == pytest.approx(voxels, rel=0.03)
+            assert (vertices >= arm.extent[0] - spacing / 2).all()
+            assert (vertices <= arm.extent[1] + spacing / 2).all()
+        assert count == pytest.approx(allowed, rel=0.1)
+
+
+def test_a_box_cuts_and_caps():
+    mask = np.zeros((30, 60, 30), bool)
+    mask[10:20, :, 10:20] = True
+    volume = labelled(mask)
+    box = np.array([[-1.0, 0.0205, -1.0], [1.0, 0.0405, 1.0]])
+    vertices, triangles = label_surface(volume, 3, within=box)
+    require_closed(triangles)
+    assert enclosed(vertices, triangles) == pytest.approx(10 * 20 * 10 * 1e-9, rel=0.01)
+    np.testing.assert_allclose([vertices[:, 1].min(), vertices[:, 1].max()], box[:, 1], atol=2e-4)
+
+
+def test_two_calls_give_the_same_bytes():
+    mask = ((np.indices((20, 20, 20)) - 9.5) ** 2).sum(axis=0) < 40
+    first, second = (label_surface(labelled(mask), 3, 1.7e-3) for _ in range(2))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
+
+
+def test_what_has_no_surface_is_said(monkeypatch):
+    mask = np.zeros((12, 12, 12), bool)
+    mask[5:7, 5:7, 5:7] = True
+    volume = labelled(mask)
+    with pytest.raises(VolumeError, match=r"label 9 \(unnamed\) occurs nowhere: name another"):
+        label_surface(volume, 9)
+    with pytest.raises(VolumeError, match=r"label 3 \(vein\) occurs nowhere within the tissue"):
+        label_surface(volume, 3, within=np.array([[1.0] * 3, [2.0] * 3]))
+    with pytest.raises(VolumeError, match=r"label 3 \(vein\) is too thin for a surface 5 mm fine"):
+        label_surface(volume, 3, 5e-3)
+    bare = Volume(volume.intensities, volume.index_to_patient)
+    with pytest.raises(VolumeError, match="the volume has no labels"):
+        label_surface(bare, 3)
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(VolumeError, match="need scikit-image; install it"):
+        label_surface(volume, 3)
