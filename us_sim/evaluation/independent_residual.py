@@ -88,11 +88,12 @@ class IndependentResidual:
                 push[model.fixed[touched]] = 0.0
                 unbalanced[touched] -= push[:, None] * normal
                 load = float(np.linalg.norm(push))
-            self._heaviest = max(self._heaviest, load)
-            reference = load or self._heaviest
             imbalance = float(np.linalg.norm(unbalanced))
-        if reference == 0.0:
-            return (0.0 if imbalance <= self._rounding else imbalance), 0.0
+        if load == 0.0 and imbalance <= self._rounding:
+            self._heaviest = 0.0  # at rest
+            return 0.0, 0.0
+        self._heaviest = max(self._heaviest, load) or imbalance
+        reference = load or self._heaviest
         return imbalance / reference, self._rounding / reference
 
 

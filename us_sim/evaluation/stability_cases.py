@@ -23,7 +23,16 @@ from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["COLLIDERS", "LAYOUTS", "StabilityCase", "extreme_cases", "model_of", "sampled_cases"]
+__all__ = [
+    "COLLIDERS",
+    "LAYOUTS",
+    "MOTIONS",
+    "SPRINGS",
+    "StabilityCase",
+    "extreme_cases",
+    "model_of",
+    "sampled_cases",
+]
 
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),
@@ -36,6 +45,9 @@ COLLIDERS: dict[str, Collider] = {
 
 #: Where a mesh is stiffer by the contrast.
 LAYOUTS = ("inclusion", "skin", "half", "scattered")
+
+#: Spring constants of methods that have springs, and whether tetrahedra keep their volumes.
+SPRINGS = ("algorithm_1", "fitted", "fitted with volume")
 
 #: Motions of the probe; see `us_sim.evaluation.stability_motions`.
 MOTIONS = (
@@ -75,6 +87,7 @@ class StabilityCase:
     collider: str = "sphere"
     release: str = "removed"  # the probe is "removed" or "lifted"
     stabilisation: str = "mass_scaling"  # of msds
+    springs: str = "algorithm_1"  # of msds and msds_implicit, see `SPRINGS`
 
 
 def sampled_cases(count: int) -> list[StabilityCase]:
@@ -83,7 +96,7 @@ def sampled_cases(count: int) -> list[StabilityCase]:
     Those of young_modulus, contrast, density, time_step and damping (but for an eighth without any)
     are even in the logarithm, those of poisson_ratio in lg(0.5 - poisson_ratio).
     """
-    points = qmc.Sobol(13, scramble=False).random_base2(round(math.log2(count)))
+    points = qmc.Sobol(14, scramble=False).random_base2(round(math.log2(count)))
     return [_sampled(number, point) for number, point in enumerate(points)]
 
 
@@ -109,6 +122,7 @@ def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
         support=one_of(("bottom", "bottom", "bottom", "walls", "three"), point[11]),
         release=one_of(("removed", "lifted"), point[12] * 2 % 1),
         stabilisation=one_of(("mass_scaling",) * 3 + ("substeps",), point[12]),
+        springs=one_of(("algorithm_1", "algorithm_1", *SPRINGS[1:]), point[13]),
     )
 
 
@@ -134,6 +148,9 @@ def extreme_cases(corners: bool) -> list[StabilityCase]:
         StabilityCase("damped 1000 times, steps of 10 s", damping=1e3, time_step=10.0),
         StabilityCase("sub-stepped", time_step=1e-4, damping=0.01, stabilisation="substeps"),
         StabilityCase("refuses sub-steps", time_step=10.0, stabilisation="substeps"),
+        StabilityCase("fitted springs", springs="fitted", motion="jump"),
+        StabilityCase("volumes kept", springs=SPRINGS[2], poisson_ratio=0.4999),
+        StabilityCase("volumes kept in a jump", springs=SPRINGS[2], motion="jump", depth=0.8),
         StabilityCase("whole thickness", depth=1.0),
         StabilityCase("whole thickness in a jump", depth=1.0, motion="jump"),
         StabilityCase("whole thickness of a slab", depth=1.0, mesh="slab", collider="plate"),

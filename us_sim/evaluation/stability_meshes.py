@@ -62,8 +62,9 @@ def parts(mesh: TetrahedralMesh) -> NDArray[np.intp]:
 
 
 def _box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
-    across = uniform_planes(-0.05 * size, 0.05 * size, nx), uniform_planes(
-        -0.05 * size, 0.05 * size, ny
+    across = (
+        uniform_planes(-0.05 * size, 0.05 * size, nx),
+        uniform_planes(-0.05 * size, 0.05 * size, ny),
     )
     return box_mesh(*across, uniform_planes(0.0, 0.08 * size, nz))
 
