@@ -42,7 +42,7 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["SurfaceCompliance", "surface_compliance"]
 
 # Counts as part of the cache's key: raise it when the bytes change.
-_VERSION = 1
+_VERSION = 2
 
 # Numbers in the fields. With fewer, single precision would save no time worth its rounding.
 _DOUBLE = 4_000_000
@@ -61,26 +61,21 @@ class SurfaceCompliance:
     nodes: NDArray[np.int32]  # (S,), the model's movable contact nodes
     free: NDArray[np.int32]  # (F,), nodes that are not fixed, ascending
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
-    fields: NDArray[np.floating]  # (3S, 3 F), m/N, by axis, what each force does to all free nodes
+    fields: NDArray[np.floating]  # (3S, 3, F), m/N, what each force does to all free nodes
     count: int  # N, nodes of the mesh
     rounding: float  # unbalanced force that rounding leaves in a field, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; rows without force are not read."""
-        displacement[:, self.free] += self._sum(forces).astype(displacement.dtype)
+        rows = np.flatnonzero(forces)
+        _add_rows(self.fields, rows, forces.ravel()[rows], self.free, displacement.T)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, what forces (S, 3) N do to every node."""
         displacement = np.zeros((self.count, 3))
-        displacement[self.free] = self._sum(forces).T
+        rows = np.flatnonzero(forces)
+        _add_rows(self.fields, rows, forces.ravel()[rows], self.free, displacement)
         return displacement
-
-    def _sum(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3, F) m."""
-        total = np.zeros((3, len(self.free)))
-        rows = np.flatnonzero(forces.ravel())
-        _add_rows(self.fields, rows, forces.ravel()[rows], total.reshape(-1))
-        return total
 
 
 def surface_compliance(model: TissueModel) -> SurfaceCompliance:
@@ -138,10 +133,9 @@ def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
             done += len(part)
             if show:
                 show(0.6 + 0.4 * done / len(free))
-    flat = fields.reshape(len(fields), -1)
-    made = SurfaceCompliance(nodes, free, condensed.compliance, flat, len(model.mesh.nodes), 0.0)
+    made = SurfaceCompliance(nodes, free, condensed.compliance, fields, len(model.mesh.nodes), 0.0)
     return SurfaceCompliance(
-        nodes, free, condensed.compliance, flat, made.count, _rounding(made, system, model.fixed)
+        nodes, free, condensed.compliance, fields, made.count, _rounding(made, system, model.fixed)
     )
 
 
@@ -203,22 +197,29 @@ _FORM = Form("compliance.json", _pack, _unpack)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _add_rows(fields, rows, weights, total):
-    """Adds the weighted rows of fields (R, K) to total (K,), four at a time."""
-    width = 2048  # of a piece of the total that stays in the cache
+def _add_rows(fields, rows, weights, free, displacement):
+    """Adds the weighted rows of fields (R, 3, F) to displacement (N, 3) of free (F,) nodes."""
+    width = 1024  # of a piece that stays in the fastest cache
     four = len(rows) // 4 * 4
-    for begin in range(0, len(total), width):
-        piece = total[begin : begin + width]
-        for m in range(0, four, 4):
-            a = fields[rows[m]][begin : begin + width]
-            b = fields[rows[m + 1]][begin : begin + width]
-            c = fields[rows[m + 2]][begin : begin + width]
-            d = fields[rows[m + 3]][begin : begin + width]
-            p, q, r, s = weights[m], weights[m + 1], weights[m + 2], weights[m + 3]
-            for i in range(len(piece)):
-                piece[i] += p * a[i] + q * b[i] + r * c[i] + s * d[i]
-        for m in range(four, len(rows)):
-            a = fields[rows[m]][begin : begin + width]
-            p = weights[m]
-            for i in range(len(piece)):
-                piece[i] += p * a[i]
+    whole = np.empty((3, width))
+    for begin in range(0, len(free), width):
+        end = min(begin + width, len(free))
+        for axis in range(3):
+            piece = whole[axis, : end - begin]
+            piece[:] = 0.0
+            for m in range(0, four, 4):
+                a = fields[rows[m], axis, begin:end]
+                b = fields[rows[m + 1], axis, begin:end]
+                c = fields[rows[m + 2], axis, begin:end]
+                d = fields[rows[m + 3], axis, begin:end]
+                p, q, r, s = weights[m], weights[m + 1], weights[m + 2], weights[m + 3]
+                for i in range(len(piece)):
+                    piece[i] += p * a[i] + q * b[i] + r * c[i] + s * d[i]
+            for m in range(four, len(rows)):
+                a = fields[rows[m], axis, begin:end]
+                p = weights[m]
+                for i in range(len(piece)):
+                    piece[i] += p * a[i]
+        for i in range(end - begin):
+            for axis in range(3):
+                displacement[free[begin + i], axis] += whole[axis, i]

@@ -37,6 +37,9 @@ CLOSED = 1e-9
 
 _ROUNDS = 60
 
+# Part of the spacing: open gaps wider than this wait for the next round.
+_AHEAD = 0.25
+
 # How many earlier rounds are mixed.
 _MEMORY = 4
 
@@ -202,7 +205,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
     for iteration in range(_ROUNDS):
         _gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
         was[:] = active
-        _push(block, point, gap, normal, iteration == 0, active, forces)
+        _push(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
         same = iteration > 0
         for m in range(k):
             if active[m] != was[m]:
@@ -232,23 +235,23 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _push(block, point, gap, normal, first, active, forces):
+def _push(block, point, gap, normal, limit, first, active, forces):
     """Fills active (k,), which comes in as a guess, and forces (k, 3), with the planes of the probe
     at point (k, 3) displaced nodes, where their gap is (k,) and its normal (k, 3).
     """
     k = len(gap)
-    finite = np.flatnonzero(np.isfinite(gap))
-    count = len(finite)
+    chosen = np.flatnonzero((gap < limit) | (active & np.isfinite(gap)))
+    count = len(chosen)
     delassus = np.empty((count, count))
     offset, push, guess = np.empty(count), np.zeros(count), np.empty(count, np.bool_)
     for p in range(count):
-        m = finite[p]
+        m = chosen[p]
         x, y, z = normal[m, 0], normal[m, 1], normal[m, 2]
         offset[p] = gap[m] - (x * point[m, 0] + y * point[m, 1] + z * point[m, 2])
         guess[p] = active[m] or (first and gap[m] < 0.0)
         a, b, c = block[3 * m], block[3 * m + 1], block[3 * m + 2]
         for q in range(p + 1):
-            n = finite[q]
+            n = chosen[q]
             value = 0.0
             for axis in range(3):
                 j = 3 * n + axis
@@ -261,7 +264,7 @@ def _push(block, point, gap, normal, first, active, forces):
         active[m] = False
         forces[m, 0] = forces[m, 1] = forces[m, 2] = 0.0
     for p in range(count):
-        m = finite[p]
+        m = chosen[p]
         active[m] = push[p] > 0.0
         for axis in range(3):
             forces[m, axis] = push[p] * normal[m, axis]

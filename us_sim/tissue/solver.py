@@ -73,6 +73,7 @@ class TissueSolver(ABC):
         self.model = model
         self._pose: Pose | None = None
         self._settled = True
+        self._reach = _FARTHEST * float(np.ptp(model.mesh.nodes, axis=0).max())
         self._last = self._resting()
 
     def deform(self, probe_pose: Pose | None) -> Deformation:
@@ -155,11 +156,10 @@ class TissueSolver(ABC):
         """Put the tissue where a state says."""
 
     def _is_plausible(self, deformation: Deformation) -> bool:
-        mesh = self.model.mesh
-        reach = _FARTHEST * np.ptp(mesh.nodes, axis=0).max()
         numbers = (deformation.force, deformation.torque, deformation.residual)
         # A comparison with NaN is false.
-        return bool(np.abs(deformation.nodes - mesh.nodes).max() <= reach) and all(
+        moved = np.abs(deformation.nodes - self.model.mesh.nodes).max()
+        return bool(moved <= self._reach) and all(
             bool(np.isfinite(number).all()) for number in numbers
         )
 
