@@ -74,6 +74,7 @@ def test_node_order_is_x_then_y_then_z():
             ONE,
             "3 mesh nodes are not finite, such as node 1 at",
         ),
+        (CORNER * 1e300, ONE, "3 mesh nodes are farther than 1e.06 m away, such as node 1"),
         (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
         (CORNER, [[-1, 1, 2, 3]], "name nodes -1 to 3"),
         (

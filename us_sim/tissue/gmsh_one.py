@@ -43,10 +43,13 @@ def parse_gmsh_one(text: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     if any(len(row) != 4 for row in rows):
         raise MeshError("a node of the file is not a number and three coordinates")
     try:
-        numbers = np.array([row[0] for row in rows]).astype(np.int64)
+        numbers = np.array([int(row[0]) for row in rows], dtype=np.int64)
         points = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)
         elements = [[int(word) for word in row.split()] for row in _part(text, "$ELM", "$ENDELM")]
-    except ValueError as error:
+        largest = max((max(element) for element in elements), default=0)
+        if largest > np.iinfo(np.int64).max:
+            raise OverflowError(f"{largest} is no node")
+    except (ValueError, OverflowError) as error:
         raise MeshError(f"the file has something else where a number should be: {error}") from error
     if any(len(element) < 6 or len(element) != 5 + element[4] for element in elements):
         raise MeshError("an element of the file has more or fewer nodes than it says")
@@ -61,7 +64,10 @@ def parse_gmsh_one(text: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         raise MeshError("a tetrahedron of the file does not have four nodes")
     if not named:
         raise MeshError("the file has no tetrahedra")
-    order = np.argsort(numbers)
+    order = np.argsort(numbers, kind="stable")
+    twice = np.flatnonzero(np.diff(numbers[order]) == 0)
+    if len(twice):
+        raise MeshError(f"two nodes of the file have the number {numbers[order[twice[0]]]}")
     corners = np.array(named)
     place = np.searchsorted(numbers, corners, sorter=order).clip(0, len(numbers) - 1)
     tetrahedra = order[place]
@@ -79,7 +85,7 @@ def _part(text: str, begin: str, end: str) -> list[str]:
         raise MeshError(f"the file has no whole part {begin} … {end}")
     lines = body.split("\n")
     lines = [line for line in map(str.strip, lines) if line]
-    if not lines or not lines[0].isdigit() or int(lines[0]) != len(lines) - 1:
+    if not lines or not lines[0].isdecimal() or int(lines[0]) != len(lines) - 1:
         raise MeshError(
             f"the part {begin} of the file has {max(len(lines) - 1, 0)} lines, but says "
             f"{lines[0] if lines else 'nothing'}"

@@ -21,7 +21,15 @@ from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
 
-__all__ = ["EDGES", "FACES", "MOST_NODES", "check_mesh", "face_order", "signed_volumes"]
+__all__ = [
+    "EDGES",
+    "FACES",
+    "MOST_NODES",
+    "check_arrays",
+    "check_mesh",
+    "face_order",
+    "signed_volumes",
+]
 
 #: The six edges of a tetrahedron, and the four outward faces of a positively oriented one.
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
@@ -29,6 +37,9 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 #: So many nodes at most, so that the three of a face fit into one 64-bit number.
 MOST_NODES = 2**21
+
+# m, beyond which no body is, and volumes would overflow.
+_FARTHEST = 1e6
 
 # Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise.
 _SMALLEST_VOLUME = 1e-9
@@ -47,7 +58,7 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
             repeated, faces of more than two tetrahedra, tetrahedra that overlap a neighbour, or
             parts that hang together by a node or an edge only. It says how many, and where one is.
     """
-    _check_arrays(nodes, tetrahedra)
+    check_arrays(nodes, tetrahedra)
     used = np.zeros(len(nodes), dtype=bool)
     used[tetrahedra] = True
     if not used.all():
@@ -59,6 +70,42 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
     _check_places(nodes)
     _check_volumes(nodes, tetrahedra)
     _check_faces(tetrahedra)
+
+
+def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
+    """Refuse arrays that say nothing about a mesh, whatever is wrong with the mesh itself.
+
+    Raises:
+        MeshError: wrong shapes or types, too many nodes, coordinates that are not finite or too
+            large, or indices out of range.
+    """
+    if nodes.ndim != 2 or nodes.shape[1] != 3:
+        raise MeshError(f"mesh nodes have shape {nodes.shape}: give (N, 3) coordinates")
+    if tetrahedra.ndim != 2 or tetrahedra.shape[1] != 4 or tetrahedra.shape[0] == 0:
+        raise MeshError(f"tetrahedra have shape {tetrahedra.shape}: give (M, 4) indices, M > 0")
+    if not np.issubdtype(tetrahedra.dtype, np.integer):
+        raise MeshError(f"tetrahedra are of type {tetrahedra.dtype}: give integer node indices")
+    if len(nodes) > MOST_NODES:
+        raise MeshError(
+            f"the mesh has {len(nodes)} nodes: give a coarser one, of {MOST_NODES} at most"
+        )
+    bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{_counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
+            f"{bad[0]} at {nodes[bad[0]].tolist()}: give every node three numbers"
+        )
+    bad = np.flatnonzero((np.abs(nodes) > _FARTHEST).any(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{_counted(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
+            f"away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give coordinates in metres"
+        )
+    if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
+        raise MeshError(
+            f"tetrahedra name nodes {tetrahedra.min()} to {tetrahedra.max()}, but the mesh "
+            f"has nodes 0 to {len(nodes) - 1}"
+        )
 
 
 def signed_volumes(
@@ -90,30 +137,6 @@ def face_order(
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
     return order, starts, np.diff(np.append(starts, len(keys)))
-
-
-def _check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
-    if nodes.ndim != 2 or nodes.shape[1] != 3:
-        raise MeshError(f"mesh nodes have shape {nodes.shape}: give (N, 3) coordinates")
-    if tetrahedra.ndim != 2 or tetrahedra.shape[1] != 4 or tetrahedra.shape[0] == 0:
-        raise MeshError(f"tetrahedra have shape {tetrahedra.shape}: give (M, 4) indices, M > 0")
-    if not np.issubdtype(tetrahedra.dtype, np.integer):
-        raise MeshError(f"tetrahedra are of type {tetrahedra.dtype}: give integer node indices")
-    if len(nodes) > MOST_NODES:
-        raise MeshError(
-            f"the mesh has {len(nodes)} nodes: give a coarser one, of {MOST_NODES} at most"
-        )
-    bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
-    if len(bad):
-        raise MeshError(
-            f"{_counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
-            f"{bad[0]} at {nodes[bad[0]].tolist()}: give every node three numbers"
-        )
-    if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
-        raise MeshError(
-            f"tetrahedra name nodes {tetrahedra.min()} to {tetrahedra.max()}, but the mesh "
-            f"has nodes 0 to {len(nodes) - 1}"
-        )
 
 
 def _check_places(nodes: NDArray[np.float64]) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
 from us_sim.tissue.mesh import TetrahedralMesh
-from us_sim.tissue.mesh_check import signed_volumes
+from us_sim.tissue.mesh_check import check_arrays, signed_volumes
 
 __all__ = ["repair"]
 
@@ -45,8 +45,7 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
     """
     places = np.asarray(nodes, dtype=np.float64)
     corners: NDArray[Any] = np.asarray(tetrahedra)
-    if not _is_indexed(places, corners):
-        return TetrahedralMesh(places, corners), ()
+    check_arrays(places, corners)
     report = []
 
     whole, joined = np.unique(places + 0.0, axis=0, return_inverse=True)
@@ -87,20 +86,6 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
     except MeshError as error:
         done = f" (after repair: {', '.join(report)})" if report else ""
         raise MeshError(f"{error}{done}") from error
-
-
-def _is_indexed(nodes: NDArray[np.float64], tetrahedra: NDArray[np.generic]) -> bool:
-    """Whether the arrays can be worked on at all; `TetrahedralMesh` says it when not."""
-    return bool(
-        nodes.ndim == tetrahedra.ndim == 2
-        and nodes.shape[1] == 3
-        and tetrahedra.shape[1] == 4
-        and len(tetrahedra)
-        and np.issubdtype(tetrahedra.dtype, np.integer)
-        and np.isfinite(nodes).all()
-        and tetrahedra.min() >= 0
-        and tetrahedra.max() < len(nodes)
-    )
 
 
 def _said(verb: str, count: int, thing: str, how: str = "") -> str:
