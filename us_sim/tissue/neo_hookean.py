@@ -82,9 +82,15 @@ class NeoHookean:
         self._sums.forces(displacement, self._mean_change(displacement), out)
         return out
 
-    def linearise(self, displacement: NDArray) -> None:
-        """Let `tangent_product` and `diagonal_blocks` be those at this displacement."""
-        self._sums.linearise(displacement, self._mean_change(displacement))
+    def linearise(self, displacement: NDArray, positive: bool = False) -> None:
+        """Let `tangent_product` and `diagonal_blocks` be those at this displacement.
+
+        With ``positive`` the tangent has no negative eigenvalue (where no Poisson's ratio is
+        negative), as descent needs: it is the exact one wherever that has none by itself in a
+        tetrahedron, and elsewhere the stress there has less part in it.
+        """
+        loosest = self.dtype.type(0 if positive else np.inf)
+        self._sums.linearise(displacement, self._mean_change(displacement), loosest)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""

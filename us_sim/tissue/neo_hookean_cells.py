@@ -28,12 +28,15 @@ from us_sim.tissue.bulk_shares import bulk_shares
 from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.neo_hookean_point import (
+    HALF,
     INLINED,
     LOOP,
+    ONE,
     block,
     cofactor_change,
     energy_density,
     inner,
+    limited,
     stress,
     stress_slope,
     volume_change,
@@ -102,9 +105,11 @@ class CellSums:
         """(3, N) N, the energy's slope, given the nodes' mean volume change."""
         _forces(displacement, nodal, self._grid, self._constants, self._lanes, out)
 
-    def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
-        """Keep what the slopes at this displacement need."""
-        _linearise(displacement, nodal, self._grid, self._constants, self._lanes, self._tangent)
+    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.floating) -> None:
+        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
+        _linearise(
+            displacement, nodal, self._grid, self._constants, self._lanes, self._tangent, loosest
+        )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
         """J, how much `volume_changes` changes with the displacement."""
@@ -162,104 +167,23 @@ def _add_out(lanes, row, step, grid, first, rows, values):
             far[w] += a if rows[w] < 0 else b
 
 
-@njit(**INLINED)
-def _corner_gradient(lanes, rows, w, x0, x1, y0, y1, z0, z1):
-    """The gradient at a corner, of the field at the ends of its three edges."""
-    i, j, k = rows[w], rows[_LANES + w], rows[2 * _LANES + w]
-    return (
-        (lanes[3 * x1 * _LANES + w] - lanes[3 * x0 * _LANES + w]) * i,
-        (lanes[3 * y1 * _LANES + w] - lanes[3 * y0 * _LANES + w]) * j,
-        (lanes[3 * z1 * _LANES + w] - lanes[3 * z0 * _LANES + w]) * k,
-        (lanes[(3 * x1 + 1) * _LANES + w] - lanes[(3 * x0 + 1) * _LANES + w]) * i,
-        (lanes[(3 * y1 + 1) * _LANES + w] - lanes[(3 * y0 + 1) * _LANES + w]) * j,
-        (lanes[(3 * z1 + 1) * _LANES + w] - lanes[(3 * z0 + 1) * _LANES + w]) * k,
-        (lanes[(3 * x1 + 2) * _LANES + w] - lanes[(3 * x0 + 2) * _LANES + w]) * i,
-        (lanes[(3 * y1 + 2) * _LANES + w] - lanes[(3 * y0 + 2) * _LANES + w]) * j,
-        (lanes[(3 * z1 + 2) * _LANES + w] - lanes[(3 * z0 + 2) * _LANES + w]) * k,
-    )
+@njit(**LOOP)
+def _copy_field(field, grid, first, rows, lanes):
+    """Rows 3 corner + axis of lanes: the field (3, N) at the corners of cells."""
+    for axis in range(3):
+        _copy_in(field[axis], grid, first, rows, lanes, axis, 3)
 
 
-@njit(**INLINED)
-def _middle_row(lanes, w, axis):
-    """Twice the differences along x, y and z over the tetrahedron between corners 1, 2, 4, 7."""
-    first, second = lanes[(3 + axis) * _LANES + w], lanes[(6 + axis) * _LANES + w]
-    third, last = lanes[(12 + axis) * _LANES + w], lanes[(21 + axis) * _LANES + w]
-    return (
-        (third - first) + (last - second),
-        (second - first) + (last - third),
-        (first - second) + (last - third),
-    )
+@njit(**LOOP)
+def _add_field(lanes, grid, first, rows, field):
+    """Add rows 3 corner + axis from _OUT on to the field (3, N)."""
+    for axis in range(3):
+        _add_out(lanes, _OUT + axis, 3, grid, first, rows, field[axis])
 
 
-@njit(**INLINED)
-def _middle_gradient(lanes, rows, w):
-    """The gradient in the tetrahedron between the corners."""
-    i, j, k = rows[w] / 2, rows[_LANES + w] / 2, rows[2 * _LANES + w] / 2
-    xx, xy, xz = _middle_row(lanes, w, 0)
-    yx, yy, yz = _middle_row(lanes, w, 1)
-    zx, zy, zz = _middle_row(lanes, w, 2)
-    return (xx * i, xy * j, xz * k, yx * i, yy * j, yz * k, zx * i, zy * j, zz * k)
-
-
-@njit(**INLINED)
-def _gradients(lanes, rows, w):
-    """The gradients in the five tetrahedra of a cell."""
-    return (
-        _corner_gradient(lanes, rows, w, 0, 4, 0, 2, 0, 1),
-        _corner_gradient(lanes, rows, w, 2, 6, 4, 6, 6, 7),
-        _corner_gradient(lanes, rows, w, 1, 5, 5, 7, 4, 5),
-        _corner_gradient(lanes, rows, w, 3, 7, 1, 3, 2, 3),
-        _middle_gradient(lanes, rows, w),
-    )
-
-
-@njit(**INLINED)
-def _put_axis(p, q, r, s, t, rows, w, lanes, axis):
-    """Along one axis, the forces at the eight corners of rows of five stresses times volumes."""
-    i, j, k = rows[w], rows[_LANES + w], rows[2 * _LANES + w]
-    px, py, pz = p[0] * i, p[1] * j, p[2] * k
-    qx, qy, qz = q[0] * i, q[1] * j, q[2] * k
-    rx, ry, rz = r[0] * i, r[1] * j, r[2] * k
-    sx, sy, sz = s[0] * i, s[1] * j, s[2] * k
-    tx, ty, tz = t[0] * (i / 2), t[1] * (j / 2), t[2] * (k / 2)
-    row = (_OUT + axis) * _LANES + w
-    lanes[row] = -(px + py + pz)
-    lanes[row + 3 * _LANES] = (tz - tx - ty) + (pz - rx - sy)
-    lanes[row + 6 * _LANES] = (ty - tx - tz) + (py - qx - sz)
-    lanes[row + 9 * _LANES] = (sy + sz) - sx
-    lanes[row + 12 * _LANES] = (tx - ty - tz) + (px - qy - rz)
-    lanes[row + 15 * _LANES] = (rx + rz) - ry
-    lanes[row + 18 * _LANES] = (qx + qy) - qz
-    lanes[row + 21 * _LANES] = (tx + ty + tz) + (qz + ry + sx)
-
-
-@njit(**INLINED)
-def _put_forces(p, q, r, s, t, rows, w, lanes):
-    """Rows 3 corner + axis from _OUT on: the forces of five stresses times volumes."""
-    _put_axis(p[0:3], q[0:3], r[0:3], s[0:3], t[0:3], rows, w, lanes, 0)
-    _put_axis(p[3:6], q[3:6], r[3:6], s[3:6], t[3:6], rows, w, lanes, 1)
-    _put_axis(p[6:9], q[6:9], r[6:9], s[6:9], t[6:9], rows, w, lanes, 2)
-
-
-@njit(**INLINED)
-def _put_volumes(p, q, r, s, t, w, lanes):
-    """Rows corner from _OUT on: the sums of what the five tetrahedra give to each corner."""
-    row = _OUT * _LANES + w
-    lanes[row] = p
-    lanes[row + _LANES] = (p + t) + (r + s)
-    lanes[row + 2 * _LANES] = (p + t) + (q + s)
-    lanes[row + 3 * _LANES] = s
-    lanes[row + 4 * _LANES] = (p + t) + (q + r)
-    lanes[row + 5 * _LANES] = r
-    lanes[row + 6 * _LANES] = q
-    lanes[row + 7 * _LANES] = t + (q + r + s)
-
-
-@njit(**INLINED)
+@njit(**LOOP)
 def _share_nodal(nodal, grid, first, rows, lanes):
     """Rows from _SHARE on: each tetrahedron's nodal weight times the sum of its nodes' values."""
-    if len(nodal) == 0:
-        return
     _copy_in(nodal, grid, first, rows, lanes, _SUM, 1)
     for w in range(_LANES):
         v = _SUM * _LANES + w
@@ -277,62 +201,159 @@ def _share_nodal(nodal, grid, first, rows, lanes):
 
 
 @njit(**INLINED)
-def _copy_field(field, grid, first, rows, lanes):
-    """Rows 3 corner + axis of lanes: the field (3, N) at the corners of cells."""
-    for axis in range(3):
-        _copy_in(field[axis], grid, first, rows, lanes, axis, 3)
+def _corners(rows, w):
+    """Three rows of each of the eight corners."""
+    return (
+        (rows[w], rows[_LANES + w], rows[2 * _LANES + w]),
+        (rows[3 * _LANES + w], rows[4 * _LANES + w], rows[5 * _LANES + w]),
+        (rows[6 * _LANES + w], rows[7 * _LANES + w], rows[8 * _LANES + w]),
+        (rows[9 * _LANES + w], rows[10 * _LANES + w], rows[11 * _LANES + w]),
+        (rows[12 * _LANES + w], rows[13 * _LANES + w], rows[14 * _LANES + w]),
+        (rows[15 * _LANES + w], rows[16 * _LANES + w], rows[17 * _LANES + w]),
+        (rows[18 * _LANES + w], rows[19 * _LANES + w], rows[20 * _LANES + w]),
+        (rows[21 * _LANES + w], rows[22 * _LANES + w], rows[23 * _LANES + w]),
+    )
 
 
 @njit(**INLINED)
-def _add_field(lanes, grid, first, rows, field):
-    """Add rows 3 corner + axis from _OUT on to the field (3, N)."""
-    for axis in range(3):
-        _add_out(lanes, _OUT + axis, 3, grid, first, rows, field[axis])
+def _five(rows, row, w):
+    """Five rows from ``row`` on, of the five tetrahedra of a cell."""
+    v = row * _LANES + w
+    return (
+        rows[v],
+        rows[v + _LANES],
+        rows[v + 2 * _LANES],
+        rows[v + 3 * _LANES],
+        rows[v + 4 * _LANES],
+    )
 
 
 @njit(**INLINED)
-def _tetrahedron_stress(h, rows, lanes, w, number):
-    """The stress, times volume, of one of a cell's five tetrahedra."""
-    pressure = rows[(_ELEMENT + number) * _LANES + w] * volume_change(h)
-    pressure += lanes[(_SHARE + number) * _LANES + w]
-    return stress(h, rows[(_SHEAR + number) * _LANES + w], pressure)
+def _corner_gradient(x0, x1, y0, y1, z0, z1, g):
+    """The gradient at a corner, of a field at the lower and upper ends of its three edges."""
+    return (
+        (x1[0] - x0[0]) * g[0],
+        (y1[0] - y0[0]) * g[1],
+        (z1[0] - z0[0]) * g[2],
+        (x1[1] - x0[1]) * g[0],
+        (y1[1] - y0[1]) * g[1],
+        (z1[1] - z0[1]) * g[2],
+        (x1[2] - x0[2]) * g[0],
+        (y1[2] - y0[2]) * g[1],
+        (z1[2] - z0[2]) * g[2],
+    )
 
 
 @njit(**INLINED)
-def _tetrahedron_slope(h, d, rows, kept, lanes, w, number):
-    """How much the stress times volume of one of a cell's tetrahedra changes."""
+def _middle_gradient(b, c, e, h, g):
+    """The gradient in the tetrahedron between the corners 1, 2, 4 and 7."""
+    i, j, k = HALF * g[0], HALF * g[1], HALF * g[2]
+    return (
+        ((e[0] - b[0]) + (h[0] - c[0])) * i,
+        ((c[0] - b[0]) + (h[0] - e[0])) * j,
+        ((b[0] - c[0]) + (h[0] - e[0])) * k,
+        ((e[1] - b[1]) + (h[1] - c[1])) * i,
+        ((c[1] - b[1]) + (h[1] - e[1])) * j,
+        ((b[1] - c[1]) + (h[1] - e[1])) * k,
+        ((e[2] - b[2]) + (h[2] - c[2])) * i,
+        ((c[2] - b[2]) + (h[2] - e[2])) * j,
+        ((b[2] - c[2]) + (h[2] - e[2])) * k,
+    )
+
+
+@njit(**INLINED)
+def _gradients(field, rows, w):
+    """The gradients in the five tetrahedra of a cell."""
+    a, b, c, d, e, f, g, h = _corners(field, w)
+    per = (rows[w], rows[_LANES + w], rows[2 * _LANES + w])
+    return (
+        _corner_gradient(a, e, a, c, a, b, per),
+        _corner_gradient(c, g, e, g, g, h, per),
+        _corner_gradient(b, f, f, h, e, f, per),
+        _corner_gradient(d, h, b, d, c, d, per),
+        _middle_gradient(b, c, e, h, per),
+    )
+
+
+@njit(**INLINED)
+def _corner_forces(px, py, pz, qx, qy, qz, rx, ry, rz, sx, sy, sz, tx, ty, tz, g):
+    """Along one axis, the forces at the eight corners of rows of five stresses times volumes."""
+    px, py, pz = px * g[0], py * g[1], pz * g[2]
+    qx, qy, qz = qx * g[0], qy * g[1], qz * g[2]
+    rx, ry, rz = rx * g[0], ry * g[1], rz * g[2]
+    sx, sy, sz = sx * g[0], sy * g[1], sz * g[2]
+    tx, ty, tz = tx * (HALF * g[0]), ty * (HALF * g[1]), tz * (HALF * g[2])
+    return (
+        -(px + py + pz),
+        (tz - tx - ty) + (pz - rx - sy),
+        (ty - tx - tz) + (py - qx - sz),
+        (sy + sz) - sx,
+        (tx - ty - tz) + (px - qy - rz),
+        (rx + rz) - ry,
+        (qx + qy) - qz,
+        (tx + ty + tz) + (qz + ry + sx),
+    )
+
+
+@njit(**INLINED)
+def _put_eight(values, lanes, row, step, w):
+    """Rows row + step * corner."""
+    v, d = row * _LANES + w, step * _LANES
+    lanes[v] = values[0]
+    lanes[v + d] = values[1]
+    lanes[v + 2 * d] = values[2]
+    lanes[v + 3 * d] = values[3]
+    lanes[v + 4 * d] = values[4]
+    lanes[v + 5 * d] = values[5]
+    lanes[v + 6 * d] = values[6]
+    lanes[v + 7 * d] = values[7]
+
+
+@njit(**INLINED)
+def _put_forces(p, q, r, s, t, rows, w, lanes):
+    """Rows 3 corner + axis from _OUT on: the forces of five stresses times volumes."""
+    g = (rows[w], rows[_LANES + w], rows[2 * _LANES + w])
+    x = _corner_forces(
+        p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2], s[0], s[1], s[2], t[0], t[1], t[2], g
+    )
+    _put_eight(x, lanes, _OUT + 0, 3, w)
+    y = _corner_forces(
+        p[3], p[4], p[5], q[3], q[4], q[5], r[3], r[4], r[5], s[3], s[4], s[5], t[3], t[4], t[5], g
+    )
+    _put_eight(y, lanes, _OUT + 1, 3, w)
+    z = _corner_forces(
+        p[6], p[7], p[8], q[6], q[7], q[8], r[6], r[7], r[8], s[6], s[7], s[8], t[6], t[7], t[8], g
+    )
+    _put_eight(z, lanes, _OUT + 2, 3, w)
+
+
+@njit(**INLINED)
+def _put_volumes(p, q, r, s, t, w, lanes):
+    """Rows corner from _OUT on: the sums of what the five tetrahedra give to each corner."""
+    at_one, at_two, at_four = (p + t) + (r + s), (p + t) + (q + s), (p + t) + (q + r)
+    _put_eight((p, at_one, at_two, s, at_four, r, q, t + (q + r + s)), lanes, _OUT, 1, w)
+
+
+@njit(**INLINED)
+def _tetrahedron_stress(h, shear, element, share):
+    return stress(h, shear, element * volume_change(h) + share)
+
+
+@njit(**INLINED)
+def _tetrahedron_slope(h, d, shear, element, k, share):
     c = cofactor_change(h)
-    rise = rows[(_ELEMENT + number) * _LANES + w] * (inner(c, d) + (d[0] + d[4] + d[8]))
-    rise += lanes[(_SHARE + number) * _LANES + w]
-    shear, k = rows[(_SHEAR + number) * _LANES + w], kept[(_K + number) * _LANES + w]
+    rise = element * (inner(c, d) + (d[0] + d[4] + d[8])) + share
     return stress_slope(h, c, d, shear, k, rise)
 
 
 @njit(**INLINED)
-def _tetrahedron_volume(h, rows, w, number):
-    """The nodal weight times the volume change of one of a cell's tetrahedra."""
-    return rows[(_NODAL + number) * _LANES + w] * volume_change(h)
+def _tetrahedron_k(h, shear, element, share, loosest):
+    return limited(h, shear, element * volume_change(h) + share - shear, loosest)
 
 
 @njit(**INLINED)
-def _tetrahedron_volume_slope(h, d, rows, w, number):
-    """How much `_tetrahedron_volume` changes."""
-    slope = inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
-    return rows[(_NODAL + number) * _LANES + w] * slope
-
-
-@njit(**INLINED)
-def _tetrahedron_k(h, rows, lanes, w, number):
-    """V (p - mu) of one of a cell's tetrahedra."""
-    pressure = rows[(_ELEMENT + number) * _LANES + w] * volume_change(h)
-    pressure += lanes[(_SHARE + number) * _LANES + w]
-    return pressure - rows[(_SHEAR + number) * _LANES + w]
-
-
-@njit(**INLINED)
-def _tetrahedron_energy(h, rows, w, number):
-    shear, element = rows[(_SHEAR + number) * _LANES + w], rows[(_ELEMENT + number) * _LANES + w]
-    return energy_density(h, shear, element)
+def _volume_slope(h, d):
+    return inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
 
 
 @njit(**LOOP)
@@ -344,14 +365,25 @@ def _energy(displacement, grid, constants, lanes):
         _copy_field(displacement, grid, first, rows, lanes)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(lanes, rows, w)
+            shear = _five(rows, _SHEAR, w)
+            element = _five(rows, _ELEMENT, w)
             lanes[_OUT * _LANES + w] = (
-                (_tetrahedron_energy(p, rows, w, 0) + _tetrahedron_energy(q, rows, w, 1))
-                + (_tetrahedron_energy(r, rows, w, 2) + _tetrahedron_energy(s, rows, w, 3))
-                + _tetrahedron_energy(t, rows, w, 4)
+                (energy_density(p, shear[0], element[0]) + energy_density(q, shear[1], element[1]))
+                + (
+                    energy_density(r, shear[2], element[2])
+                    + energy_density(s, shear[3], element[3])
+                )
+                + energy_density(t, shear[4], element[4])
             )
         for w in range(min(_LANES, grid[3] - first)):
             total += lanes[_OUT * _LANES + w]
     return total
+
+
+@njit(**INLINED)
+def _count(ratio, least, count):
+    """The least ratio so far, NaN if one is, and how many were not above zero."""
+    return least if ratio >= least else ratio, count if ratio > 0 else count + ONE
 
 
 @njit(**LOOP)
@@ -364,19 +396,17 @@ def _volume_ratios(displacement, grid, constants, lanes):
         _copy_field(displacement, grid, first, rows, lanes)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(lanes, rows, w)
-            lanes[_OUT * _LANES + w] = 1 + volume_change(p)
-            lanes[(_OUT + 1) * _LANES + w] = 1 + volume_change(q)
-            lanes[(_OUT + 2) * _LANES + w] = 1 + volume_change(r)
-            lanes[(_OUT + 3) * _LANES + w] = 1 + volume_change(s)
-            lanes[(_OUT + 4) * _LANES + w] = 1 + volume_change(t)
+            least, count = _count(ONE + volume_change(p), ONE, ONE - ONE)
+            least, count = _count(ONE + volume_change(q), least, count)
+            least, count = _count(ONE + volume_change(r), least, count)
+            least, count = _count(ONE + volume_change(s), least, count)
+            lanes[_OUT * _LANES + w], lanes[(_OUT + 1) * _LANES + w] = _count(
+                ONE + volume_change(t), least, count
+            )
         for w in range(min(_LANES, grid[3] - first)):
-            if rows[w] != 0:
-                for number in range(5):
-                    ratio = lanes[(_OUT + number) * _LANES + w]
-                    if not ratio >= smallest:
-                        smallest = ratio
-                    if not ratio > 0:
-                        inverted += 1
+            if not lanes[_OUT * _LANES + w] >= smallest:
+                smallest = lanes[_OUT * _LANES + w]
+            inverted += int(lanes[(_OUT + 1) * _LANES + w])
     return smallest, inverted
 
 
@@ -389,12 +419,13 @@ def _volume_changes(displacement, grid, constants, lanes, nodal):
         _copy_field(displacement, grid, first, rows, lanes)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(lanes, rows, w)
+            weight = _five(rows, _NODAL, w)
             _put_volumes(
-                _tetrahedron_volume(p, rows, w, 0),
-                _tetrahedron_volume(q, rows, w, 1),
-                _tetrahedron_volume(r, rows, w, 2),
-                _tetrahedron_volume(s, rows, w, 3),
-                _tetrahedron_volume(t, rows, w, 4),
+                weight[0] * volume_change(p),
+                weight[1] * volume_change(q),
+                weight[2] * volume_change(r),
+                weight[3] * volume_change(s),
+                weight[4] * volume_change(t),
                 w,
                 lanes,
             )
@@ -407,16 +438,20 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * _LANES
-        _share_nodal(nodal, grid, first, rows, lanes)
+        if len(nodal):
+            _share_nodal(nodal, grid, first, rows, lanes)
         _copy_field(displacement, grid, first, rows, lanes)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(lanes, rows, w)
+            shear = _five(rows, _SHEAR, w)
+            element = _five(rows, _ELEMENT, w)
+            share = _five(lanes, _SHARE, w)
             _put_forces(
-                _tetrahedron_stress(p, rows, lanes, w, 0),
-                _tetrahedron_stress(q, rows, lanes, w, 1),
-                _tetrahedron_stress(r, rows, lanes, w, 2),
-                _tetrahedron_stress(s, rows, lanes, w, 3),
-                _tetrahedron_stress(t, rows, lanes, w, 4),
+                _tetrahedron_stress(p, shear[0], element[0], share[0]),
+                _tetrahedron_stress(q, shear[1], element[1], share[1]),
+                _tetrahedron_stress(r, shear[2], element[2], share[2]),
+                _tetrahedron_stress(s, shear[3], element[3], share[3]),
+                _tetrahedron_stress(t, shear[4], element[4], share[4]),
                 rows,
                 w,
                 lanes,
@@ -425,20 +460,24 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, grid, constants, lanes, tangent):
+def _linearise(displacement, nodal, grid, constants, lanes, tangent, loosest):
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * _LANES
         kept = tangent[chunk]
-        _share_nodal(nodal, grid, first, rows, lanes)
+        if len(nodal):
+            _share_nodal(nodal, grid, first, rows, lanes)
         _copy_field(displacement, grid, first, rows, kept)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(kept, rows, w)
-            kept[_K * _LANES + w] = _tetrahedron_k(p, rows, lanes, w, 0)
-            kept[(_K + 1) * _LANES + w] = _tetrahedron_k(q, rows, lanes, w, 1)
-            kept[(_K + 2) * _LANES + w] = _tetrahedron_k(r, rows, lanes, w, 2)
-            kept[(_K + 3) * _LANES + w] = _tetrahedron_k(s, rows, lanes, w, 3)
-            kept[(_K + 4) * _LANES + w] = _tetrahedron_k(t, rows, lanes, w, 4)
+            shear = _five(rows, _SHEAR, w)
+            element = _five(rows, _ELEMENT, w)
+            share = _five(lanes, _SHARE, w)
+            kept[_K * _LANES + w] = _tetrahedron_k(p, shear[0], element[0], share[0], loosest)
+            kept[(_K + 1) * _LANES + w] = _tetrahedron_k(q, shear[1], element[1], share[1], loosest)
+            kept[(_K + 2) * _LANES + w] = _tetrahedron_k(r, shear[2], element[2], share[2], loosest)
+            kept[(_K + 3) * _LANES + w] = _tetrahedron_k(s, shear[3], element[3], share[3], loosest)
+            kept[(_K + 4) * _LANES + w] = _tetrahedron_k(t, shear[4], element[4], share[4], loosest)
 
 
 @njit(**LOOP)
@@ -451,13 +490,14 @@ def _volume_slopes(change, grid, constants, tangent, lanes, nodal):
         kept = tangent[chunk]
         for w in range(_LANES):
             p, q, r, s, t = _gradients(kept, rows, w)
+            weight = _five(rows, _NODAL, w)
             dp, dq, dr, ds, dt = _gradients(lanes, rows, w)
             _put_volumes(
-                _tetrahedron_volume_slope(p, dp, rows, w, 0),
-                _tetrahedron_volume_slope(q, dq, rows, w, 1),
-                _tetrahedron_volume_slope(r, dr, rows, w, 2),
-                _tetrahedron_volume_slope(s, ds, rows, w, 3),
-                _tetrahedron_volume_slope(t, dt, rows, w, 4),
+                weight[0] * _volume_slope(p, dp),
+                weight[1] * _volume_slope(q, dq),
+                weight[2] * _volume_slope(r, dr),
+                weight[3] * _volume_slope(s, ds),
+                weight[4] * _volume_slope(t, dt),
                 w,
                 lanes,
             )
@@ -470,18 +510,23 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * _LANES
-        _share_nodal(nodal, grid, first, rows, lanes)
+        if len(nodal):
+            _share_nodal(nodal, grid, first, rows, lanes)
         _copy_field(change, grid, first, rows, lanes)
         kept = tangent[chunk]
         for w in range(_LANES):
             p, q, r, s, t = _gradients(kept, rows, w)
+            shear = _five(rows, _SHEAR, w)
+            element = _five(rows, _ELEMENT, w)
+            k = _five(kept, _K, w)
+            share = _five(lanes, _SHARE, w)
             dp, dq, dr, ds, dt = _gradients(lanes, rows, w)
             _put_forces(
-                _tetrahedron_slope(p, dp, rows, kept, lanes, w, 0),
-                _tetrahedron_slope(q, dq, rows, kept, lanes, w, 1),
-                _tetrahedron_slope(r, dr, rows, kept, lanes, w, 2),
-                _tetrahedron_slope(s, ds, rows, kept, lanes, w, 3),
-                _tetrahedron_slope(t, dt, rows, kept, lanes, w, 4),
+                _tetrahedron_slope(p, dp, shear[0], element[0], k[0], share[0]),
+                _tetrahedron_slope(q, dq, shear[1], element[1], k[1], share[1]),
+                _tetrahedron_slope(r, dr, shear[2], element[2], k[2], share[2]),
+                _tetrahedron_slope(s, ds, shear[3], element[3], k[3], share[3]),
+                _tetrahedron_slope(t, dt, shear[4], element[4], k[4], share[4]),
                 rows,
                 w,
                 lanes,
@@ -490,20 +535,18 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
 
 
 @njit(**INLINED)
-def _corner_blocks(h, rows, w, number, x, y, z):
+def _corner_blocks(h, i, j, k, shear, element):
     """Blocks of a corner tetrahedron: at its corner, and at the ends of its edges along x, y, z.
 
-    x, y and z are -1 where the edge leaves the corner upwards.
+    i, j and k are the shape gradient of its corner.
     """
-    i, j, k = rows[w], rows[_LANES + w], rows[2 * _LANES + w]
     c = cofactor_change(h)
-    shear, element = rows[(_SHEAR + number) * _LANES + w], rows[(_ELEMENT + number) * _LANES + w]
-    zero = i * 0
+    none = ONE - ONE
     return (
-        block((x * i, y * j, z * k), c, shear, element),
-        block((i, zero, zero), c, shear, element),
-        block((zero, j, zero), c, shear, element),
-        block((zero, zero, k), c, shear, element),
+        block((i, j, k), c, shear, element),
+        block((i, none, none), c, shear, element),
+        block((none, j, none), c, shear, element),
+        block((none, none, k), c, shear, element),
     )
 
 
@@ -539,20 +582,22 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
         kept = tangent[chunk]
         for w in range(_LANES):
             p, q, r, s, t = _gradients(kept, rows, w)
-            p0, px, py, pz = _corner_blocks(p, rows, w, 0, -1, -1, -1)
-            q0, qx, qy, qz = _corner_blocks(q, rows, w, 1, 1, 1, -1)
-            r0, rx, ry, rz = _corner_blocks(r, rows, w, 2, 1, -1, 1)
-            s0, sx, sy, sz = _corner_blocks(s, rows, w, 3, -1, 1, 1)
-            i, j, k = rows[w] / 2, rows[_LANES + w] / 2, rows[2 * _LANES + w] / 2
+            shear = _five(rows, _SHEAR, w)
+            element = _five(rows, _ELEMENT, w)
+            i, j, k = rows[w], rows[_LANES + w], rows[2 * _LANES + w]
+            p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], element[0])
+            q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], element[1])
+            r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], element[2])
+            s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], element[3])
+            i, j, k = HALF * i, HALF * j, HALF * k
             c = cofactor_change(t)
-            shear, element = rows[(_SHEAR + 4) * _LANES + w], rows[(_ELEMENT + 4) * _LANES + w]
             _put_one(p0, lanes, 0, w)
-            _put_sum(block((-i, -j, k), c, shear, element), pz, rx, sy, lanes, 1, w)
-            _put_sum(block((-i, j, -k), c, shear, element), py, qx, sz, lanes, 2, w)
+            _put_sum(block((-i, -j, k), c, shear[4], element[4]), pz, rx, sy, lanes, 1, w)
+            _put_sum(block((-i, j, -k), c, shear[4], element[4]), py, qx, sz, lanes, 2, w)
             _put_one(s0, lanes, 3, w)
-            _put_sum(block((i, -j, -k), c, shear, element), px, qy, rz, lanes, 4, w)
+            _put_sum(block((i, -j, -k), c, shear[4], element[4]), px, qy, rz, lanes, 4, w)
             _put_one(r0, lanes, 5, w)
             _put_one(q0, lanes, 6, w)
-            _put_sum(block((i, j, k), c, shear, element), qz, ry, sx, lanes, 7, w)
+            _put_sum(block((i, j, k), c, shear[4], element[4]), qz, ry, sx, lanes, 7, w)
         for entry in range(6):
             _add_out(lanes, _OUT + entry, 6, grid, chunk * _LANES, rows, blocks[entry])

@@ -22,16 +22,21 @@ True
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 __all__ = [
+    "HALF",
     "INLINED",
     "LOOP",
+    "ONE",
     "block",
     "cofactor_change",
     "cofactor_slope",
     "energy_density",
     "inner",
+    "largest_stretch",
+    "limited",
     "stress",
     "stress_slope",
     "volume_change",
@@ -40,6 +45,17 @@ __all__ = [
 # How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
 LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 INLINED = {**LOOP, "forceinline": True}
+
+# Exact in any precision, and they do not turn single precision into double, as literals would.
+ONE, HALF = np.float32(1.0), np.float32(0.5)
+_TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+
+# Below 1 over the root of 2.
+_LESS = np.float32(0.7)
+
+# Keeps quotients finite where nothing is strained.
+_TINY = np.float32(1e-30)
+_SMALL = np.float32(1e-3)
 
 
 @njit(**INLINED)
@@ -111,7 +127,7 @@ def energy_density(h, shear, bulk):
     """The energy density, the stable neo-Hookean polynomial."""
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
-    return shear * (inner(h, h) / 2 - beyond) + bulk * change * change / 2
+    return shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
 
 
 @njit(**INLINED)
@@ -171,3 +187,56 @@ def block(g, c, shear, bulk):
         bulk * y * z,
         plain + bulk * z * z,
     )
+
+
+@njit(**INLINED)
+def largest_stretch(h):
+    """The largest singular value of I + h, to a thousandth, never less than it is.
+
+    A root of the characteristic polynomial of the strain is q + 2 p cos(acos(r) / 3); the cosine
+    is a root c of 4 c^3 - 3 c = r, found by a step of Newton's method from below.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
+    axx = (xx + xx) + (xx * xx + yx * yx + zx * zx)
+    ayy = (yy + yy) + (xy * xy + yy * yy + zy * zy)
+    azz = (zz + zz) + (xz * xz + yz * yz + zz * zz)
+    axy = (xy + yx) + (xx * xy + yx * yy + zx * zy)
+    axz = (xz + zx) + (xx * xz + yx * yz + zx * zz)
+    ayz = (yz + zy) + (xy * xz + yy * yz + zy * zz)
+    q = (axx + ayy + azz) / _THREE
+    axx, ayy, azz = axx - q, ayy - q, azz - q
+    square = (axx * axx + ayy * ayy + azz * azz) + _TWO * (axy * axy + axz * axz + ayz * ayz)
+    p = np.sqrt(square / (_THREE + _THREE))
+    per = ONE / (p + _TINY)
+    axx, ayy, azz, axy, axz, ayz = axx * per, ayy * per, azz * per, axy * per, axz * per, ayz * per
+    r = HALF * (
+        axx * (ayy * azz - ayz * ayz)
+        - axy * (axy * azz - ayz * axz)
+        + axz * (axy * ayz - ayy * axz)
+    )
+    r = -ONE if r < -ONE else r
+    r = ONE if r > ONE else r
+    below = np.sqrt(HALF + HALF * r)
+    below = _SMALL if below < _SMALL else below
+    c = HALF + HALF * below
+    c -= ((_TWO + _TWO) * c * c * c - _THREE * c - r) / (_TWELVE * c * c - _THREE)
+    stretch = ONE + q + _TWO * p * c
+    return np.sqrt(_TINY if stretch < _TINY else stretch)
+
+
+@njit(**INLINED)
+def limited(h, shear, k, loosest):
+    """k = p - mu, held within bounds where the stress's slope has no negative eigenvalue.
+
+    The slope's eigenvalues are mu + k s and mu - k s with s each singular value of F (Smith et al.,
+    section 4), and three more. All are positive or zero if |k| s <= mu, k has the sign opposite to
+    J's, |k| <= mu and bulk >= mu (Poisson's ratio is not negative); or if |k| s root 2 <= mu. The
+    bounds are never below ``loosest``.
+    """
+    s = largest_stretch(h)
+    usual = shear / (ONE if s < ONE else s)
+    other = _LESS * shear / s
+    bound = other if k * (ONE + volume_change(h)) > 0 else usual
+    bound = loosest if loosest > bound else bound
+    k = bound if k > bound else k
+    return -bound if k < -bound else k

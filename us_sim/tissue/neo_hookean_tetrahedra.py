@@ -29,10 +29,12 @@ from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.neo_hookean_point import (
     INLINED,
     LOOP,
+    ONE,
     block,
     cofactor_change,
     energy_density,
     inner,
+    limited,
     stress,
     stress_slope,
     volume_change,
@@ -89,9 +91,11 @@ class TetrahedraSums:
         """(3, N) N, the energy's slope, given the nodes' mean volume change."""
         _forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
 
-    def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
-        """Keep what the slopes at this displacement need."""
-        _linearise(displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent)
+    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.floating) -> None:
+        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
+        _linearise(
+            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
+        )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
         """J, how much `volume_changes` changes with the displacement."""
@@ -268,7 +272,7 @@ def _volume_ratios(displacement, nodes, constants, lanes):
         _gather(displacement, nodes[chunk], lanes)
         rows = constants[chunk]
         for w in range(_LANES):
-            lanes[_OUT * _LANES + w] = 1 + volume_change(_gradient(lanes, rows, w))
+            lanes[_OUT * _LANES + w] = ONE + volume_change(_gradient(lanes, rows, w))
         for w in range(_LANES):
             if rows[_SHEAR * _LANES + w] > 0:
                 if not lanes[_OUT * _LANES + w] >= smallest:
@@ -306,7 +310,7 @@ def _forces(displacement, nodal, nodes, constants, lanes, forces):
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
+def _linearise(displacement, nodal, nodes, constants, lanes, tangent, loosest):
     for chunk in range(len(nodes)):
         _gather(displacement, nodes[chunk], lanes)
         if len(nodal):
@@ -317,7 +321,8 @@ def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
             h = _gradient(lanes, rows, w)
             _keep(h, kept, w)
             pressure = rows[_ELEMENT * _LANES + w] * volume_change(h) + _nodal_sum(lanes, rows, w)
-            kept[_K * _LANES + w] = pressure - rows[_SHEAR * _LANES + w]
+            shear = rows[_SHEAR * _LANES + w]
+            kept[_K * _LANES + w] = limited(h, shear, pressure - shear, loosest)
 
 
 @njit(**LOOP)
