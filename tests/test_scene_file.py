@@ -99,7 +99,7 @@ def test_units_are_si_inside():
         (
             "tissue.solver",
             "magic",
-            "tissue.solver: 'magic' is not one of fem, fem_nonlinear, fem_cg, msds",
+            "tissue.solver: 'magic' is not one of fem, fem_nonlinear",
         ),
         ("tissue.materials", {}, "tissue.materials: names no material"),
         (
