@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import bsr_array
 
 from us_sim.errors import SolverError
 from us_sim.tissue.materials import TissueMaterials
@@ -93,17 +92,15 @@ def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
     Raises:
         SolverError: a connected part has no three fixed nodes off one line.
     """
-    count = len(mesh.nodes)
-    graph = coo_array((np.ones(len(mesh.edges)), tuple(mesh.edges.T)), shape=(count, count))
-    parts, part = connected_components(graph, directed=False)
-    for i in range(parts):
-        held = mesh.nodes[fixed & (part == i)]
+    for i in range(mesh.parts.max() + 1):
+        part = mesh.parts == i
+        held = mesh.nodes[fixed & part]
         spread = np.zeros(3)
         if len(held) > 2:
             spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False)
         if spread[1] <= 1e-9 * spread[0]:
             raise SolverError(
                 f"the tissue can move as a whole: the part of the mesh around node "
-                f"{np.flatnonzero(part == i)[0]} has {len(held)} fixed nodes; fix at least three "
+                f"{np.flatnonzero(part)[0]} has {len(held)} fixed nodes; fix at least three "
                 f"that are not on one line, such as the face `bottom`"
             )

@@ -85,9 +85,11 @@ class TissueMaterials:
         for name, bad in unphysical.items():
             if bad.any():
                 where = int(np.flatnonzero(bad)[0])
+                others = f" and of {bad.sum() - 1} others" if bad.sum() > 1 else ""
                 raise MaterialError(
-                    f"{name} of tetrahedron {where} is {getattr(self, name)[where]!r}: moduli and "
-                    f"densities are above zero, Poisson's ratio is above -1 and below 0.5"
+                    f"{name} of tetrahedron {where}{others} is out of range, "
+                    f"{getattr(self, name)[where]:g}: moduli and densities are above zero, "
+                    f"Poisson's ratio is above -1 and below 0.5"
                 )
 
 
