@@ -71,7 +71,7 @@ class FemNonlinear(TissueSolver):
 
     The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
     probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
-    of the contact forces (without any, over the largest there were), in double precision and of
+    of the contact forces (without any, over the largest since rest), in double precision and of
     the displacement that is returned.
 
     Args:
@@ -111,11 +111,10 @@ class FemNonlinear(TissueSolver):
         self._lever = float(np.linalg.norm(box[:3]) + box[3])
         self._stride = _STRIDE * float(np.ptp(model.mesh.nodes, axis=0).min())
         self._newton = Newton(model)
-        self._heaviest = 0.0  # N, norm of the contact forces, the largest there were
         if len(self._surface):
             self._compliance = surface_compliance(model)
         self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
-        self._forget()
+        self._restore(self.state)
 
     @property
     def state(self) -> TissueState:
@@ -126,6 +125,7 @@ class FemNonlinear(TissueSolver):
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()
         self._forget()
+        self._heaviest = 0.0  # N, norm of the contact forces, the largest since rest
         if state.displacement.any():
             self._newton.displacement = np.ascontiguousarray(state.displacement.T)
             self._taken_over = True
@@ -144,6 +144,7 @@ class FemNonlinear(TissueSolver):
             # Nothing reaches the undeformed tissue: it is the solution.
             newton.rest()
             self._forget()
+            self._heaviest = 0.0
             self._settled = True
             return self._resting()
         actions = []
