@@ -164,6 +164,8 @@ def test_a_turning_probe_is_followed():
         ("damping_factor", float("inf")),
         ("rest_tolerance", float("nan")),
         ("stabilisation", "hope"),
+        ("stiffness", "stiff"),
+        ("volume", 1),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value):

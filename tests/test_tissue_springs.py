@@ -95,7 +95,7 @@ def test_fitted_springs_on_a_regular_tetrahedron():
     materials = uniform_material(mesh, Material(10e3, 0.25, 1000.0))
     springs = fitted_springs(mesh, materials)
     np.testing.assert_allclose(springs.stiffness, 4e3 * 0.1 * 15 / 6 / math.sqrt(72))
-    np.testing.assert_allclose(springs.lame_constant(mesh), 4e3)
+    np.testing.assert_allclose(springs.lame_constant, 4e3)
     # There springs and elasticity agree on a swelling exactly, node by node.
     swollen = (1e-6 * nodes).ravel()
     factor = springs.factor(mesh.nodes)
@@ -137,8 +137,8 @@ def test_what_algorithm_1_hides_is_a_length():
         materials = uniform_material(mesh, SOFT)
         total.append(
             (
-                springs_of(mesh, materials).lame_constant(mesh) @ mesh.volumes,
-                fitted_springs(mesh, materials).lame_constant(mesh) @ mesh.volumes,
+                springs_of(mesh, materials).lame_constant @ mesh.volumes,
+                fitted_springs(mesh, materials).lame_constant @ mesh.volumes,
             )
         )
     assert total[1][0] == pytest.approx(2 * total[0][0], rel=0.01)

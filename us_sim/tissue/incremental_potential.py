@@ -75,12 +75,10 @@ class IncrementalPotential:
 
     def begin(self, positions: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
         """Start a step from positions (N, 3) m and velocity (N, 3) m/s."""
-        _measure(self._springs[0], self._volume[0], positions, self._lengths, self._volumes)
-        self._lengths += (self._rest_length - self._lengths) / self._stiffening
-        self._volumes += (self._rest_volume - self._volumes) / self._stiffening
-        if self._stiffening == 1.0:  # rounded alike, so that nothing pulls at rest
-            self._lengths[:] = self._rest_length
-            self._volumes[:] = self._rest_volume
+        _aim(
+            *(self._springs[0], self._rest_length, self._volume[0], self._rest_volume),
+            *(positions, self._stiffening, self._lengths, self._volumes),
+        )
         self._aim = positions + self._time_step * velocity
 
     def evaluate(self, positions: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -116,15 +114,18 @@ class IncrementalPotential:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _measure(edges, tetrahedra, x, length, volume):
-    """Fills length (E,) and volume (M,) at positions x (N, 3)."""
+def _aim(edges, rest_length, tetrahedra, rest_volume, x, stiffening, length, volume):
+    """Fills length (E,) and volume (M,) that a step from x (N, 3) draws springs and volumes to."""
+    viscous = 1.0 - 1.0 / stiffening  # rounds to nothing where nothing is viscous
     for e in range(len(edges)):
         u = x[edges[e, 1], 0] - x[edges[e, 0], 0]
         v = x[edges[e, 1], 1] - x[edges[e, 0], 1]
         w = x[edges[e, 1], 2] - x[edges[e, 0], 2]
-        length[e] = math.sqrt(u * u + v * v + w * w)
+        now = math.sqrt(u * u + v * v + w * w)
+        length[e] = rest_length[e] + viscous * (now - rest_length[e])
     for t in range(len(tetrahedra)):
-        volume[t] = area_vectors(x, tetrahedra, t)[0]
+        now = area_vectors(x, tetrahedra, t)[0]
+        volume[t] = rest_volume[t] + viscous * (now - rest_volume[t])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

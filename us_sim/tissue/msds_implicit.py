@@ -18,7 +18,7 @@ steps lowers the function, so that no energy comes from nowhere and no time step
 >>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
 >>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
 >>> solver = MsdsImplicit(model)
->>> for _ in range(20):
+>>> for _ in range(40):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> deformation.residual < 1e-3, bool(deformation.force[2] < 0)
 (True, True)
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
-from us_sim.tissue.contact import wrench_on_probe
+from us_sim.tissue.contact import push_out, wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity import shape_gradients
 from us_sim.tissue.incremental_potential import IncrementalPotential
@@ -63,10 +63,8 @@ _LEAST_INERTIA = 1e-9
 # How often a step that does not lower the function is halved.
 _HALVINGS = 20
 
-# Rounding of the function that is minimised, and how far the residual must fall in a frame before
-# touched nodes that slid a little are corrected again.
+# Relative, of the function that is minimised.
 _ROUNDING = 1e-13
-_REFINEMENT = 1e-2
 
 
 class MsdsImplicit(TissueSolver):
@@ -103,8 +101,8 @@ class MsdsImplicit(TissueSolver):
         self,
         model: TissueModel,
         *,
-        iterations: int = 3,
-        contact_updates: int = 2,
+        iterations: int = 2,
+        contact_updates: int = 1,
         tolerance: float = 1e-4,
         time_step: float = 0.2,
         stiffness: str = "fitted",
@@ -198,24 +196,36 @@ class MsdsImplicit(TissueSolver):
         moved = not same_pose(pose, self._pose)
         before = self._positions.copy()
         self._potential.begin(before, self._velocity)
+        if moved and self._goes_on(pose):
+            self._positions += self._time_step * self._velocity
         given = -np.inf  # J, the most that the function was before it was lowered
-        exactly = False
         for number, iterations in enumerate(self._rounds):
-            self._revise(pose, exactly, moved and number == 0)
-            start, exactly = self._minimise(iterations)
-            given = max(given, start)
+            self._revise(pose, moved and number == 0)
+            given = max(given, self._minimise(iterations))
         self._velocity = (self._positions - before) / self._time_step
         return self._outcome(pose, given)
+
+    def _goes_on(self, pose: Pose | None) -> bool:
+        """Whether the touched nodes, moving on as they do, come nearer to the probe's surface."""
+        rows = self._touchable[self._contact.touched]
+        if pose is None or not len(rows):
+            return False
+        here = self._positions[rows]
+        gaps = []
+        for points in (here, here + self._time_step * self._velocity[rows]):
+            gap, _ = push_out(self.model.collider, pose, points, self.model.contact_spacing)
+            gaps.append(float(np.linalg.norm(gap)))
+        return gaps[1] < 0.5 * gaps[0]  # false where the probe has left a node
 
     def _confine(self) -> None:
         touched = np.flatnonzero(self._contact.touched)
         self._preconditioner.confine(touched, self._contact.normal[touched])
 
-    def _revise(self, pose: Pose | None, exactly: bool, moved: bool) -> None:
+    def _revise(self, pose: Pose | None, moved: bool) -> None:
         """Renew the set of touched nodes and put them onto the probe; the others go along."""
         surface = self._surface()
         was = surface.copy()
-        if not self._contact.revise(pose, surface, exactly=exactly, moved=moved):
+        if not self._contact.revise(pose, surface, moved=moved):
             return
         self._confine()
         touched = self._contact.touched
@@ -233,13 +243,12 @@ class MsdsImplicit(TissueSolver):
         left[rows] -= np.einsum("ij,ij->i", left[rows], normal)[:, None] * normal
         return left
 
-    def _minimise(self, iterations: int) -> tuple[float, bool]:
-        """Lower the function by so many iterations; its value before, and whether it is minimal."""
+    def _minimise(self, iterations: int) -> float:
+        """Lower the function by so many iterations; its value before, J."""
         potential = self._potential
         value, force = potential.evaluate(self._positions)
         start = value
         left = self._unconfined(force)
-        first = float(np.linalg.norm(left))
         stop = 0.5 * self._tolerance * self._reference
         direction, previous, slope = np.zeros_like(left), left, np.inf
         for _ in range(iterations):
@@ -271,7 +280,7 @@ class MsdsImplicit(TissueSolver):
         self._contact.weigh(-force[self._touchable])
         load = float(np.linalg.norm(np.maximum(self._contact.push, 0.0)))
         self._reference = load or self._heaviest
-        return start, bool(np.linalg.norm(left) <= _REFINEMENT * first)
+        return start
 
     def _outcome(self, pose: Pose | None, given: float) -> Deformation:
         contact, touchable = self._contact, self._touchable

@@ -80,6 +80,7 @@ class ScalarPreconditioner:
         """Let the touched (K,) of the surface nodes move only across normal (K, 3)."""
         self._touched, self._normal = touched, normal
         self._rows = self._surface[touched]
+        self._columns = self._response[touched].T  # (N, K)
         if len(touched):
             delassus = self._compliance[np.ix_(touched, touched)] * (normal @ normal.T)
             self._schur = cho_factor(delassus + 1e-6 * np.diag(np.diag(delassus)))
@@ -100,4 +101,4 @@ class ScalarPreconditioner:
         """Add to displacement (N, 3) m what moves the confined nodes by distance (K,) m, nearly."""
         if len(self._touched):
             push = cho_solve(self._schur, distance)[:, None] * self._normal
-            displacement += self._response[self._touched].T @ push.astype(np.float32)
+            displacement += self._columns @ push.astype(np.float32)

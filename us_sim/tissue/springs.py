@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -37,6 +37,8 @@ class SpringNetwork:
     stiffness: NDArray[np.float64]  # (E,), N/m
     damping: NDArray[np.float64]  # (E,), N s/m
     rest_length: NDArray[np.float64]  # (E,), m
+    # (M,), Pa, lambda and mu that those of each tetrahedron amount to; empty when of no mesh
+    lame_constant: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def forces(
         self, positions: NDArray[np.float64], velocity: NDArray[np.float64]
@@ -58,18 +60,12 @@ class SpringNetwork:
         """The network without springs between two fixed nodes, which never do anything."""
         kept = ~fixed[self.edges].all(axis=1)
         return SpringNetwork(
-            self.edges[kept], self.stiffness[kept], self.damping[kept], self.rest_length[kept]
+            self.edges[kept],
+            self.stiffness[kept],
+            self.damping[kept],
+            self.rest_length[kept],
+            self.lame_constant,
         )
-
-    def lame_constant(self, mesh: TetrahedralMesh) -> NDArray[np.float64]:
-        """(M,) Pa, the mu, and lambda, that the springs around each tetrahedron amount to.
-
-        As a material whose springs point everywhere alike: sum of k L**2 / 15 over its volume. A
-        spring's share in a tetrahedron goes by volume.
-        """
-        place = _edges_of_tetrahedra(mesh)
-        around = np.bincount(place.ravel(), np.repeat(mesh.volumes, 6), len(self.edges))
-        return (self.stiffness * self.rest_length**2 / around)[place].sum(axis=1) / 15
 
     def factor(self, nodes: NDArray[np.float64]) -> csr_array:
         """B (E, 3N), (N/m)^0.5, such that B'B is the stiffness around unstretched ``nodes``."""
@@ -125,9 +121,7 @@ def fitted_springs(
     """
     ratio = np.maximum(materials.poisson_ratio, 0.25) if with_volume else 0.25
     shear = materials.young_modulus / (2 * (1 + ratio))
-    ends = mesh.nodes[mesh.tetrahedra][:, _CORNERS]
-    squares = ((ends[:, :, 1] - ends[:, :, 0]) ** 2).sum(axis=(1, 2))
-    return _network(mesh, 15 * shear * mesh.volumes / squares, damping_factor)
+    return _network(mesh, 15 * shear * mesh.volumes / _squares(mesh), damping_factor)
 
 
 def _network(
@@ -138,7 +132,14 @@ def _network(
     np.add.at(merged, _edges_of_tetrahedra(mesh), stiffness[:, None])
     rest_length = np.empty(len(mesh.edges))
     _lengths(mesh.edges, mesh.nodes, rest_length)
-    return SpringNetwork(mesh.edges, merged, damping_factor * merged, rest_length)
+    lame_constant = stiffness * _squares(mesh) / (15 * mesh.volumes)
+    return SpringNetwork(mesh.edges, merged, damping_factor * merged, rest_length, lame_constant)
+
+
+def _squares(mesh: TetrahedralMesh) -> NDArray[np.float64]:
+    """(M,) m2, sum of the squared lengths of each tetrahedron's edges."""
+    ends = mesh.nodes[mesh.tetrahedra][:, _CORNERS]
+    return ((ends[:, :, 1] - ends[:, :, 0]) ** 2).sum(axis=(1, 2))
 
 
 def _edges_of_tetrahedra(mesh: TetrahedralMesh) -> NDArray[np.intp]:

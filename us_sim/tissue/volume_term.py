@@ -36,6 +36,9 @@ from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.springs import SpringNetwork
 
+# Part of the shear modulus below which what is left for the nodes is rounding.
+_ROUNDING = 1e-9
+
 __all__ = ["VolumeTerm", "add_volume_forces", "area_vectors", "volume_term"]
 
 
@@ -126,9 +129,10 @@ def volume_term(
         damping_time: s, viscosity over stiffness.
     """
     shares = bulk_shares(materials)
-    lacking = shares.element - shares.shear - springs.lame_constant(mesh)
+    lacking = shares.element - shares.shear - springs.lame_constant
     element = np.maximum(lacking, 0.0)
-    nodal = np.maximum(shares.nodal + np.minimum(lacking, 0.0), 0.0)
+    nodal = shares.nodal + np.minimum(lacking, 0.0)
+    nodal[nodal < _ROUNDING * shares.shear] = 0.0
     weight = np.zeros(len(mesh.nodes))
     rest_volume = np.empty(len(mesh.tetrahedra))
     _measure(mesh.tetrahedra, mesh.nodes, rest_volume)
