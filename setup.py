@@ -69,6 +69,7 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
+        "evaluate": ["scikit-fem>=10"],
         "meshes": ["meshio>=5.3"],
         "test": [
             "hypothesis>=6.100",

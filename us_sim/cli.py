@@ -1,4 +1,4 @@
-"""The command `us-sim`: demo, run, render, play, bag info."""
+"""The command `us-sim`: demo, run, render, play, bag info, evaluate."""
 
 from __future__ import annotations
 
@@ -94,6 +94,24 @@ def _parser() -> argparse.ArgumentParser:
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)
     info.set_defaults(command=_bag_info)
+
+    evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
+    subjects = evaluate.add_subparsers(required=True, metavar="SUBJECT")
+    for subject, text, command in (
+        ("tissue", "error of every tissue solver against its run time", _evaluate_tissue),
+        ("stability", "what every tissue solver does with extreme cases", _evaluate_stability),
+    ):
+        measured = subjects.add_parser(subject, help=text)
+        measured.add_argument(
+            "--quick", action="store_true", help="a part of it, in less than three minutes"
+        )
+        measured.add_argument(
+            "--out",
+            type=Path,
+            default=Path(f"us_sim_{subject}"),
+            help="folder to write to; default: %(default)s",
+        )
+        measured.set_defaults(command=command)
     return parser
 
 
@@ -174,6 +192,18 @@ def _bag_info(args: argparse.Namespace) -> int:
 
     print(describe(read_bag(args.file)))
     return 0
+
+
+def _evaluate_tissue(args: argparse.Namespace) -> int:
+    from us_sim.evaluation.tissue import evaluate_tissue
+
+    return evaluate_tissue(args.out, args.quick)
+
+
+def _evaluate_stability(args: argparse.Namespace) -> int:
+    from us_sim.evaluation.stability import evaluate_stability
+
+    return evaluate_stability(args.out, args.quick)
 
 
 def _parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -1,0 +1,126 @@
+"""Reference solutions on two meshes, kept in the user's cache folder by what decides them."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation import neo_hookean_hexahedra, reference, two_level
+from us_sim.evaluation.neo_hookean_hexahedra import NeoHookeanHexahedra
+from us_sim.evaluation.reference import Solution, solve_contact
+from us_sim.evaluation.tissue_cases import Scene
+from us_sim.volume.phantom_cache import cache_folder
+
+__all__ = ["Reference", "kept_reference"]
+
+# m. Poses on the way to the last are this far apart, at least.
+_STRIDE = 0.005
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The solution at the end of a scene's path, and how much a coarser mesh differs."""
+
+    solution: Solution
+    size: float  # m, of the elements under the probe
+    coarser: float  # m, likewise, of the mesh compared with
+    difference: float  # relative L2, between the two
+    force_difference: float  # relative
+
+    @property
+    def unknowns(self) -> int:
+        """Displacement components of the whole block's half that was solved."""
+        return self.solution.displacement.size
+
+
+def kept_reference(
+    scene: Scene, sizes: tuple[float, float], progress: Callable[[float, str], None] | None = None
+) -> Reference:
+    """The reference of a scene, computed first if it is not kept.
+
+    Args:
+        scene: pressed as its path's end says.
+        sizes: m, of the elements under the probe: of the mesh that shows how far it has converged,
+            and of the mesh that is the reference.
+        progress: called with the fraction that is done, and a word.
+
+    Raises:
+        SolverError: no equilibrium was found.
+    """
+    coarse = _kept(scene, sizes[0], None, lambda done, text: _tell(progress, 0.4 * done, text))
+    fine = _kept(
+        scene, sizes[1], coarse, lambda done, text: _tell(progress, 0.4 + 0.6 * done, text)
+    )
+    points = fine.block.corners * [1.0, 1.0, 1.0]
+    here, there = fine.at(points), coarse.at(points)
+    return Reference(
+        fine,
+        sizes[1],
+        sizes[0],
+        float(np.linalg.norm(there - here) / np.linalg.norm(here)),
+        float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force)),
+    )
+
+
+def _tell(progress: Callable[[float, str], None] | None, done: float, text: str) -> None:
+    if progress is not None:
+        progress(done, text)
+
+
+def _kept(
+    scene: Scene, size: float, start: Solution | None, progress: Callable[[float, str], None]
+) -> Solution:
+    planes = scene.reference_planes(size)
+    file = cache_folder() / f"reference-{_hash(scene, planes)}.npz"
+    names = ("displacement", "pressure", "force", "volume", "penetration")
+    try:
+        with np.load(file) as kept:
+            block = NeoHookeanHexahedra(planes, scene.material)
+            arrays = [kept[name] for name in names]
+            return Solution(block, *arrays[:3], float(arrays[3]), float(arrays[4]))
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        _logger.warning("%s cannot be used (%s), so it is made again", file, error)
+    poses = [scene.path[-1]] if start is not None else _approach(scene)
+    solution = solve_contact(planes, scene.material, scene.collider, poses, start, progress)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as partial:
+            np.savez(partial, **{name: getattr(solution, name) for name in names})
+        os.replace(partial.name, file)
+    except OSError as error:
+        _logger.warning("%s cannot be written (%s), so it is not kept", file, error)
+    return solution
+
+
+def _approach(scene: Scene) -> list:
+    """The path's poses without those that are near the one before; the last is there."""
+    poses = [scene.path[0]]
+    for pose in scene.path[1:-1]:
+        turn = 1.0 - abs(float(pose.orientation @ poses[-1].orientation))
+        if np.linalg.norm(pose.position - poses[-1].position) > 0.999 * _STRIDE or turn > 0.0009:
+            poses.append(pose)
+    return [*poses, scene.path[-1]]
+
+
+def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
+    """Of everything that decides the solution, the code included."""
+    digest = hashlib.sha256()
+    for module in (neo_hookean_hexahedra, reference, two_level):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(repr(scene.material).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,267 @@
+"""tissue.md: the machine, the tables, the pictures, and which method is worth its time."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from os import cpu_count
+from pathlib import Path
+
+import numpy as np
+
+from us_sim.evaluation.kept_reference import Reference
+from us_sim.evaluation.tissue_cases import MESHES, SCENES
+from us_sim.evaluation.tissue_plots import exponent, plot_errors, plot_sizes
+from us_sim.evaluation.tissue_points import Point
+
+__all__ = ["pareto_front", "table", "write_report"]
+
+_FINEST = int(np.prod(MESHES[-1]))
+_MAIN = "press_25mm"
+
+
+def table(points: Sequence[Point]) -> str:
+    """What the command prints: the defaults of every method against the nonlinear reference."""
+    return _table(
+        ("scene", "method", "nodes", "ms", "p99", "L2 %", "max mm", "force %", "volume %"),
+        [
+            (
+                p.scene,
+                p.method,
+                f"{p.nodes}",
+                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
+                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
+            )
+            for p in points
+            if p.default and not p.own
+        ],
+    )
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Those points than which no other is both faster and more accurate, fastest first."""
+    front: list[Point] = []
+    finite = [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)]
+    for point in sorted(finite, key=lambda p: (p.ms_median, p.rel_l2_error)):
+        if not front or point.rel_l2_error < front[-1].rel_l2_error:
+            front.append(point)
+    return front
+
+
+def write_report(
+    out: Path,
+    points: Sequence[Point],
+    references: dict[str, Reference],
+    quick: bool,
+    seconds: float,
+) -> list[Path]:
+    """Write tissue.md and its pictures; returns the pictures' files."""
+    finest = [p for p in points if p.nodes == _FINEST]
+    main = [p for p in points if p.scene == _MAIN]
+    nonlinear = [p for p in points if not p.own]
+    pictures = {
+        "tissue_error.png": (
+            "Error against run time, to large deformation on fine quadratic elements "
+            f"({_FINEST:,} nodes)",
+            {name: [p for p in finest if p.scene == name and not p.own] for name in references},
+        ),
+        "tissue_own_error.png": (
+            f"Error against run time, to each method's own converged equations ({_FINEST:,} nodes)",
+            {name: [p for p in finest if p.scene == name and p.own] for name in references},
+        ),
+        "tissue_meshes.png": (
+            f"Error against run time, by mesh, {SCENES[_MAIN].words}",
+            {
+                f"{nodes:,} nodes": [p for p in main if p.nodes == nodes and not p.own]
+                for nodes in sorted({p.nodes for p in main})
+            },
+        ),
+    }
+    files = []
+    for name, (title, panels) in pictures.items():
+        plot_errors(panels, title, out / name)
+        files.append(out / name)
+    sizes = [p for p in nonlinear if p.default and p.scene == _MAIN]
+    plot_sizes(sizes, f"Cost against size, {SCENES[_MAIN].words}", out / "tissue_size.png")
+    files.append(out / "tissue_size.png")
+    text = _text(points, references, sizes, quick, seconds)
+    (out / "tissue.md").write_text(text, encoding="utf-8")
+    return files
+
+
+def _text(
+    points: Sequence[Point],
+    references: dict[str, Reference],
+    sizes: Sequence[Point],
+    quick: bool,
+    seconds: float,
+) -> str:
+    parts = [
+        "# Tissue: error against run time",
+        f"`us-sim evaluate tissue{' --quick' if quick else ''}`, {seconds:.0f} s, on {_machine()}. "
+        "Every row is in [tissue.csv](tissue.csv).",
+        "A block of 0.2 × 0.1 × 0.1 m, held at its bottom, E = 10 kPa and ν = 0.45 unless a scene "
+        "says otherwise, is pressed by a sphere of 30 mm radius that moves 2.5 mm a frame (in "
+        "`tilt` by a capsule of 25 mm radius that turns 2.5° a frame). Times are of whole frames, "
+        "wall clock, on one thread unless the column `threads` says more. Errors are of the last "
+        "frame as it came out while the probe moved: L2 and maximum of all nodes' displacements, "
+        "the force along the probe, and the block's volume over its volume at rest.",
+        "## Against large deformation",
+        "The reference is a stable neo-Hookean block of 27-node hexahedra with contact over the "
+        "whole surface, by scikit-fem; what it still changes from one mesh to the next finer is:",
+        _reference_table(references),
+        "![Error against run time](tissue_error.png)",
+        _table_of_defaults(points),
+        "### The Pareto front",
+        f"Methods than which no other was both faster and more accurate, on {_FINEST:,} nodes:",
+        *(_front(points, name) for name in references),
+        "![Error against run time on several meshes](tissue_meshes.png)",
+        "## Against each method's own equations",
+        "The same mesh and method with as many iterations as it takes (`fem` against an "
+        "independent assembly by scikit-fem, solved by SciPy). This is what the hurry of a frame "
+        "costs; what is left in the picture above is the mesh and the model.",
+        "![Error to own equations](tissue_own_error.png)",
+        _own_table(points),
+        "## Cost against size",
+        "Memory is that of the arrays that a solver holds when it is ready, those of its mesh "
+        "included. Set-up is the time to make the solver, which may read its precomputed part from "
+        "the cache.",
+        "![Cost against size](tissue_size.png)",
+        _size_table(sizes),
+    ]
+    failures = [p for p in points if p.failure]
+    if failures:
+        parts += [
+            "## Failed",
+            "\n".join(
+                f"- {p.method} ({p.setting}), {p.scene}, {p.nodes:,} nodes: {p.failure}"
+                for p in failures
+            ),
+        ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _machine() -> str:
+    processor = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                processor = line.partition(":")[2].strip()
+                break
+    except OSError:
+        pass
+    libraries = []
+    for name in ("numpy", "scipy", "numba", "scikit-fem"):
+        try:
+            libraries.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return (
+        f"{processor}, {cpu_count()} cores, {platform.system()}, Python "
+        f"{platform.python_version()}, {', '.join(libraries)}"
+    )
+
+
+def _reference_table(references: dict[str, Reference]) -> str:
+    return _table(
+        ("scene", "elements", "unknowns", "force N", "L2 change", "force change", "penetration mm"),
+        [
+            (
+                name,
+                f"{r.coarser * 1e3:g} → {r.size * 1e3:g} mm",
+                f"{r.unknowns:,}",
+                f"{-r.solution.force[2]:.3f}",
+                f"{100 * r.difference:.2f} %",
+                f"{100 * r.force_difference:.2f} %",
+                f"{r.solution.penetration * 1e3:.3f}",
+            )
+            for name, r in references.items()
+        ],
+    )
+
+
+def _table_of_defaults(points: Sequence[Point]) -> str:
+    return _table(
+        (
+            "scene",
+            "method",
+            "nodes",
+            "ms",
+            "p99 ms",
+            "L2 %",
+            "max mm",
+            "force %",
+            "volume %",
+            "smallest volume ratio",
+        ),
+        [
+            (
+                p.scene,
+                p.method,
+                f"{p.nodes:,}",
+                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
+                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
+                _number(p.smallest_volume_ratio),
+            )
+            for p in points
+            if p.default and not p.own
+        ],
+    )
+
+
+def _own_table(points: Sequence[Point]) -> str:
+    return _table(
+        ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference"),
+        [
+            (
+                p.method,
+                p.setting,
+                f"{p.threads}",
+                *(_number(v) for v in (p.ms_median, 100 * p.rel_l2_error, p.max_error_mm)),
+                _number(100 * p.force_error),
+                p.reference,
+            )
+            for p in points
+            if p.own and p.scene == _MAIN and p.nodes == _FINEST
+        ],
+    )
+
+
+def _size_table(sizes: Sequence[Point]) -> str:
+    counts = sorted({p.nodes for p in sizes})
+    rows = []
+    for method in dict.fromkeys(p.method for p in sizes):
+        mine = {p.nodes: p for p in sizes if p.method == method}
+        for what, value in (
+            ("ms a frame", lambda p: p.ms_median),
+            ("MB held", lambda p: p.memory / 1e6),
+            ("s to set up", lambda p: p.setup),
+        ):
+            numbers = [_number(value(mine[n])) if n in mine else "" for n in counts]
+            rows.append((method, what, *numbers, _number(exponent(list(mine.values()), value))))
+    return _table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
+
+
+def _front(points: Sequence[Point], scene: str) -> str:
+    front = pareto_front(
+        [p for p in points if p.scene == scene and p.nodes == _FINEST and not p.own]
+    )
+    steps = [
+        f"`{p.method}` ({p.setting}) leaves {100 * p.rel_l2_error:.2g} % in {p.ms_median:.3g} ms"
+        for p in front
+    ]
+    return f"- **{scene}** ({SCENES[scene].words}): {'; '.join(steps) or 'nothing was measured'}."
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
+    lines = [head, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
+        for line in lines
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "failed"
