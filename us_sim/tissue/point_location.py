@@ -71,8 +71,11 @@ def locate(mesh: TetrahedralMesh, points: NDArray[np.float64]) -> Location:
     outside = np.zeros(len(points))
     lost = np.flatnonzero(tetrahedra < 0)
     if len(lost):
-        a, b, c = (np.ascontiguousarray(mesh.nodes[mesh.boundary[:, i]]) for i in range(3))
-        nearest, outside[lost] = _nearest_triangle(points[lost], a, b, c)
+        faces = mesh.nodes[mesh.boundary]
+        sides = faces[:, 1:] - faces[:, :1]
+        middles = faces.mean(axis=1)
+        radii = np.linalg.norm(faces - middles[:, None], axis=2).max(axis=1)
+        nearest, outside[lost] = _nearest_triangle(points[lost], faces, sides, middles, radii)
         tetrahedra[lost] = mesh.boundary_tetrahedra[nearest]
     offset = points - origins[tetrahedra]
     weights = np.einsum("pax,px->pa", gradients[tetrahedra], offset)
@@ -138,30 +141,25 @@ def _find(points, cells, starts, members, shape, origins, gradients):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _nearest_triangle(points, a, b, c):
-    """(P,) the nearest of the triangles a, b, c (T, 3) to each point, and (P,) its distance."""
-    middles = (a + b + c) / 3
-    radii = np.empty(len(a))
-    for t in range(len(a)):
-        radii[t] = np.sqrt(
-            max(
-                np.sum((a[t] - middles[t]) ** 2),
-                np.sum((b[t] - middles[t]) ** 2),
-                np.sum((c[t] - middles[t]) ** 2),
-            )
-        )
+def _nearest_triangle(points, faces, sides, middles, radii):
+    """(P,) the nearest triangle to each of points (P, 3), and (P,) its distance.
+
+    Args:
+        faces: (T, 3, 3) corners. sides: (T, 2, 3) from the first to the others.
+        middles, radii: (T, 3) and (T,) of a sphere around each.
+    """
     nearest = np.zeros(len(points), dtype=np.int64)
     distance = np.empty(len(points))
     for p in range(len(points)):
         best = np.inf
-        for t in range(len(a)):
+        for t in range(len(faces)):
             x = points[p, 0] - middles[t, 0]
             y = points[p, 1] - middles[t, 1]
             z = points[p, 2] - middles[t, 2]
-            # No point of the triangle is nearer than its bounding sphere.
+            # No point of the triangle is nearer than its sphere.
             reach = best + radii[t]
             if x * x + y * y + z * z < reach * reach:
-                d = _distance_to_triangle(points[p], a[t], b[t], c[t])
+                d = _distance_to_triangle(points[p], faces[t, 0], sides[t, 0], sides[t, 1])
                 if d < best:
                     best = d
                     nearest[p] = t
@@ -170,30 +168,43 @@ def _nearest_triangle(points, a, b, c):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _distance_to_triangle(p, a, b, c):
+def _distance_to_triangle(p, a, ab, ac):
     """By the region of the triangle's plane that p projects to (Ericson 2005, 5.1.5)."""
-    ab = b - a
-    ac = c - a
-    d1 = np.sum(ab * (p - a))
-    d2 = np.sum(ac * (p - a))
-    if d1 <= 0.0 and d2 <= 0.0:
-        return np.sqrt(np.sum((p - a) ** 2))
-    d3 = np.sum(ab * (p - b))
-    d4 = np.sum(ac * (p - b))
-    if d3 >= 0.0 and d4 <= d3:
-        return np.sqrt(np.sum((p - b) ** 2))
-    d5 = np.sum(ab * (p - c))
-    d6 = np.sum(ac * (p - c))
-    if d6 >= 0.0 and d5 <= d6:
-        return np.sqrt(np.sum((p - c) ** 2))
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return np.sqrt(np.sum((p - a - d1 / (d1 - d3) * ab) ** 2))
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return np.sqrt(np.sum((p - a - d2 / (d2 - d6) * ac) ** 2))
+    d1 = 0.0
+    d2 = 0.0
+    bb = 0.0
+    bc = 0.0
+    cc = 0.0
+    for x in range(3):
+        d1 += ab[x] * (p[x] - a[x])
+        d2 += ac[x] * (p[x] - a[x])
+        bb += ab[x] * ab[x]
+        bc += ab[x] * ac[x]
+        cc += ac[x] * ac[x]
+    d3 = d1 - bb
+    d4 = d2 - bc
+    d5 = d1 - bc
+    d6 = d2 - cc
     va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 >= d3 and d5 >= d6:
-        return np.sqrt(np.sum((p - b - (d4 - d3) / ((d4 - d3) + (d5 - d6)) * (c - b)) ** 2))
-    total = va + vb + vc
-    return np.sqrt(np.sum((p - a - vb / total * ab - vc / total * ac) ** 2))
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    # The nearest point is a + s ab + t ac.
+    if d1 <= 0.0 and d2 <= 0.0:
+        s, t = 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        s, t = 1.0, 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        s, t = 0.0, 1.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        s, t = d1 / (d1 - d3), 0.0
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        s, t = 0.0, d2 / (d2 - d6)
+    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
+        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        s = 1.0 - t
+    else:
+        s, t = vb / (va + vb + vc), vc / (va + vb + vc)
+    square = 0.0
+    for x in range(3):
+        square += (p[x] - a[x] - s * ab[x] - t * ac[x]) ** 2
+    return np.sqrt(square)
