@@ -27,6 +27,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from us_sim.errors import SolverError
 from us_sim.tissue.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity import shape_gradients
 from us_sim.tissue.materials import TissueMaterials
@@ -48,17 +49,24 @@ class NeoHookean:
         mesh: in frame ``patient``.
         materials: of each tetrahedron.
         dtype: float32, or float64.
+
+    Raises:
+        SolverError: another dtype; and from every method, a field of another shape or dtype.
     """
 
     def __init__(
         self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike = np.float32
     ) -> None:
         self.dtype = np.dtype(dtype)
+        if self.dtype not in (np.float32, np.float64):
+            raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
         self._count = len(mesh.nodes)
         kind = TetrahedraSums if mesh.planes is None else CellSums
         self._sums: TetrahedraSums | CellSums = kind(mesh, materials, self.dtype)
         weight = bulk_shares(materials).nodal * mesh.volumes / 4
-        total = np.bincount(mesh.tetrahedra.ravel(), np.repeat(weight, 4), self._count)
+        total: NDArray[np.float64] = np.bincount(
+            mesh.tetrahedra.ravel(), np.repeat(weight, 4), self._count
+        )
         self._averaged = bool(total.any())
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
@@ -68,6 +76,7 @@ class NeoHookean:
 
     def energy(self, displacement: NDArray) -> float:
         """J, summed in double precision."""
+        self._require(displacement)
         energy = self._sums.energy(displacement)
         if self._averaged:
             self._sums.volume_changes(displacement, self._nodal)
@@ -78,7 +87,9 @@ class NeoHookean:
 
     def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the energy: what must act on each node to hold it there."""
+        self._require(displacement)
         out = np.empty_like(displacement) if out is None else out
+        self._require(out)
         self._sums.forces(displacement, self._mean_change(displacement), out)
         return out
 
@@ -89,12 +100,15 @@ class NeoHookean:
         negative), as descent needs: it is the exact one wherever that has none by itself in a
         tetrahedron, and elsewhere the stress there has less part in it.
         """
-        loosest = self.dtype.type(0 if positive else np.inf)
+        self._require(displacement)
+        loosest = np.array(0.0 if positive else np.inf, dtype=self.dtype)[()]
         self._sums.linearise(displacement, self._mean_change(displacement), loosest)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
+        self._require(change)
         out = np.empty_like(change) if out is None else out
+        self._require(out)
         if self._averaged:
             self._sums.volume_slopes(change, self._nodal)
             self._nodal *= self._inverse
@@ -113,11 +127,24 @@ class NeoHookean:
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:
         """The smallest J, a tetrahedron's volume over its volume at rest; NaN if one is."""
+        self._require(displacement)
         return self._sums.volume_ratios(displacement)[0]
 
     def inverted(self, displacement: NDArray) -> int:
         """How many tetrahedra have a J that is not above zero."""
+        self._require(displacement)
         return self._sums.volume_ratios(displacement)[1]
+
+    def _require(self, field: NDArray) -> None:
+        if (
+            field.shape != (3, self._count)
+            or field.dtype != self.dtype
+            or not field.flags.c_contiguous
+        ):
+            raise SolverError(
+                f"a field of the neo-Hookean tissue is {field.dtype} of shape {field.shape}: give "
+                f"C-contiguous {self.dtype} of shape {(3, self._count)}"
+            )
 
     def _mean_change(self, displacement: NDArray) -> NDArray:
         if self._averaged:

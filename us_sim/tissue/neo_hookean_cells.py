@@ -383,7 +383,8 @@ def _energy(displacement, grid, constants, lanes):
 @njit(**INLINED)
 def _count(ratio, least, count):
     """The least ratio so far, NaN if one is, and how many were not above zero."""
-    return least if ratio >= least else ratio, count if ratio > 0 else count + ONE
+    least = ratio if ratio < least or np.isnan(ratio) else least
+    return least, count if ratio > 0 else count + ONE
 
 
 @njit(**LOOP)
@@ -396,7 +397,7 @@ def _volume_ratios(displacement, grid, constants, lanes):
         _copy_field(displacement, grid, first, rows, lanes)
         for w in range(_LANES):
             p, q, r, s, t = _gradients(lanes, rows, w)
-            least, count = _count(ONE + volume_change(p), ONE, ONE - ONE)
+            least, count = _count(ONE + volume_change(p), np.float32(np.inf), ONE - ONE)
             least, count = _count(ONE + volume_change(q), least, count)
             least, count = _count(ONE + volume_change(r), least, count)
             least, count = _count(ONE + volume_change(s), least, count)
@@ -404,8 +405,9 @@ def _volume_ratios(displacement, grid, constants, lanes):
                 ONE + volume_change(t), least, count
             )
         for w in range(min(_LANES, grid[3] - first)):
-            if not lanes[_OUT * _LANES + w] >= smallest:
-                smallest = lanes[_OUT * _LANES + w]
+            least = lanes[_OUT * _LANES + w]
+            if rows[w] != 0 and (least < smallest or np.isnan(least)):
+                smallest = least
             inverted += int(lanes[(_OUT + 1) * _LANES + w])
     return smallest, inverted
 

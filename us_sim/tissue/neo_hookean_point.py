@@ -22,6 +22,8 @@ True
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -43,8 +45,13 @@ __all__ = [
 ]
 
 # How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
-LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-INLINED = {**LOOP, "forceinline": True}
+LOOP: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "nsz"},
+}
+INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
 
 # Exact in any precision, and they do not turn single precision into double, as literals would.
 ONE, HALF = np.float32(1.0), np.float32(0.5)

@@ -274,10 +274,11 @@ def _volume_ratios(displacement, nodes, constants, lanes):
         for w in range(_LANES):
             lanes[_OUT * _LANES + w] = ONE + volume_change(_gradient(lanes, rows, w))
         for w in range(_LANES):
+            ratio = lanes[_OUT * _LANES + w]
             if rows[_SHEAR * _LANES + w] > 0:
-                if not lanes[_OUT * _LANES + w] >= smallest:
-                    smallest = lanes[_OUT * _LANES + w]
-                if not lanes[_OUT * _LANES + w] > 0:
+                if ratio < smallest or np.isnan(ratio):
+                    smallest = ratio
+                if not ratio > 0:
                     inverted += 1
     return smallest, inverted
 
