@@ -36,8 +36,8 @@ _SKIRT = 0.25
 
 # As a touched node slides along a curved surface, its prescribed displacement and its normal become
 # outdated. Renewing them starts the search anew, so while it goes on small errors wait.
-_DRIFT, _LITTLE_DRIFT = 1e-4, GAP_TOLERANCE  # m
-_TURN, _LITTLE_TURN = 0.05, 1e-3  # rad
+_DRIFT, _LITTLE_DRIFT = 1e-4, 1e-9  # m
+_TURN, _LITTLE_TURN = 0.05, 1e-7  # rad
 
 
 class ActiveSet:
@@ -120,6 +120,15 @@ class ActiveSet:
             or (np.abs(gap[self.touched]) > GAP_TOLERANCE).any()
             or (self.push[self.touched] < 0).any()
         )
+
+    def normal_at(
+        self, pose: Pose | None, displacement: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(C, 3) directions in which the probe pushes touched nodes where they are; else zero."""
+        if pose is None:
+            return np.zeros_like(self.normal)
+        _, normal = self._gap(pose, self._rest + displacement)
+        return np.where(self.touched[:, None], normal, 0.0)
 
     def weigh(self, force: NDArray[np.float64]) -> None:
         """Take the forces (C, 3) N that hold the nodes; what is along the normal is the push."""

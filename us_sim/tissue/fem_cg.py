@@ -141,7 +141,8 @@ class FemCg(TissueSolver):
         moved = not same_pose(pose, self._pose)
         for round_number, iterations in enumerate(self._rounds):
             surface = displacement[self._touchable]
-            exactly = self._norm <= self._refine_at
+            enough = 0.5 * self._tolerance * self._reference
+            exactly = self._norm <= max(self._refine_at, enough)
             if contact.revise(pose, surface, exactly=exactly, moved=round_number == 0 and moved):
                 displacement[self._touchable] = surface
                 self._renew_equations()
@@ -158,13 +159,12 @@ class FemCg(TissueSolver):
                 self._slope,
                 self._norm,
                 iterations,
-                0.5 * self._tolerance * self._reference,
+                enough,
             )
             if anew:
                 self._refine_at = _REFINEMENT * before
             contact.weigh(product_rows(*self._matrix, displacement, self._touchable))
             load = float(np.linalg.norm(np.maximum(contact.push, 0.0)))
-            self._heaviest = max(self._heaviest, load)
             self._reference = load or self._heaviest
         return self._outcome(pose)
 
@@ -172,11 +172,14 @@ class FemCg(TissueSolver):
         contact, displacement = self._contact, self._displacement
         everywhere = np.arange(len(self._free), dtype=self._touchable.dtype)
         unbalanced = product_rows(*self._matrix, displacement, everywhere)
-        push = np.maximum(contact.push, 0.0)[:, None] * contact.normal
+        normal = contact.normal_at(pose, displacement[self._touchable])
+        holding = np.einsum("ij,ij->i", unbalanced[self._touchable], normal)
+        push = np.where(contact.touched, np.maximum(holding, 0.0), 0.0)[:, None] * normal
         unbalanced[self._touchable] -= push
         imbalance = float(np.linalg.norm(unbalanced))
-        if self._reference == 0.0:
-            self._reference = self._heaviest = imbalance  # taken over deformed, and not touched
+        load = float(np.linalg.norm(push))
+        self._heaviest = max(self._heaviest, load) or imbalance  # taken over and not touched
+        self._reference = load or self._heaviest
         residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
         self._settled = balanced and contact.consistent(pose, displacement[self._touchable])
@@ -190,8 +193,9 @@ class FemCg(TissueSolver):
             self._slope = -1.0
         nodes = self.model.mesh.nodes.copy()
         nodes[self._free] += displacement
-        pushed = self.model.movable_contact_nodes[contact.push > 0]
+        pushing = push.any(axis=1)
+        pushed = self.model.movable_contact_nodes[pushing]
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
-            force, torque = wrench_on_probe(pose, nodes[pushed], push[contact.push > 0])
+            force, torque = wrench_on_probe(pose, nodes[pushed], push[pushing])
         return Deformation(nodes, pushed, force, torque, residual)
