@@ -38,6 +38,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.pose import Pose
+from us_sim.tissue.carried_correction import CarriedCorrection
 from us_sim.tissue.complementarity import unilateral
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.contact import GAP_TOLERANCE, push_out, wrench_on_probe
@@ -111,6 +112,7 @@ class FemNonlinear(TissueSolver):
         self._lever = float(np.linalg.norm(box[:3]) + box[3])
         self._stride = _STRIDE * float(np.ptp(model.mesh.nodes, axis=0).min())
         self._newton = Newton(model)
+        self._correction = CarriedCorrection(model.mesh)
         if len(self._surface):
             self._compliance = surface_compliance(model)
         self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
@@ -134,8 +136,7 @@ class FemNonlinear(TissueSolver):
         self._followed: Pose | None = None  # the pose that the tissue is at
         self._retreat = 0.0  # m, by which it is still kept off the probe there
         self._taken_over = False
-        self._correction: NDArray[np.float64] | None = None  # (3, N) m, nonlinear part of a frame
-        self._motion = np.zeros(6)  # m, of the probe in that frame
+        self._correction.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         newton = self._newton
@@ -198,7 +199,7 @@ class FemNonlinear(TissueSolver):
         taken = halvings = 0
         ordinary = self._steps_to(pose) == 1
         if not ordinary:
-            self._correction = None
+            self._correction.forget()
         while (steps := self._steps_to(pose)) and budget > 0:
             assert self._followed is not None
             share = 0.5**halvings / steps
@@ -209,7 +210,7 @@ class FemNonlinear(TissueSolver):
             budget -= _PREDICTION + abs(used)
             if used < 0:
                 newton.restore(good)
-                self._correction = None
+                self._correction.forget()
                 halvings += 1
                 if halvings > _HALVINGS:
                     break
@@ -225,9 +226,9 @@ class FemNonlinear(TissueSolver):
         start = newton.displacement.copy()
         inverted = newton.tissue.inverted(start)
         step = motion(self._followed, pose, self._lever)
-        if self._correction is not None and (length := float(self._motion @ self._motion)) > 0:
-            likeness = min(max(float(step @ self._motion) / length, 0.0), 1.0)
-            newton.displacement = start + likeness * self._correction
+        guess = self._correction.guess(step, pose.rotation[:, 2])
+        if guess is not None:
+            newton.displacement = start + guess
         self._field[:] = 0.0
         self._predict(pose, retreat)
         newton.displacement = newton.displacement + self._field
@@ -236,8 +237,7 @@ class FemNonlinear(TissueSolver):
             return -1
         used = self._improve(pose, retreat, least, most)
         if ordinary:
-            self._correction = newton.displacement - start - self._field
-            self._motion = step
+            self._correction.learn(newton.displacement - start - self._field, step)
         return used
 
     def _improve(self, pose: Pose, retreat: float, least: int, most: int) -> int:
