@@ -169,7 +169,7 @@ def spring_forces(
 def volume_forces(
     mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array
 ) -> Array:
-    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra and (M,) Pa averaged around nodes."""
+    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes."""
     gradient = _gradients(mesh)
     slope = _slopes(mesh, gradient, displacement)
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ __all__ = [
     "sampled_cases",
 ]
 
+#: Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are.
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),
     "needle": Sphere(0.001),
@@ -127,7 +128,7 @@ def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
 
 
 def extreme_cases(corners: bool) -> list[StabilityCase]:
-    """Cases with a name: one extreme at a time, and with ``corners`` all combinations of extremes."""
+    """Cases with a name: one extreme at a time, with ``corners`` also combinations of extremes."""
     cases = [
         StabilityCase("soft as 1 Pa", young_modulus=1.0),
         StabilityCase("stiff as 1 TPa", young_modulus=1e12),
@@ -208,7 +209,14 @@ def model_of(case: StabilityCase) -> TissueModel:
         if case.motion in _REACHED_FROM_ALL_SIDES
         else face_nodes(mesh, "top")
     )
-    return TissueModel(mesh, materials, fixed, COLLIDERS[case.collider], reached.astype(np.int32))
+    scale = float(np.ptp(mesh.nodes[:, 0])) / 0.1
+    return TissueModel(
+        mesh, materials, fixed, _scaled(COLLIDERS[case.collider], scale), reached.astype(np.int32)
+    )
+
+
+def _scaled(collider: Collider, scale: float) -> Collider:
+    return type(collider)(**{name: scale * size for name, size in asdict(collider).items()})
 
 
 def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:

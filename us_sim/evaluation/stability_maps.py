@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -20,43 +22,59 @@ from us_sim.evaluation.stability_trial import Trial
 __all__ = ["draw_map", "draw_step_limits"]
 
 _FAILED, _REFUSED = "#d62728", "#d9d9d9"
-_BINS = 9
 
-# A quantity's name, its value in a case, and the edges of its bins or its categories.
-_Axis = tuple[str, Callable[[StabilityCase], float], Sequence[float] | Sequence[str]]
+# With fewer cases than this, cells are larger.
+_MANY, _FINE, _COARSE = 500, 10, 5
 
-_MODULUS: _Axis = (
-    "Young's modulus of the softest / Pa",
-    lambda case: math.log10(case.young_modulus),
-    np.linspace(0, 12, _BINS + 1).tolist(),
+
+@dataclass(frozen=True)
+class _Axis:
+    """A quantity of cases; its cells are equal parts of a range, or its categories."""
+
+    name: str
+    value: Callable[[StabilityCase], float]
+    low: float = 0.0
+    high: float = 0.0
+    power: bool = True  # the value is a decimal logarithm
+    categories: tuple[str, ...] = ()
+
+    def cell(self, case: StabilityCase, cells: int) -> int:
+        """Of the case; what is beyond the range is in the first or the last cell."""
+        if self.categories:
+            return int(self.value(case))
+        share = (self.value(case) - self.low) / (self.high - self.low)
+        return int(min(max(share * cells, 0), cells - 1))
+
+    def count(self, cells: int) -> int:
+        """How many cells there are."""
+        return len(self.categories) or cells
+
+    def ticks(self, cells: int) -> tuple[list[float], list[str]]:
+        """Where the axis is labelled, in cells, and with what."""
+        if self.categories:
+            return [i + 0.5 for i in range(len(self.categories))], list(self.categories)
+        step = (3 if self.high - self.low > 5 else 1) if self.power else 0.2
+        numbers = np.arange(math.ceil(self.low / step) * step, self.high + 1e-9, step)
+        places = (numbers - self.low) / (self.high - self.low) * cells
+        texts = [f"$10^{{{n:.0f}}}$" if self.power else f"{n:.1f}" for n in numbers]
+        return places.tolist(), texts
+
+
+_MODULUS = _Axis(
+    "Young's modulus of the softest / Pa", lambda c: math.log10(c.young_modulus), 0, 12
 )
-_RATIO: _Axis = (
-    "0.5 − Poisson's ratio",
-    lambda case: math.log10(0.5 - case.poisson_ratio),
-    np.linspace(-4.1, -0.3, _BINS + 1).tolist(),
+_RATIO = _Axis("0.5 - Poisson's ratio", lambda c: math.log10(0.5 - c.poisson_ratio), -4.1, -0.3)
+_CONTRAST = _Axis("contrast within the mesh", lambda c: math.log10(c.contrast), 0, 9)
+_DEPTH = _Axis("depth / thickness", lambda c: c.depth, 0, 1, power=False)
+_STEP = _Axis("time step / s", lambda c: math.log10(c.time_step), -6, 1)
+_DAMPING = _Axis(
+    "damping / critical (lowest row: none)",
+    lambda c: math.log10(c.damping) if c.damping > 0 else -math.inf,
+    -3.5,
+    3,
 )
-_CONTRAST: _Axis = (
-    "contrast within the mesh",
-    lambda case: math.log10(case.contrast),
-    np.linspace(0, 9, _BINS + 1).tolist(),
-)
-_DEPTH: _Axis = (
-    "depth / thickness",
-    lambda case: case.depth,
-    np.linspace(0, 1, _BINS + 1).tolist(),
-)
-_STEP: _Axis = (
-    "time step / s",
-    lambda case: math.log10(case.time_step),
-    np.linspace(-6, 1, _BINS + 1).tolist(),
-)
-_DAMPING: _Axis = (
-    "damping / critical (0 at the left)",
-    lambda case: math.log10(max(case.damping, 1e-4)),
-    [-4.0, *np.linspace(-3, 3, _BINS).tolist()],
-)
-_MOTION: _Axis = ("motion", lambda case: MOTIONS.index(case.motion), MOTIONS)
-_MESH: _Axis = ("mesh", lambda case: list(MESHES).index(case.mesh), tuple(MESHES))
+_MOTION = _Axis("motion", lambda c: MOTIONS.index(c.motion), categories=MOTIONS)
+_MESH = _Axis("mesh", lambda c: list(MESHES).index(c.mesh), categories=tuple(MESHES))
 
 
 def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Path) -> None:
@@ -66,7 +84,11 @@ def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Pa
     third = (_STEP, _DAMPING) if method.startswith("msds") else (_MOTION, _MESH)
     pairs = ((_MODULUS, _RATIO), (_CONTRAST, _DEPTH), third)
     rows: tuple[tuple[str, Callable[[Trial], float], LogNorm], ...] = (
-        ("farthest node from rest after release / mm", _recovered, LogNorm(1e-6, 1e2)),
+        (
+            "farthest node from rest after release / mm",
+            lambda t: t.recovered_mm,
+            LogNorm(1e-6, 1e2),
+        ),
         ("residual under the probe", lambda t: t.residual_checked, LogNorm(1e-12, 1e2)),
     )
     panels = figure.subplots(len(rows), len(pairs), squeeze=False)
@@ -107,10 +129,6 @@ def draw_step_limits(
     figure.savefig(file)
 
 
-def _recovered(trial: Trial) -> float:
-    return trial.recovered_mm
-
-
 def _draw_cells(
     panel: Axes,
     tried: Sequence[tuple[StabilityCase, Trial]],
@@ -118,53 +136,24 @@ def _draw_cells(
     y: _Axis,
     value: Callable[[Trial], float],
     norm: LogNorm,
-):
-    across, up = _cells(tried, x), _cells(tried, y)
-    shape = _count(y), _count(x)
-    worst = np.full(shape, np.nan)
-    refused = np.zeros(shape, dtype=bool)
-    failed = np.zeros(shape, dtype=bool)
-    for i, j, (_, trial) in zip(up, across, tried, strict=True):
-        failed[i, j] |= not trial.passed
-        refused[i, j] |= trial.refused
-        number = value(trial)
-        if math.isfinite(number):
-            worst[i, j] = np.fmax(worst[i, j], max(number, norm.vmin or 0.0))
+) -> QuadMesh:
+    cells = _FINE if len(tried) >= _MANY else _COARSE
+    worst = np.full((y.count(cells), x.count(cells)), np.nan)
+    refused = np.zeros(worst.shape, dtype=bool)
+    failed = np.zeros(worst.shape, dtype=bool)
+    for case, trial in tried:
+        place = y.cell(case, cells), x.cell(case, cells)
+        failed[place] |= not trial.passed
+        refused[place] |= trial.refused
+        if math.isfinite(value(trial)):
+            worst[place] = np.fmax(worst[place], max(value(trial), float(norm.vmin or 0.0)))
     grey = np.where(refused & np.isnan(worst), 0.0, np.nan)
     panel.pcolormesh(grey, cmap=ListedColormap([_REFUSED]))
-    image = panel.pcolormesh(worst, cmap="viridis", norm=norm)
+    image = panel.pcolormesh(worst, cmap="viridis", norm=norm, edgecolors="white", linewidth=0.3)
     rows, columns = np.nonzero(failed)
-    panel.plot(columns + 0.5, rows + 0.5, "x", color=_FAILED, markersize=9, markeredgewidth=2)
-    _label(panel, x, y)
+    panel.plot(columns + 0.5, rows + 0.5, "x", color=_FAILED, markersize=8, markeredgewidth=2)
+    panel.set_xlabel(x.name)
+    panel.set_ylabel(y.name)
+    panel.set_xticks(*x.ticks(cells), rotation=35 if x.categories else 0)
+    panel.set_yticks(*y.ticks(cells))
     return image
-
-
-def _count(axis: _Axis) -> int:
-    edges = axis[2]
-    return len(edges) if isinstance(edges[0], str) else len(edges) - 1
-
-
-def _cells(tried: Sequence[tuple[StabilityCase, Trial]], axis: _Axis) -> NDArray[np.intp]:
-    """Which cell along an axis each case is in; beyond the last edge it is in the last cell."""
-    _, value, edges = axis
-    numbers = np.array([value(case) for case, _ in tried])
-    if isinstance(edges[0], str):
-        return numbers.astype(np.intp)
-    inner = np.array(edges[1:-1], dtype=float)
-    return np.searchsorted(inner, numbers, side="right")
-
-
-def _label(panel: Axes, x: _Axis, y: _Axis) -> None:
-    for axis, place in ((x, panel.xaxis), (y, panel.yaxis)):
-        name, _, edges = axis
-        place.set_label_text(name)
-        if isinstance(edges[0], str):
-            place.set_ticks(np.arange(len(edges)) + 0.5, edges)
-            continue
-        chosen = range(0, len(edges), 3)
-        numbers = [float(edges[i]) for i in chosen]
-        logarithmic = axis is not _DEPTH
-        texts = [f"$10^{{{n:.3g}}}$" if logarithmic else f"{n:.2g}" for n in numbers]
-        place.set_ticks(list(chosen), texts)
-    if isinstance(x[2][0], str):
-        panel.tick_params(axis="x", rotation=40)

@@ -131,7 +131,7 @@ def _tetrahedron() -> TetrahedralMesh:
 
 def _two_pieces() -> TetrahedralMesh:
     one = box_mesh([-0.05, -0.03, -0.01], [-0.02, 0.02], [0.0, 0.04, 0.08])
-    other = one.nodes + [0.06, 0.0, 0.0]
+    other = one.nodes + np.array([0.06, 0.0, 0.0])
     return TetrahedralMesh(
         np.concatenate([one.nodes, other]),
         np.concatenate([one.tetrahedra, one.tetrahedra + len(other)]),

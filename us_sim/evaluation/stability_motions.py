@@ -27,9 +27,21 @@ def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
 
     Args:
         motion: one of `us_sim.evaluation.stability_cases.MOTIONS`.
-        mesh: whose top is z = 0.
+        mesh: whose top is z = 0. The probe is put above the node of the top that is nearest to the
+            middle, so that a needle hits one.
         depth: reached, as a fraction of the mesh's thickness.
     """
+    top = mesh.nodes[mesh.nodes[:, 2] == mesh.nodes[:, 2].min()]
+    middle = mesh.nodes[:, :2].min(axis=0) + np.ptp(mesh.nodes[:, :2], axis=0) / 2
+    nearest = top[np.argmin(np.linalg.norm(top[:, :2] - middle, axis=1))]
+    above = np.array([nearest[0], nearest[1], 0.0])
+    return [
+        pose if pose is None or pose is LIFTED else Pose(pose.position + above, pose.orientation)
+        for pose in _centred(motion, mesh, depth)
+    ]
+
+
+def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     thick = high[2] - low[2]
     wide = high[0] - low[0]
@@ -45,8 +57,8 @@ def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
         phase = 2 * np.pi * _TREMOR / _FRAMES_A_SECOND * np.arange(14)
         return [_at(z=deep + 0.02 * thick * shake) for shake in np.sin(phase)]
     if motion == "slide":
-        ways = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)
-        return [_at(x=way * wide, y=0.3 * way * wide, z=deep) for way in ways]
+        aside = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)
+        return [_at(x=way * wide, y=0.3 * way * wide, z=deep) for way in aside]
     if motion == "tilt":
         angles = (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)
         return [_at(z=deep, angle=angle, about=(0.4, 1.0, 0.1)) for angle in angles]

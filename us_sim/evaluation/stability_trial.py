@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,8 +172,10 @@ def agrees(reported: float, checked: float, rounding: float) -> bool:
     Negligible is below 1e-5, or below what rounding the nodes to doubles makes.
     """
     floor = max(_NEGLIGIBLE, rounding)
+    if not (math.isfinite(reported) and math.isfinite(checked)):
+        return False
     low, high = sorted((reported, checked))
-    return high <= floor or high <= _FACTOR * max(low, 0.0)
+    return high <= floor or high <= _FACTOR * low
 
 
 def damping_factor(case: StabilityCase, model: TissueModel) -> float:
@@ -190,7 +193,7 @@ def damping_factor(case: StabilityCase, model: TissueModel) -> float:
     return 2 * case.damping / math.sqrt(float((stiffness / model.lumped_mass)[free].mean()))
 
 
-def spring_settings(case: StabilityCase) -> dict[str, object]:
+def spring_settings(case: StabilityCase) -> dict[str, Any]:
     """Settings of methods with springs for a case's ``springs``."""
     return {
         "stiffness": "algorithm_1" if case.springs == "algorithm_1" else "fitted",
@@ -198,9 +201,9 @@ def spring_settings(case: StabilityCase) -> dict[str, object]:
     }
 
 
-def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, object]:
+def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
     known = inspect.signature(_solver_class(method)).parameters
-    asked: dict[str, object] = {
+    asked: dict[str, Any] = {
         "time_step": case.time_step,
         "damping_factor": damping_factor(case, model),
         "stabilisation": case.stabilisation,
