@@ -113,9 +113,19 @@ class Msds(TissueSolver):
         self._rest_tolerance = rest_tolerance
         self._damping_factor = damping_factor
         self._springs, self._volume = spring_tissue(
-            "msds", model, stiffness, volume, stiffness_factor, damping_factor
+            self.name,
+            model,
+            stiffness,
+            volume,
+            stiffness_factor,
+            damping_factor,
+            yielding=True,
         )
-        self._volume_arrays = (*self._volume.arrays, np.empty_like(self._volume.rest_volume))
+        self._volume_arrays = (
+            *self._volume.arrays,
+            np.empty_like(self._volume.rest_volume),
+            self._volume.yield_area,
+        )
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
         self.mass, self._substeps, self._action = stabilised(
             model, self._factors, time_step, damping_factor, stabilisation, maximum_substeps
@@ -274,8 +284,15 @@ def spring_tissue(
     volume: bool,
     stiffness_factor: float,
     damping_factor: float,
+    *,
+    yielding: bool = False,
 ) -> tuple[SpringNetwork, VolumeTerm]:
     """The springs, without those between fixed nodes, and the volume term that settings ask for.
+
+    Args:
+        solver: its name.
+        model, stiffness, volume, stiffness_factor, damping_factor: as in `Msds`.
+        yielding: as in `us_sim.tissue.volume_term.volume_term`.
 
     Raises:
         SolverError: a setting is out of range.
@@ -291,5 +308,5 @@ def spring_tissue(
         springs = springs_of(mesh, materials, stiffness_factor, damping_factor)
     term = VolumeTerm.nothing(len(mesh.nodes))
     if volume:
-        term = volume_term(mesh, materials, springs, damping_factor)
+        term = volume_term(mesh, materials, springs, damping_factor, yielding=yielding)
     return springs.without(model.fixed), term

@@ -13,7 +13,7 @@ drifts on at the speed it was given.
 ...     edges, 100.0 * one, 0.1 * one, one, np.ones(2), positions, velocity, np.zeros((2, 3)),
 ...     0.01, 1, 20, Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)),
 ...     np.empty(0, np.int32), np.empty(0, bool), np.empty((0, 3)), np.zeros((2, 3)),
-...     (*VolumeTerm.nothing(2).arrays, np.empty(0)), 0.0,
+...     (*VolumeTerm.nothing(2).arrays, np.empty(0), np.empty(0)), 0.0,
 ... )
 >>> positions.round(6).tolist()
 [[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
@@ -59,7 +59,7 @@ def advance_frame(
     The probe is at rotations (steps, 3, 3) and origins (steps, 3), or nowhere when these are empty.
     Fills touched (C,) and normal (C, 3) of the reachable (C,) nodes as they are in the last
     sub-step, and wrench (2, 3) with the mean force and torque on the probe in its frame. A volume
-    term is given by its `VolumeTerm.arrays` and a float64 array of their length to write on.
+    term is given by its `VolumeTerm.arrays`, an array (M,) to write on, and its yield_area.
     """
     for step in range(steps):
         for _sub in range(substeps):

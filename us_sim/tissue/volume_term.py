@@ -23,6 +23,7 @@ True
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -35,6 +36,9 @@ from us_sim.tissue.bulk_shares import bulk_shares
 from us_sim.tissue.materials import TissueMaterials
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.springs import SpringNetwork
+
+# How many times its rest value the sum of a tetrahedron's squared faces is when it yields.
+_YIELD = 1.5
 
 # Part of the shear modulus below which what is left for the nodes is rounding.
 _ROUNDING = 1e-9
@@ -56,12 +60,15 @@ class VolumeTerm:
     nodal: NDArray[np.float64]  # (M,), Pa, n
     node_weight: NDArray[np.float64]  # (N,), N m, C
     damping_time: float  # s, viscosity over stiffness
+    # (M,) m4, at which sum of squared derivatives of 6 times the volume a tetrahedron yields, see
+    # `volume_term`; infinite where it never does
+    yield_area: NDArray[np.float64]
 
     @classmethod
     def nothing(cls, count: int) -> VolumeTerm:
         """Of no tetrahedron, for ``count`` nodes."""
         none = np.zeros(0)
-        return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0)
+        return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
 
     @cached_property
     def arrays(self) -> tuple[NDArray, ...]:
@@ -85,6 +92,7 @@ class VolumeTerm:
         add_volume_forces(
             *self.arrays,
             np.empty_like(self.rest_volume),
+            self.yield_area,
             self.damping_time,
             np.ascontiguousarray(positions),
             np.ascontiguousarray(velocity),
@@ -116,6 +124,8 @@ def volume_term(
     materials: TissueMaterials,
     springs: SpringNetwork,
     damping_time: float = 0.0,
+    *,
+    yielding: bool = False,
 ) -> VolumeTerm:
     """What the network's lambda lacks to the material's.
 
@@ -127,6 +137,9 @@ def volume_term(
         mesh, materials: of the tissue.
         springs: on the mesh's edges.
         damping_time: s, viscosity over stiffness.
+        yielding: whether a tetrahedron whose faces have grown beyond `_YIELD` resists no more than
+            it does there. Its stiffness grows with the square of its faces, and so, without this,
+            a mesh stretched far out of shape would need ever shorter explicit steps.
     """
     shares = bulk_shares(materials)
     lacking = shares.element - shares.shear - springs.lame_constant
@@ -137,7 +150,13 @@ def volume_term(
     rest_volume = np.empty(len(mesh.tetrahedra))
     _measure(mesh.tetrahedra, mesh.nodes, rest_volume)
     np.add.at(weight, mesh.tetrahedra, (nodal * rest_volume / 4)[:, None])
-    return VolumeTerm(mesh.tetrahedra, rest_volume, element, nodal, weight, damping_time)
+    yield_area = np.full(len(rest_volume), np.inf)
+    if yielding:
+        area = 36 * (_volume_gradients(mesh.nodes[mesh.tetrahedra]) ** 2).sum(axis=(1, 2))
+        yield_area = _YIELD * area
+    return VolumeTerm(
+        mesh.tetrahedra, rest_volume, element, nodal, weight, damping_time, yield_area
+    )
 
 
 def _volume_gradients(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -169,6 +188,15 @@ def area_vectors(x, tetrahedra, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _yielded(yield_area, px, py, pz, qx, qy, qz, rx, ry, rz):
+    """What is left of a tetrahedron's strain, and of its stress."""
+    sx, sy, sz = px + qx + rx, py + qy + ry, pz + qz + rz
+    area = px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz
+    area += rx * rx + ry * ry + rz * rz + sx * sx + sy * sy + sz * sz
+    return 1.0 if area <= yield_area else math.sqrt(yield_area / area)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _measure(tetrahedra, nodes, volume):
     """Fills volume (M,) m3."""
     for t in range(len(tetrahedra)):
@@ -184,6 +212,7 @@ def add_volume_forces(
     inverse_weight,
     mean,
     change,
+    yield_area,
     damping_time,
     positions,
     velocity,
@@ -204,6 +233,7 @@ def add_volume_forces(
             rate += (y[c, 0] - y[a, 0]) * qx + (y[c, 1] - y[a, 1]) * qy + (y[c, 2] - y[a, 2]) * qz
             rate += (y[d, 0] - y[a, 0]) * rx + (y[d, 1] - y[a, 1]) * ry + (y[d, 2] - y[a, 2]) * rz
             change[t] += damping_time * rate / 6.0
+        change[t] *= _yielded(yield_area[t], px, py, pz, qx, qy, qz, rx, ry, rz)
         if len(mean) > 0:
             share = 0.25 * nodal[t] * change[t]
             mean[a] += share
@@ -218,7 +248,7 @@ def add_volume_forces(
         push = -element[t] * change[t] / rest_volume[t]
         if len(mean) > 0:
             push -= 0.25 * nodal[t] * (mean[a] + mean[b] + mean[c] + mean[d])
-        push /= 6.0
+        push *= _yielded(yield_area[t], px, py, pz, qx, qy, qz, rx, ry, rz) / 6.0
         force[a, 0] -= push * (px + qx + rx)
         force[a, 1] -= push * (py + qy + ry)
         force[a, 2] -= push * (pz + qz + rz)
