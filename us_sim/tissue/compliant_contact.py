@@ -30,7 +30,7 @@ from us_sim.pose import Pose
 from us_sim.tissue.complementarity import pivot, solve_active
 from us_sim.tissue.contact import only_forward, pushing_gap
 
-__all__ = ["CLOSED", "CompliantContact"]
+__all__ = ["CLOSED", "SKIRT", "CompliantContact", "gaps", "gather", "yielded"]
 
 #: m. A gap this small is closed, and so is a node that is in the probe by this much.
 CLOSED = 1e-9
@@ -46,10 +46,10 @@ _MEMORY = 4
 # Force along the surface, over the contact force, that is left when the normals have come to rest.
 _SLIDING = 1e-8
 
-# Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
-# under it again without end. So a pushed node counts as under the probe until it is this part of
-# the spacing beside it, and farther each time that it comes back.
-_SKIRT = 0.25
+#: Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
+#: under it again without end. So a pushed node counts as under the probe until it is this part of
+#: the spacing beside it, and farther each time that it comes back.
+SKIRT = 0.25
 
 
 class CompliantContact:
@@ -117,9 +117,9 @@ class CompliantContact:
     def _gaps(self, pose: Pose) -> NDArray[np.float64]:
         gap = np.empty(len(self._rest))
         normal = np.empty_like(self._rest)
-        skirt = np.where(self.forces.any(axis=1), _SKIRT * self._spacing, 0.0)
+        skirt = np.where(self.forces.any(axis=1), SKIRT * self._spacing, 0.0)
         everyone = np.arange(len(self._rest))
-        _gaps(
+        gaps(
             self._box,
             self._forward,
             pose.rotation,
@@ -156,7 +156,21 @@ class CompliantContact:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
+def gather(compliance, near):
+    """(3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
+    k = len(near)
+    block = np.empty((3 * k, 3 * k))
+    for m in range(k):
+        for axis in range(3):
+            row = compliance[3 * near[m] + axis]
+            for n in range(k):
+                for other in range(3):
+                    block[3 * m + axis, 3 * n + other] = row[3 * near[n] + other]
+    return block
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
     """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
     r = rotation
     for m in range(len(index)):
@@ -181,13 +195,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
     Returns whether it converged, and the norm of the forces along the surface.
     """
     k = len(near)
-    block = np.empty((3 * k, 3 * k))
-    for m in range(k):
-        for axis in range(3):
-            row = compliance[3 * near[m] + axis]
-            for n in range(k):
-                for other in range(3):
-                    block[3 * m + axis, 3 * n + other] = row[3 * near[n] + other]
+    block = gather(compliance, near)
     gap, normal = np.empty(k), np.empty((k, 3))
     active, was = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
     joined, skirt = np.zeros(k, np.int64), np.zeros(k)
@@ -195,7 +203,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
         if forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0:
             active[m] = True
             joined[m] = 1
-            skirt[m] = _SKIRT * spacing
+            skirt[m] = SKIRT * spacing
     point = displacement.copy()  # where the planes touch the probe
     step, last_step = np.empty((k, 3)), np.empty((k, 3))
     last_point = np.empty((k, 3))
@@ -203,7 +211,7 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
     remembered = 0
     converged, sliding = False, 0.0
     for iteration in range(_ROUNDS):
-        _gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
+        gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
         was[:] = active
         _push(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
         same = iteration > 0
@@ -212,12 +220,12 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
                 same = False
                 if active[m]:
                     joined[m] += 1
-                    skirt[m] = _SKIRT * joined[m] * spacing
-        _yield(block, active, forces, displacement)
+                    skirt[m] = SKIRT * joined[m] * spacing
+        yielded(block, active, forces, displacement)
         for m in range(k):
             for axis in range(3):
                 step[m, axis] = displacement[m, axis] - point[m, axis]
-        _gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
+        gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
         converged, sliding = _check(gap, normal, active, forces)
         if converged or iteration == _ROUNDS - 1:
             break
@@ -271,7 +279,7 @@ def _push(block, point, gap, normal, limit, first, active, forces):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _yield(block, active, forces, displacement):
+def yielded(block, active, forces, displacement):
     """Fills displacement (k, 3) with what forces (k, 3) at active nodes do."""
     pushed = np.flatnonzero(active)
     for i in range(len(block)):

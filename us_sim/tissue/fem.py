@@ -24,32 +24,42 @@ small complementarity problem (`us_sim.tissue.compliant_contact`), and the field
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
 
+from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.compliant_contact import CompliantContact
 from us_sim.tissue.contact import wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.friction import FrictionalContact
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solver import TissueSolver
+from us_sim.tissue.solver import TissueSolver, require_number
 
-__all__ = ["Fem"]
+__all__ = ["CONTACTS", "Fem"]
+
+#: What holds between the probe and the surface.
+CONTACTS = ("frictionless", "coulomb", "sticking")
 
 # How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
 
 
 class Fem(TissueSolver):
-    """Linear elasticity under a frictionless probe, by the compliance of the reachable surface.
+    """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
     The residual is what rounding leaves in the stored fields, as measured when they were made, and
-    the forces along the surface where the probe is curved.
+    the forces along the surface where the probe is curved (without friction), or by which the
+    forces had not settled (with it).
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
+        contact: ``frictionless``, ``coulomb``, or ``sticking``: a touched node keeps its place on
+            the probe until it is pulled.
+        friction: Coulomb's coefficient.
 
     Raises:
         SolverError: a setting is out of range, or the tissue is not held.
@@ -57,15 +67,25 @@ class Fem(TissueSolver):
 
     name: ClassVar[str] = "fem"
 
-    def __init__(self, model: TissueModel) -> None:
+    def __init__(
+        self, model: TissueModel, *, contact: str = "frictionless", friction: float = 0.3
+    ) -> None:
+        if contact not in CONTACTS:
+            raise SolverError(f"fem.contact is {contact!r}: name one of {', '.join(CONTACTS)}")
+        require_number("fem.friction", friction, 0.0)
         self._compliance = surface_compliance(model)
         self._reached = self._compliance.nodes
-        self._contact = CompliantContact(
+        surface = (
             model.collider,
             model.mesh.nodes[self._reached],
             model.contact_spacing,
             self._compliance.matrix,
         )
+        if contact == "frictionless":
+            self._contact = CompliantContact(*surface)
+        else:
+            coefficient = friction if contact == "coulomb" else math.inf
+            self._contact = FrictionalContact(*surface, coefficient)
         self._displacement = np.zeros_like(model.mesh.nodes)
         super().__init__(model)
 
