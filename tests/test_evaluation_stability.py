@@ -13,7 +13,7 @@ from us_sim.evaluation.stability_cases import StabilityCase, extreme_cases, mode
 from us_sim.evaluation.stability_meshes import MESHES, SUPPORTS, fixed_nodes, mesh_named, parts
 from us_sim.evaluation.stability_motions import poses_of
 from us_sim.evaluation.stability_refusals import REFUSALS, refusal_of
-from us_sim.evaluation.stability_trial import Trial, _equations, agrees, run_trial, try_case
+from us_sim.evaluation.stability_trial import Trial, agrees, equations_of, run_trial, try_case
 from us_sim.tissue.fem_cg import FemCg
 
 CASE = StabilityCase("press", depth=0.2, contrast=10.0)
@@ -60,7 +60,7 @@ class Failing(FemCg):
 def tried(solver, case=CASE):
     trial = Trial()
     model = model_of(case)
-    run_trial(solver(model), _equations("fem_cg", case, model), case, trial)
+    run_trial(solver(model), equations_of("fem_cg", case, model), case, trial)
     return trial
 
 

@@ -154,6 +154,8 @@ def _draw_cells(
     panel.plot(columns + 0.5, rows + 0.5, "x", color=_FAILED, markersize=8, markeredgewidth=2)
     panel.set_xlabel(x.name)
     panel.set_ylabel(y.name)
-    panel.set_xticks(*x.ticks(cells), rotation=35 if x.categories else 0)
+    panel.set_xticks(*x.ticks(cells))
+    for label in panel.get_xticklabels() if x.categories else []:
+        label.set(rotation=35, horizontalalignment="right", rotation_mode="anchor")
     panel.set_yticks(*y.ticks(cells))
     return image

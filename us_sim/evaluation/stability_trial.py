@@ -45,6 +45,7 @@ __all__ = [
     "Trial",
     "agrees",
     "damping_factor",
+    "equations_of",
     "run_trial",
     "spring_settings",
     "try_case",
@@ -115,7 +116,7 @@ def try_case(method: str, case: StabilityCase) -> Trial:
         return trial
     if unheld:
         trial.failure = "was not refused, though it is not held"
-    run_trial(solver, _equations(method, case, model), case, trial)
+    run_trial(solver, equations_of(method, case, model), case, trial)
     return trial
 
 
@@ -193,32 +194,8 @@ def damping_factor(case: StabilityCase, model: TissueModel) -> float:
     return 2 * case.damping / math.sqrt(float((stiffness / model.lumped_mass)[free].mean()))
 
 
-def spring_settings(case: StabilityCase) -> dict[str, Any]:
-    """Settings of methods with springs for a case's ``springs``."""
-    return {
-        "stiffness": "algorithm_1" if case.springs == "algorithm_1" else "fitted",
-        "volume": case.springs == "fitted with volume",
-    }
-
-
-def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
-    known = inspect.signature(_solver_class(method)).parameters
-    asked: dict[str, Any] = {
-        "time_step": case.time_step,
-        "damping_factor": damping_factor(case, model),
-        "stabilisation": case.stabilisation,
-        **spring_settings(case),
-    }
-    return {name: value for name, value in asked.items() if name in known}
-
-
-def _solver_class(method: str) -> type[TissueSolver]:
-    module, name = SOLVERS[method]
-    solver: type[TissueSolver] = getattr(__import__(module, fromlist=[name]), name)
-    return solver
-
-
-def _equations(method: str, case: StabilityCase, model: TissueModel) -> IndependentResidual:
+def equations_of(method: str, case: StabilityCase, model: TissueModel) -> IndependentResidual:
+    """What checks the residuals of a method on a case."""
     mesh, materials = model.mesh, model.materials
     whole = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
     modulus = whole / (1 - 2 * materials.poisson_ratio) + whole
@@ -247,6 +224,31 @@ def _equations(method: str, case: StabilityCase, model: TissueModel) -> Independ
     if with_volume:
         rounding += rounding_of_forces(mesh, volume.element + volume.nodal)
     return IndependentResidual(model, of_springs, rounding)
+
+
+def spring_settings(case: StabilityCase) -> dict[str, Any]:
+    """Settings of methods with springs for a case's ``springs``."""
+    return {
+        "stiffness": "algorithm_1" if case.springs == "algorithm_1" else "fitted",
+        "volume": case.springs == "fitted with volume",
+    }
+
+
+def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
+    known = inspect.signature(_solver_class(method)).parameters
+    asked: dict[str, Any] = {
+        "time_step": case.time_step,
+        "damping_factor": damping_factor(case, model),
+        "stabilisation": case.stabilisation,
+        **spring_settings(case),
+    }
+    return {name: value for name, value in asked.items() if name in known}
+
+
+def _solver_class(method: str) -> type[TissueSolver]:
+    module, name = SOLVERS[method]
+    solver: type[TissueSolver] = getattr(__import__(module, fromlist=[name]), name)
+    return solver
 
 
 def _finite(deformation: Deformation) -> bool:
