@@ -6,7 +6,7 @@ import hashlib
 import logging
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -18,6 +18,7 @@ from us_sim.evaluation import neo_hookean_hexahedra, reference, two_level
 from us_sim.evaluation.neo_hookean_hexahedra import NeoHookeanHexahedra
 from us_sim.evaluation.reference import Solution, solve_contact
 from us_sim.evaluation.tissue_cases import Scene
+from us_sim.pose import Pose
 from us_sim.volume.phantom_cache import cache_folder
 
 __all__ = ["Reference", "kept_reference"]
@@ -45,37 +46,38 @@ class Reference:
 
 
 def kept_reference(
-    scene: Scene, sizes: tuple[float, float], progress: Callable[[float, str], None] | None = None
+    scene: Scene, sizes: Sequence[float], progress: Callable[[float, str], None] | None = None
 ) -> Reference:
     """The reference of a scene, computed first if it is not kept.
 
     Args:
         scene: pressed as its path's end says.
-        sizes: m, of the elements under the probe: of the mesh that shows how far it has converged,
-            and of the mesh that is the reference.
+        sizes: m, of the elements under the probe, at least two: each mesh starts from the one
+            before, the last is the reference, and the one before it shows how far it has converged.
         progress: called with the fraction that is done, and a word.
 
     Raises:
         SolverError: no equilibrium was found.
     """
-    coarse = _kept(scene, sizes[0], None, lambda done, text: _tell(progress, 0.4 * done, text))
-    fine = _kept(
-        scene, sizes[1], coarse, lambda done, text: _tell(progress, 0.4 + 0.6 * done, text)
-    )
-    points = fine.block.corners * [1.0, 1.0, 1.0]
+    fine: Solution | None = None
+    for number, size in enumerate(sizes):
+
+        def tell(done: float, text: str, number: int = number) -> None:
+            if progress is not None:
+                progress((number + done) / len(sizes), text)
+
+        coarse, fine = fine, _kept(scene, size, fine, tell)
+    assert coarse is not None
+    assert fine is not None
+    points = fine.block.corners
     here, there = fine.at(points), coarse.at(points)
     return Reference(
         fine,
-        sizes[1],
-        sizes[0],
+        sizes[-1],
+        sizes[-2],
         float(np.linalg.norm(there - here) / np.linalg.norm(here)),
         float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force)),
     )
-
-
-def _tell(progress: Callable[[float, str], None] | None, done: float, text: str) -> None:
-    if progress is not None:
-        progress(done, text)
 
 
 def _kept(
@@ -87,8 +89,8 @@ def _kept(
     try:
         with np.load(file) as kept:
             block = NeoHookeanHexahedra(planes, scene.material)
-            arrays = [kept[name] for name in names]
-            return Solution(block, *arrays[:3], float(arrays[3]), float(arrays[4]))
+            displacement, pressure, force, volume, penetration = (kept[name] for name in names)
+            return Solution(block, displacement, pressure, force, float(volume), float(penetration))
     except FileNotFoundError:
         pass
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
@@ -105,7 +107,7 @@ def _kept(
     return solution
 
 
-def _approach(scene: Scene) -> list:
+def _approach(scene: Scene) -> list[Pose]:
     """The path's poses without those that are near the one before; the last is there."""
     poses = [scene.path[0]]
     for pose in scene.path[1:-1]:

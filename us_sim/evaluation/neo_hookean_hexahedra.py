@@ -74,9 +74,9 @@ class NeoHookeanHexahedra:
 
         top = mesh.facets_satisfying(lambda x: np.isclose(x[2], self.planes[2][0]))
         surface = FacetBasis(mesh, ElementHex2(), facets=top, intorder=7)
-        self.surface_points = surface.global_coordinates().value.reshape(3, -1).T  # (S, 3) m
+        self.surface_points = np.asarray(surface.global_coordinates()).reshape(3, -1).T  # (S, 3) m
         self.surface_weights = surface.dx.ravel()  # (S,) m2
-        values = np.stack([field[0].value for field in surface.basis])  # (27, facets, points)
+        values = np.stack([np.asarray(field[0]) for field in surface.basis])  # (27, facets, points)
         count = values[0].size
         #: (S, N), values of the shape functions at the surface points.
         self.surface_values = csr_array(

@@ -42,7 +42,7 @@ _PATIENT: dict[str, dict[str, Any]] = {
     "msds_implicit": {"iterations": 50, "tolerance": 1e-8, "rest_tolerance": 1e-8},
 }
 _FRAMES = 400
-_LONGEST = 25.0  # s
+_LONGEST = 10.0  # s
 
 
 def equations(method: str, setting: dict[str, Any]) -> tuple[Any, ...]:

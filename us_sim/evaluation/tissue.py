@@ -63,7 +63,7 @@ _SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
 }
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
 _QUICK_SETTINGS = 2
-_SIZES, _QUICK_SIZES = (0.005, 0.00325), (0.01, 0.0065)  # m, of the reference's elements
+_SIZES, _QUICK_SIZES = (0.01, 0.005, 0.00325), (0.01, 0.0065)  # m, of the reference's elements
 
 #: The scene that is pressed on every mesh.
 MAIN_SCENE = "press_25mm"
@@ -103,9 +103,9 @@ def plan(quick: bool) -> list[Trial]:
     trials: list[Trial] = []
     for scene in (SCENES[name] for name in _QUICK_SCENES) if quick else SCENES.values():
         main = scene.name == MAIN_SCENE
-        meshes = (MESHES[0], MESHES[-1]) if quick else (*MESHES, LARGEST_MESH)
-        if quick and not main:
-            meshes = MESHES[-1:]
+        meshes = [*MESHES, LARGEST_MESH]
+        if quick:
+            meshes = [MESHES[0], MESHES[-1]] if main else [MESHES[-1]]
         for counts in meshes:
             finest = counts == MESHES[-1]
             for method in SOLVERS:
@@ -216,8 +216,6 @@ class _Bench:
             len(model.mesh.tetrahedra),
             threads,
             ", ".join(f"{key}={value}" for key, value in trial.setting.items()) or "default",
-            *[float("nan")] * 6,
-            "",
             default=not {key for key in trial.setting if key != "threads"} and threads == 1,
         )
         try:

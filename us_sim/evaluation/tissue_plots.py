@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from us_sim.evaluation.tissue_points import Point
@@ -22,10 +23,12 @@ STYLES = {
     "msds": ("#009E73", "^"),
     "msds_implicit": ("#CC79A7", "v"),
 }
+# Where a name may stand beside its point: right, above, below, left, and the corners.
+_PLACES = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 _FRAME = 1000.0 / 30.0  # ms, of the paper's 30 frames a second
 
 
-def plot_errors(panels: dict[str, Sequence[Point]], title: str, file: Path) -> None:
+def plot_errors(panels: Mapping[str, Sequence[Point]], title: str, file: Path) -> None:
     """A panel each: relative error against ms a frame, both logarithmic.
 
     Full marks are defaults; a line joins a method's settings that solve the same equations.
@@ -34,9 +37,11 @@ def plot_errors(panels: dict[str, Sequence[Point]], title: str, file: Path) -> N
     rows = -(-len(panels) // columns)
     figure = _figure((4.6 * columns + 0.4, 4.0 * rows + 0.7))
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    named = []
     for number, (name, points) in enumerate(panels.items()):
         panel = axes[divmod(number, columns)]
-        _errors(panel, [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)])
+        shown = [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)]
+        named.append((panel, _errors(panel, shown), shown))
         panel.set_title(name, fontsize=11, loc="left")
     for panel in axes.flat[len(panels) :]:
         panel.set_visible(False)
@@ -47,7 +52,10 @@ def plot_errors(panels: dict[str, Sequence[Point]], title: str, file: Path) -> N
         axes[lowest, column].set_xlabel("ms a frame (median)")
         axes[lowest, column].tick_params(labelbottom=True)
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    figure.savefig(file, dpi=110)
+    figure.draw_without_rendering()  # names are placed when the panels have their extents
+    for panel, labels, shown in named:
+        _label(panel, labels, shown)
+    figure.savefig(file, dpi=figure.dpi)
 
 
 def plot_sizes(points: Sequence[Point], title: str, file: Path) -> None:
@@ -63,7 +71,7 @@ def plot_sizes(points: Sequence[Point], title: str, file: Path) -> None:
         panel.set_xlabel("nodes")
     time_panel.axhline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=figure.dpi)
 
 
 def exponent(points: Sequence[Point], value: Callable[[Point], float]) -> float:
@@ -75,12 +83,13 @@ def exponent(points: Sequence[Point], value: Callable[[Point], float]) -> float:
 
 
 def _figure(size: tuple[float, float]) -> Figure:
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def _errors(axes, points: Sequence[Point]) -> None:  # type: ignore[no-untyped-def]
+def _errors(axes, points: Sequence[Point]) -> list[tuple[float, float, str, str]]:  # type: ignore[no-untyped-def]
+    """Draw one panel; returns where which names belong, in which colour."""
     labels = []
     for method, (colour, mark) in STYLES.items():
         mine = [p for p in points if p.method == method]
@@ -105,9 +114,20 @@ def _errors(axes, points: Sequence[Point]) -> None:  # type: ignore[no-untyped-d
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
+    axes.text(
+        _FRAME,
+        0.01,
+        " 30 frames a second",
+        transform=axes.get_xaxis_transform(),
+        color="0.6",
+        fontsize=7.5,
+        rotation=90,
+        va="bottom",
+        ha="right",
+    )
     _ticks(axes)
-    axes.margins(0.14)
-    _label(axes, labels)
+    axes.margins(0.12)
+    return labels
 
 
 def _family(point: Point) -> str:
@@ -116,28 +136,55 @@ def _family(point: Point) -> str:
     return ", ".join(part.replace("stiffness=", "").replace("=", " ") for part in parts)
 
 
-def _label(axes, labels: list[tuple[float, float, str, str]]) -> None:  # type: ignore[no-untyped-def]
-    """Names beside their points, moved apart where they would touch."""
-    last = -np.inf
-    for x, y, words, colour in sorted(labels, key=lambda entry: entry[1]):
-        height = np.log10(y)
-        place = max(height, last + 0.16 * (1 + words.count("\n")))
+def _label(axes, labels: list[tuple[float, float, str, str]], points: Sequence[Point]) -> None:  # type: ignore[no-untyped-def]
+    """Names beside their points, where they cover least of marks and of each other."""
+    figure = axes.figure
+    scale = 72.0 / figure.dpi
+    marks = [(p.ms_median, p.rel_l2_error) for p in points]
+    centres = axes.transData.transform(marks) * scale if marks else []
+    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in centres]
+    low_x, low_y = axes.transAxes.transform((0, 0)) * scale
+    high_x, high_y = axes.transAxes.transform((1, 1)) * scale
+    for x, y, words, colour in labels:
+        at_x, at_y = axes.transData.transform((x, y)) * scale
+        lines = words.split("\n")
+        width, height = 4.6 * max(map(len, lines)), 10.0 * len(lines)
+        best = None
+        for dx, dy in _PLACES:
+            left = at_x + (9 if dx > 0 else -9 - width if dx < 0 else -width / 2)
+            bottom = at_y - height / 2 + dy * (height / 2 + 8)
+            box = (left, bottom, left + width, bottom + height)
+            cost = sum(_overlap(box, other) for other in taken)
+            inside = _overlap(box, (low_x, low_y, high_x, high_y))
+            cost += 3.0 * (width * height - inside)
+            if best is None or cost < best[0]:
+                best = (cost, box)
+        assert best is not None
+        box = best[1]
+        taken.append(box)
         axes.annotate(
             words,
             (x, y),
-            xytext=(9, 22 * (place - height) / 0.16 * 0.6),
+            xytext=(box[0] - at_x, (box[1] + box[3]) / 2 - at_y),
             textcoords="offset points",
             color=colour,
             fontsize=8.5,
             va="center",
             linespacing=0.95,
             zorder=4,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
-        last = place
+
+
+def _overlap(one: Sequence[float], other: Sequence[float]) -> float:
+    """Area that two boxes (left, bottom, right, top) share."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    return max(width, 0.0) * max(height, 0.0)
 
 
 def _sizes(axes, points: Sequence[Point], value: Callable[[Point], float]) -> None:  # type: ignore[no-untyped-def]
-    ends = []
+    ends: list[tuple[int, float, str, str]] = []
     for method, (colour, mark) in STYLES.items():
         mine = sorted((p for p in points if p.method == method), key=lambda p: p.nodes)
         mine = [p for p in mine if np.isfinite(value(p)) and value(p) > 0]
@@ -152,8 +199,8 @@ def _sizes(axes, points: Sequence[Point], value: Callable[[Point], float]) -> No
             lw=1.4,
         )
         power = exponent(mine, value)
-        words = method + (f"  n^{power:.2f}" if np.isfinite(power) else "")
-        ends.append([mine[-1].nodes, value(mine[-1]), words, colour])
+        words = method + (f"  ~ n$^{{{power:.2f}}}$" if np.isfinite(power) else "")
+        ends.append((mine[-1].nodes, value(mine[-1]), words, colour))
     axes.set_xscale("log")
     axes.set_yscale("log")
     sizes = sorted({p.nodes for p in points})
@@ -180,8 +227,15 @@ def _sizes(axes, points: Sequence[Point], value: Callable[[Point], float]) -> No
     axes.tick_params(labelsize=8)
 
 
+def _percent(value: float, _: int) -> str:
+    if value >= 1e-5:
+        return f"{100 * value:g} %"
+    return f"$10^{{{np.log10(100 * value):.0f}}}$ %"
+
+
 def _ticks(axes) -> None:  # type: ignore[no-untyped-def]
     axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(_percent))
     axes.grid(True, which="major", color="0.93")
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8.5)

@@ -49,13 +49,13 @@ class Point:
     tets: int
     threads: int
     setting: str
-    ms_median: float
-    ms_p99: float
-    rel_l2_error: float
-    max_error_mm: float
-    force_error: float
-    volume_error: float
-    reference: str  # what the errors are against; begins with `own` or with `nonlinear`
+    ms_median: float = float("nan")
+    ms_p99: float = float("nan")
+    rel_l2_error: float = float("nan")
+    max_error_mm: float = float("nan")
+    force_error: float = float("nan")
+    volume_error: float = float("nan")
+    reference: str = ""  # what the errors are against; begins with `own` or with `nonlinear`
     default: bool = field(default=False, metadata={"column": False})
     memory: float = field(default=float("nan"), metadata={"column": False})  # bytes
     setup: float = field(default=float("nan"), metadata={"column": False})  # s
