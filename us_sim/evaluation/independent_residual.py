@@ -46,6 +46,9 @@ Array = NDArray[np.float64]
 # (lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages.
 _ELEMENT_SHARE = 5.0
 
+# Parts of its volume below which a nonlinear tetrahedron resists being crushed, and more simply so.
+_CROWDED, _CRUSHED = 0.25, 0.02
+
 # m, how far the probe is taken to go on behind its collider.
 _GRIP = 0.1
 
@@ -137,6 +140,7 @@ def neo_hookean_forces(
     swelling = _trace(slope) + minors + np.linalg.det(slope)
     own, nodal = _shares(shear, whole)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
+    pressure += shear * _crowding(1 + swelling)
     cofactor = _cofactors(slope + np.eye(3))
     # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
     difference = (
@@ -147,6 +151,16 @@ def neo_hookean_forces(
     )
     stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
     return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
+
+
+def _crowding(ratio: Array) -> Array:
+    """Derivative by J of (J0 - J)**3 / 3 J0 J below J0, straight on from where J is tiny."""
+    held = np.clip(ratio, _CRUSHED, _CROWDED)
+    missing = _CROWDED - held
+    slope = -(missing**2) * (2 * held + _CROWDED) / (3 * _CROWDED * held**2)
+    square = held**2 + _CROWDED * held + _CROWDED**2
+    rise = 2 * missing * square / (3 * _CROWDED * held**3)
+    return slope + rise * np.minimum(ratio - _CRUSHED, 0)
 
 
 def spring_forces(

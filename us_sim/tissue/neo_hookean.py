@@ -64,9 +64,8 @@ class NeoHookean:
         kind = TetrahedraSums if mesh.planes is None else CellSums
         self._sums: TetrahedraSums | CellSums = kind(mesh, materials, self.dtype)
         weight = bulk_shares(materials).nodal * mesh.volumes / 4
-        total: NDArray[np.float64] = np.bincount(
-            mesh.tetrahedra.ravel(), np.repeat(weight, 4), self._count
-        )
+        total = np.zeros(self._count)
+        np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
@@ -101,7 +100,7 @@ class NeoHookean:
         tetrahedron, and elsewhere the stress there has less part in it.
         """
         self._require(displacement)
-        loosest = np.array(0.0 if positive else np.inf, dtype=self.dtype)[()]
+        loosest = np.float32(0.0 if positive else np.inf)
         self._sums.linearise(displacement, self._mean_change(displacement), loosest)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:

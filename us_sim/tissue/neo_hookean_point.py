@@ -7,6 +7,13 @@ logarithmic barrier):
     mu/2 (|F|^2 - 3) - mu (J - 1) + bulk/2 (J - 1)^2,    bulk = lambda + mu.
 
 It is a polynomial, so it holds for inverted tissue too, and linearised at rest it is Hooke's law.
+But it lets a tetrahedron be pressed to nothing by a finite force, as where a vein closes. So below
+a quarter of its volume (J0) a term is added that grows beyond bounds, twice continuously from zero,
+
+    mu (J0 - J)^3 / (3 J0 J),
+
+and below a fiftieth goes on as its Taylor polynomial of second order, to hold everywhere.
+
 Everything is written in h, not F, so that small strains keep all their digits in single precision.
 
 A 3x3 matrix is a tuple of nine numbers, row by row. These functions are compiled into the loops
@@ -35,6 +42,7 @@ __all__ = [
     "block",
     "cofactor_change",
     "cofactor_slope",
+    "crowding",
     "energy_density",
     "inner",
     "largest_stretch",
@@ -56,6 +64,9 @@ INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
 # Exact in any precision, and they do not turn single precision into double, as literals would.
 ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+
+# Parts of its volume: where a tetrahedron begins to resist being crushed, and where it is crushed.
+_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.02)
 
 # Below 1 over the root of 2.
 _LESS = np.float32(0.7)
@@ -130,16 +141,38 @@ def volume_change(h):
 
 
 @njit(**INLINED)
+def crowding(change):
+    """The term against being crushed, over mu, and its first and second slope by J = change + 1."""
+    ratio = ONE + change
+    held = _CRUSHED if ratio < _CRUSHED else ratio
+    beyond = ratio - held
+    missing = _CROWDED - held
+    missing = missing if missing > 0 else ONE - ONE
+    per = ONE / held
+    scale = missing / (_THREE * _CROWDED)
+    value = scale * missing * missing * per
+    slope = -scale * missing * (held + held + _CROWDED) * per * per
+    both = held * (held + _CROWDED) + _CROWDED * _CROWDED
+    curvature = (scale + scale) * both * per * per * per
+    return (
+        value + beyond * (slope + HALF * curvature * beyond),
+        slope + curvature * beyond,
+        curvature,
+    )
+
+
+@njit(**INLINED)
 def energy_density(h, shear, bulk):
-    """The energy density, the stable neo-Hookean polynomial."""
+    """The energy density above."""
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
-    return shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
+    plain = shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
+    return plain + shear * crowding(change)[0]
 
 
 @njit(**INLINED)
 def stress(h, shear, pressure):
-    """First Piola-Kirchhoff stress mu F + (p - mu) cof F, with p the bulk modulus times J - 1."""
+    """First Piola-Kirchhoff stress mu F + (p - mu) cof F, p being the slope of all else by J."""
     c = cofactor_change(h)
     k = pressure - shear
     return (
