@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 _ELEMENT_SHARE = 5.0
 
 # Parts of its volume below which a nonlinear tetrahedron resists being crushed, and more simply so.
-_CROWDED, _CRUSHED = 0.25, 0.02
+_CROWDED, _CRUSHED = 1 / 4, 1 / 64
 
 # m, how far the probe is taken to go on behind its collider.
 _GRIP = 0.1

@@ -12,7 +12,7 @@ a quarter of its volume (J0) a term is added that grows beyond bounds, twice con
 
     mu (J0 - J)^3 / (3 J0 J),
 
-and below a fiftieth goes on as its Taylor polynomial of second order, to hold everywhere.
+and below a sixty-fourth goes on as its Taylor polynomial of second order, to hold everywhere.
 
 Everything is written in h, not F, so that small strains keep all their digits in single precision.
 
@@ -66,7 +66,7 @@ ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
 
 # Parts of its volume: where a tetrahedron begins to resist being crushed, and where it is crushed.
-_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.02)
+_CROWDED, _CRUSHED = np.float32(0.25), np.float32(1 / 64)
 
 # Below 1 over the root of 2.
 _LESS = np.float32(0.7)
