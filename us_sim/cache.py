@@ -132,10 +132,12 @@ def _load(entry: Path, form: Form[Thing]) -> Thing:
         facts = json.loads((entry / form.description).read_text(encoding="utf-8"))
         arrays = {}
         for name, checksum in facts["crc32"].items():
-            # A plain array over the map: a subclass would slow kernels and surprise callers.
-            arrays[name] = np.asarray(np.load(entry / f"{name}.npy", mmap_mode="r"))
-            if zlib.crc32(np.ascontiguousarray(arrays[name])) != checksum:
+            path = entry / f"{name}.npy"
+            if zlib.crc32(np.ascontiguousarray(np.load(path, mmap_mode="r"))) != checksum:
                 raise _DamagedError(f"the checksum of {name} is wrong")
+            # Mapped anew, so that only what is used takes memory; and a plain array over the map,
+            # since a subclass would slow kernels and surprise callers.
+            arrays[name] = np.asarray(np.load(path, mmap_mode="r"))
         return form.unpack(arrays, facts)
     except (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise _DamagedError(str(error)) from error

@@ -42,9 +42,10 @@ from us_sim.tissue.averaged_pressure import AveragedPressure
 from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.tissue.nested_dissection import Part, nested_dissection
 
-__all__ = ["Condensed", "condense"]
+__all__ = ["Condensed", "Field", "condense"]
 
-_Field = tuple[NDArray[np.int64], NDArray[np.floating]]
+#: Free nodes (F,), and their displacements (3F, 3K) m/N.
+Field = tuple[NDArray[np.int64], NDArray[np.floating]]
 _Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
 
 
@@ -68,7 +69,7 @@ class Condensed:
     _pressures: NDArray[np.float64]  # pressures of kept nodes per their ascending displacements
     _below: list[_Follower]
 
-    def fields(self) -> Iterator[_Field]:
+    def fields(self) -> Iterator[Field]:
         """For every part of the mesh its (F,) free nodes and their (3F, 3K) m/N displacements.
 
         Row 3 f + axis, column 3 k + axis of the force. The parts' numbers are in the precision
@@ -132,7 +133,7 @@ def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse + np.tril(inverse, -1).T
 
 
-def _follow(parts: list[_Follower], above: NDArray[np.floating]) -> Iterator[_Field]:
+def _follow(parts: list[_Follower], above: NDArray[np.floating]) -> Iterator[Field]:
     """The fields of parts and those below, from the (R, 3K) fields around them."""
     for part in parts:
         around = above[part.around]
