@@ -166,6 +166,12 @@ def test_at_rest_it_is_linear_elasticity_with_averaged_pressure(mesh):
     np.testing.assert_allclose(tissue.diagonal_blocks()[[0, 3, 5]], diagonal, rtol=1e-12)
 
 
+def test_up_to_a_ratio_of_two_fifths_the_nodes_have_no_share():
+    assert not bulk_shares(uniform(0.4)).nodal.any()
+    # Of lambda + mu = 10 mu at 0.45, five stay with the tetrahedra.
+    np.testing.assert_allclose(bulk_shares(uniform(0.45)).nodal, 5 * 10e3 / 2.9)
+
+
 @BOTH
 def test_diagonal_blocks_are_those_of_the_tangent(mesh):
     tissue = NeoHookean(mesh, uniform(0.3), np.float64)

@@ -50,5 +50,7 @@ def bulk_shares(materials: TissueMaterials) -> BulkShares:
     ratio = materials.poisson_ratio
     shear = materials.young_modulus / (2 * (1 + ratio))
     whole = shear / (1 - 2 * ratio)
-    element = np.minimum(whole, _ELEMENT_LIMIT * shear)
+    limit = _ELEMENT_LIMIT * shear
+    # At the limit itself rounding must not leave the nodes a share.
+    element = np.where(whole > limit * (1 + 1e-9), limit, whole)
     return BulkShares(shear, element, whole - element)

@@ -6,7 +6,8 @@ resists the average change of volume around each of them:
     sum over tetrahedra e of V (mu/2 (|F|^2 - 3) - mu (J - 1) + element/2 (J - 1)^2)
     + 1/2 sum over nodes a of C q^2,   C = sum of c over a's e,   q = sum of c (J - 1) / C,
 
-with c = V nodal / 4. Linearised at rest it is the linear elasticity of the same shares.
+with c = V nodal / 4, and what `neo_hookean_point` adds against being crushed. Linearised at rest it
+is the linear elasticity of the same shares.
 
 >>> import numpy as np
 >>> from us_sim.tissue.materials import Material, uniform_material
