@@ -202,8 +202,9 @@ class MsdsImplicit(TissueSolver):
         for number, iterations in enumerate(self._rounds):
             self._revise(pose, moved and number == 0)
             given = max(given, self._minimise(iterations))
+        kinetic = self._kinetic()
         self._velocity = (self._positions - before) / self._time_step
-        return self._outcome(pose, given)
+        return self._outcome(pose, kinetic, given)
 
     def _goes_on(self, pose: Pose | None) -> bool:
         """Whether the touched nodes, moving on as they do, come nearer to the probe's surface."""
@@ -282,14 +283,14 @@ class MsdsImplicit(TissueSolver):
         self._reference = load or self._heaviest
         return start
 
-    def _outcome(self, pose: Pose | None, given: float) -> Deformation:
+    def _outcome(self, pose: Pose | None, kinetic: float, given: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
         words, hopeless = self._tangling.judge(self._positions, bool(contact.touched.any()))
         if hopeless:
             self._positions = self.model.mesh.nodes.copy()
             self._velocity[:] = 0.0
         energy, unbalanced = self._potential.elastic(self._positions)
-        self._limit_speed(given, energy)
+        self._limit_speed(kinetic, given, energy)
         unbalanced[self.model.fixed] = 0.0
         along = np.einsum("ij,ij->i", unbalanced[touchable], contact.normal)
         push = np.where(contact.touched, np.maximum(-along, 0.0), 0.0)
@@ -319,14 +320,26 @@ class MsdsImplicit(TissueSolver):
             self._positions.copy(), touchable[pushed], force, torque, residual, words
         )
 
-    def _limit_speed(self, given: float, energy: float) -> None:
-        """Take away the kinetic energy that an unfinished minimisation would have brought in.
+    def _kinetic(self) -> float:
+        """J."""
+        return 0.5 * float(self.mass @ np.einsum("ij,ij->i", self._velocity, self._velocity))
+
+    def _limit_speed(self, kinetic: float, given: float, energy: float) -> None:
+        """Take away what an unfinished minimisation or a jump of the probe brings in as speed.
 
         What inertia, springs and volumes had at the start, with touched nodes where the probe has
-        put them, is the value of the function there; more than that cannot be left.
+        put them, is the value of the function there; more than that cannot be left. And a jump
+        puts nodes elsewhere but does not throw them: kinetic energy grows by no more than the
+        springs' and volumes' energy has changed.
+
+        Args:
+            kinetic: J, before the frame.
+            given: J, the most that the function was before it was lowered.
+            energy: J, of springs and volumes now.
         """
         given += self._energy * self._potential.viscous_part
-        moving = 0.5 * float(self.mass @ np.einsum("ij,ij->i", self._velocity, self._velocity))
-        if moving > 0 and moving + energy > given:
-            self._velocity *= np.sqrt(max(given - energy, 0.0) / moving)
+        allowed = min(given - energy, kinetic + abs(energy - self._energy))
+        moving = self._kinetic()
+        if moving > max(allowed, 0.0):
+            self._velocity *= np.sqrt(max(allowed, 0.0) / moving)
         self._energy = energy

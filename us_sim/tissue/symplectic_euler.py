@@ -61,11 +61,25 @@ def advance_frame(
     sub-step, and wrench (2, 3) with the mean force and torque on the probe in its frame. A volume
     term is given by its `VolumeTerm.arrays`, an array (M,) to write on, and its yield_area.
     """
+    tetrahedra, rest_volume, element, nodal, inverse_weight, mean, change, yield_area = volume
     for step in range(steps):
         for _sub in range(substeps):
             spring_forces(edges, stiffness, damping, rest_length, positions, velocity, force)
-            if len(volume[0]) > 0:
-                add_volume_forces(*volume, damping_factor, positions, velocity, force)
+            if len(tetrahedra) > 0:
+                add_volume_forces(
+                    tetrahedra,
+                    rest_volume,
+                    element,
+                    nodal,
+                    inverse_weight,
+                    mean,
+                    change,
+                    yield_area,
+                    damping_factor,
+                    positions,
+                    velocity,
+                    force,
+                )
             for i in range(len(positions)):
                 for axis in range(3):
                     v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]

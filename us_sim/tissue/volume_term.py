@@ -71,7 +71,7 @@ class VolumeTerm:
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
 
     @cached_property
-    def arrays(self) -> tuple[NDArray, ...]:
+    def arrays(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
         """What the kernels take first; the last one, (N,), is theirs to write on."""
         inverse = np.zeros_like(self.node_weight)
         np.divide(1.0, self.node_weight, out=inverse, where=self.node_weight > 0)
