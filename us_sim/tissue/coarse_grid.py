@@ -204,20 +204,23 @@ def _restrict(field, node, start, corner, weight, coarse):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _prolong(coarse, node, start, corner, weight, field):
     """field (3, N) += P coarse (3G,)."""
-    values = np.empty((3, 8), field.dtype)
     for c in range(len(corner)):
-        for q in range(8):
-            g = 3 * corner[c, q]
-            for d in range(3):
-                values[d, q] = coarse[g + d]
-        for k in range(start[c], start[c + 1]):
-            w = weight[k]
-            i = node[k]
-            for d in range(3):
-                v = values[d]
-                total = (w[0] * v[0] + w[1] * v[1]) + (w[2] * v[2] + w[3] * v[3])
-                total += (w[4] * v[4] + w[5] * v[5]) + (w[6] * v[6] + w[7] * v[7])
-                field[d, i] += total
+        near = corner[c]
+        for d in range(3):
+            v0 = coarse[3 * near[0] + d]
+            v1 = coarse[3 * near[1] + d]
+            v2 = coarse[3 * near[2] + d]
+            v3 = coarse[3 * near[3] + d]
+            v4 = coarse[3 * near[4] + d]
+            v5 = coarse[3 * near[5] + d]
+            v6 = coarse[3 * near[6] + d]
+            v7 = coarse[3 * near[7] + d]
+            f = field[d]
+            for k in range(start[c], start[c + 1]):
+                w = weight[k]
+                value = (w[0] * v0 + w[1] * v1) + (w[2] * v2 + w[3] * v3)
+                value += (w[4] * v4 + w[5] * v5) + (w[6] * v6 + w[7] * v7)
+                f[node[k]] += value
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

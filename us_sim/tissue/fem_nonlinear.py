@@ -31,17 +31,17 @@ the energy.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.pose import Pose
 from us_sim.tissue.carried_correction import CarriedCorrection
-from us_sim.tissue.complementarity import unilateral
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.contact import GAP_TOLERANCE, push_out, wrench_on_probe
+from us_sim.tissue.contact_prediction import predict_forces
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity import require_held
 from us_sim.tissue.model import TissueModel
@@ -57,14 +57,28 @@ _STRIDE = 0.05
 # A prediction takes the time of so many iterations.
 _PREDICTION = 3
 
-# Conjugate-gradient iterations of one Newton step, and of a sub-step that others follow.
-_NEWTON, _PASSING = 6, 4
+# Conjugate-gradient iterations of a frame that may take 33 ms at 10,000 nodes, and of any frame.
+_BUDGET, _LEAST_BUDGET = 36, 12
+
+# Of one Newton step: solved further, a step after a large change overshoots.
+_NEWTON = 6
+
+# Iterations of a sub-step that others follow, and the residual with which they may.
+_PASSING, _PASSABLE = 4, 0.15
 
 # A sub-step is halved so often before the probe is not followed any further in this frame.
 _HALVINGS = 4
 
 # m. On taking over, a node this near the probe is taken to be pushed.
 _NEAR = 1e-4
+
+
+@dataclass(frozen=True)
+class _Effort:
+    least: int  # iterations
+    most: int  # iterations, until the goal is reached
+    goal: float  # residual
+    newton: int = _NEWTON  # iterations of one Newton step
 
 
 class FemNonlinear(TissueSolver):
@@ -79,7 +93,8 @@ class FemNonlinear(TissueSolver):
         model: at least three fixed nodes that are not on one line in every connected part.
         iterations: of the conjugate gradients in an ordinary frame.
         frame_tolerance: residual down to which a frame goes on after those.
-        most_iterations: in any frame; what is then left to do waits for the next.
+        most_iterations: in any frame; what is then left to do waits for the next. By default 36,
+            less on meshes of more than 10,000 nodes.
         tolerance: residual at which the tissue under an unmoved probe has settled.
 
     Raises:
@@ -92,12 +107,16 @@ class FemNonlinear(TissueSolver):
         self,
         model: TissueModel,
         *,
-        iterations: int = 6,
+        iterations: int = 4,
         frame_tolerance: float = 0.03,
-        most_iterations: int = 36,
+        most_iterations: int | None = None,
         tolerance: float = 1e-5,
     ) -> None:
         require_count("fem_nonlinear.iterations", iterations)
+        if most_iterations is None:
+            most_iterations = max(
+                _LEAST_BUDGET, round(_BUDGET / max(1.0, len(model.mesh.nodes) / 1e4))
+            )
         require_count("fem_nonlinear.most_iterations", most_iterations)
         require_number("fem_nonlinear.frame_tolerance", frame_tolerance, 0.0, 1.0)
         require_number("fem_nonlinear.tolerance", tolerance, 0.0, 1.0)
@@ -163,7 +182,9 @@ class FemNonlinear(TissueSolver):
         if taken > 1:
             actions.append(f"sub-stepped {taken} times")
         if taken == 0:
-            self._improve(self._followed, self._retreat, self._iterations, self._most_iterations)
+            # Nothing is new, so a long step does not overshoot.
+            half = max(self._most_iterations // 2, 1)
+            self._improve(self._followed, self._retreat, _Effort(half, half, 1.0, half))
         progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
         return self._outcome(pose, progress, actions)
 
@@ -205,8 +226,10 @@ class FemNonlinear(TissueSolver):
             share = 0.5**halvings / steps
             target, retreat = between(self._followed, pose, share), self._retreat * (1 - share)
             good = newton.snapshot()
-            least = self._iterations if share == 1.0 else _PASSING
-            used = self._attempt(target, retreat, least, max(budget - _PREDICTION, 1), ordinary)
+            effort = _Effort(_PASSING, budget - _PREDICTION, _PASSABLE)
+            if share == 1.0:
+                effort = replace(effort, least=self._iterations, goal=self._frame_tolerance)
+            used = self._attempt(target, retreat, effort, ordinary)
             budget -= _PREDICTION + abs(used)
             if used < 0:
                 newton.restore(good)
@@ -219,37 +242,36 @@ class FemNonlinear(TissueSolver):
                 taken += 1
         return taken
 
-    def _attempt(self, pose: Pose, retreat: float, least: int, most: int, ordinary: bool) -> int:
+    def _attempt(self, pose: Pose, retreat: float, effort: _Effort, ordinary: bool) -> int:
         """One step; how many iterations it took, or -1 when it came out inside out."""
         newton = self._newton
         assert self._followed is not None
         start = newton.displacement.copy()
-        inverted = newton.tissue.inverted(start)
         step = motion(self._followed, pose, self._lever)
         guess = self._correction.guess(step, pose.rotation[:, 2])
         if guess is not None:
             newton.displacement = start + guess
-        self._field[:] = 0.0
         self._predict(pose, retreat)
         newton.displacement = newton.displacement + self._field
         newton.settle_on(pose, retreat)
-        if not newton.tissue.inverted(newton.displacement) <= inverted:
+        inverted = newton.tissue.inverted(newton.displacement)
+        if inverted and inverted > newton.tissue.inverted(start):
             return -1
-        used = self._improve(pose, retreat, least, most)
+        used = self._improve(pose, retreat, effort)
         if ordinary:
             self._correction.learn(newton.displacement - start - self._field, step)
         return used
 
-    def _improve(self, pose: Pose, retreat: float, least: int, most: int) -> int:
-        """Newton steps with so many iterations in all; how many were used."""
+    def _improve(self, pose: Pose, retreat: float, effort: _Effort) -> int:
+        """Newton steps until the effort is spent; how many iterations were used."""
         newton, used = self._newton, 0
         while newton.imbalance > 0.0:
-            left = least - used
-            if left <= 0 and newton.imbalance > self._frame_tolerance * newton.load:
-                left = most - used
+            left = effort.least - used
+            if left <= 0 and newton.imbalance > effort.goal * newton.load:
+                left = effort.most - used
             if left <= 0:
                 break
-            spent, better = newton.step(pose, retreat, min(left, _NEWTON))
+            spent, better = newton.step(pose, retreat, min(left, effort.newton))
             used += max(spent, 1)
             if not better:
                 break
@@ -257,34 +279,29 @@ class FemNonlinear(TissueSolver):
 
     def _predict(self, pose: Pose, retreat: float) -> None:
         """Fill the field with the linear answer to the probe's new pose, and say who touches it."""
-        contact = self._newton.contact
-        load = np.where(contact.touched[:, None], self._newton.force[:, self._surface].T, 0.0)
-        contact.look(pose, retreat, self._newton.surface)
-        near = np.flatnonzero(contact.touched | (contact.gap < 2 * self._stride))
-        near = near[np.isfinite(contact.gap[near])]
-        delassus, gap = _normal_problem(
+        newton, contact = self._newton, self._newton.contact
+        before = contact.touched.copy()
+        contact.look(pose, retreat, newton.surface)
+        change, contact.touched = predict_forces(
             self._compliance.matrix,
-            near,
-            np.flatnonzero(load.any(axis=1)),
-            contact.normal,
             contact.gap,
-            load,
+            contact.normal,
+            newton.force[:, self._surface].T,
+            before,
+            2 * self._stride,
         )
-        push, active = unilateral(delassus, gap, contact.touched[near] | (gap < 0))
-        change = -load
-        change[near] += push[:, None] * contact.normal[near]
-        contact.touched[:] = False
-        contact.touched[near[active]] = True
+        self._field[:] = 0.0
         self._compliance.add_field(change, self._field)
 
     def _outcome(self, pose: Pose, progress: bool, actions: list[str]) -> Deformation:
         newton = self._newton
-        assert self._followed is not None
         behind = self._steps_to(pose) > 0
+        assert self._followed is not None
         kept = newton.snapshot()
         if behind:
             newton.weigh_on(pose)
-            actions.append(f"the tissue is {1e3 * self._depth(pose, newton.surface):.2g} mm behind")
+            way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+            actions.append(f"the tissue is {1e3 * max(way, self._retreat):.2g} mm behind")
         contact = newton.contact
         self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
         reference = newton.load or self._heaviest
@@ -299,33 +316,3 @@ class FemNonlinear(TissueSolver):
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         newton.restore(kept)
         return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _normal_problem(compliance, near, loaded, normal, gap, load):
-    """Delassus matrix (K, K) of ``near`` nodes, and gaps (K,) with the loads taken off."""
-    count = len(near)
-    delassus = np.empty((count, count))
-    opened = np.empty(count)
-    for i in range(count):
-        a = near[i]
-        opened[i] = gap[a]
-        for m in range(len(loaded)):
-            b = loaded[m]
-            for d in range(3):
-                r = compliance[3 * a + d]
-                s = r[3 * b] * load[b, 0] + r[3 * b + 1] * load[b, 1] + r[3 * b + 2] * load[b, 2]
-                opened[i] -= normal[a, d] * s
-        for j in range(i + 1):
-            b = near[j]
-            total = 0.0
-            for d in range(3):
-                r = compliance[3 * a + d]
-                total += normal[a, d] * (
-                    r[3 * b] * normal[b, 0]
-                    + r[3 * b + 1] * normal[b, 1]
-                    + r[3 * b + 2] * normal[b, 2]
-                )
-            delassus[i, j] = total
-            delassus[j, i] = total
-    return delassus, opened

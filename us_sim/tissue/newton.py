@@ -43,6 +43,9 @@ __all__ = ["Newton"]
 # Young's moduli further apart than this leave nothing of the softer forces in single precision.
 _SINGLE_CONTRAST = 1e4
 
+# And the same for the resistance to a change of volume over that to one of shape.
+_SINGLE_BULK = 1e3
+
 # A step is halved so often before it is given up.
 _BACKTRACKS = 6
 
@@ -52,6 +55,9 @@ _SLIDE = 1.5
 # Each step ends when its preconditioned residual has fallen to this part: the next one sees the
 # true slope again.
 _FORCING = 1e-2
+
+# Over the largest eigenvalue of the locally preconditioned stiffness at rest: 1 to 6 tried.
+_LOCAL_SHARE = 4.0
 
 # Power iterations towards the largest eigenvalue of the locally preconditioned stiffness.
 _POWER = 20
@@ -75,7 +81,8 @@ class Newton:
 
     def __init__(self, model: TissueModel) -> None:
         mesh, modulus = model.mesh, model.materials.young_modulus
-        single = modulus.max() <= _SINGLE_CONTRAST * modulus.min()
+        bulk = 1 / (1 - 2 * model.materials.poisson_ratio.max())  # lambda + mu over mu
+        single = modulus.max() <= _SINGLE_CONTRAST * modulus.min() and bulk <= _SINGLE_BULK
         self._dtype: type[np.floating] = np.float32 if single else np.float64
         self.tissue = NeoHookean(mesh, model.materials, np.float64)
         # Conjugate gradients only correct; what they correct is in double precision.
@@ -84,6 +91,8 @@ class Newton:
         self._surface = model.movable_contact_nodes
         self._surface_rest = mesh.nodes[self._surface]
         self._grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
+        # As they are at rest: the deformed ones, computed anew at each step, save no iterations.
+        self._blocks: NDArray[np.floating] = self.tissue.diagonal_blocks().astype(self._dtype)
         self._share = self._local_share()
         shape = (3, len(mesh.nodes))
         self._solution = np.empty(shape, self._dtype)
@@ -152,7 +161,7 @@ class Newton:
         residual = (self.force * (-1.0 / (self.imbalance or 1.0))).astype(self._dtype)
         project(residual, constraints)
         self._tangent.linearise(self.displacement.astype(self._dtype))
-        blocks = self._tangent.diagonal_blocks()
+        blocks = self._blocks
         turn = contact.curvature(pose, self.surface)
         turn = (turn * contact.push[contact.touched][:, None, None]).astype(self._dtype)
 
@@ -223,7 +232,7 @@ class Newton:
         self.load = float(np.linalg.norm(np.maximum(self.contact.push, 0.0)))
 
     def _local_share(self) -> float:
-        """2 over the largest eigenvalue of the locally preconditioned stiffness at rest."""
+        """What the local preconditioner weighs beside the coarse one, which needs no weight."""
         none = np.zeros(0, np.int64)
         constraints = Constraints(self._fixed, none, np.zeros((0, 3)))
         inverse = inverse_blocks(self.tissue.diagonal_blocks(), 1.0, constraints)
@@ -244,7 +253,7 @@ class Newton:
                     inverse[2] * x + inverse[4] * y + inverse[5] * z,
                 ]
             )
-        return 2.0 / largest
+        return _LOCAL_SHARE / largest
 
 
 def _along(blocks: NDArray[np.floating], normal: NDArray[np.float64]) -> NDArray[np.float64]:
