@@ -49,6 +49,9 @@ _ELEMENT_SHARE = 5.0
 # Parts of its volume below which a nonlinear tetrahedron resists being crushed, and more simply so.
 _CROWDED, _CRUSHED = 1 / 4, 1 / 64
 
+# Growth of a tetrahedron's faces at which its volume term yields in an explicit method.
+_YIELD = 1.5
+
 # m, how far the probe is taken to go on behind its collider.
 _GRIP = 0.1
 
@@ -68,6 +71,10 @@ class IndependentResidual:
         self._model = model
         self._forces = forces
         self._rounding = rounding
+        self._heaviest = 0.0
+
+    def forget(self) -> None:
+        """The solver went back to an earlier state: loads before count no more."""
         self._heaviest = 0.0
 
     def check(self, deformation: Deformation, pose: Pose | None) -> tuple[float, float]:
@@ -181,16 +188,30 @@ def spring_forces(
 
 
 def volume_forces(
-    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array
+    mesh: TetrahedralMesh,
+    element: Array,
+    nodal: Array,
+    displacement: Array,
+    yielding: bool = False,
 ) -> Array:
-    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes."""
+    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
+
+    ``yielding`` ones whose faces, squared and added, have grown to 1.5 times what they were keep
+    their strain and their stress in proportion to the square root of what is beyond.
+    """
     gradient = _gradients(mesh)
     slope = _slopes(mesh, gradient, displacement)
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     swelling = _trace(slope) + minors + np.linalg.det(slope)
-    around = _around(mesh, nodal * mesh.volumes / 4, swelling)
-    pressure = element * swelling + nodal * around
-    stress = pressure[:, None, None] * _cofactors(slope + np.eye(3))
+    cofactor = _cofactors(slope + np.eye(3))
+    left = np.ones(len(swelling))
+    if yielding:
+        faces = np.einsum("mij,maj->mai", cofactor, gradient)
+        grown = (faces**2).sum(axis=(1, 2)) / (gradient**2).sum(axis=(1, 2))
+        left = np.sqrt(np.minimum(_YIELD / np.maximum(grown, _YIELD), 1.0))
+    around = _around(mesh, nodal * mesh.volumes / 4, left * swelling)
+    pressure = left * (element * left * swelling + nodal * around)
+    stress = pressure[:, None, None] * cofactor
     return _gathered(mesh, mesh.volumes, gradient, stress, np.zeros(len(pressure)))
 
 

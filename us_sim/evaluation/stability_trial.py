@@ -103,7 +103,7 @@ def try_case(method: str, case: StabilityCase) -> Trial:
     unheld = False
     try:
         model = model_of(case)
-        unheld = method in QUASI_STATIC and not _held(model)
+        unheld = method in QUASI_STATIC and not _held(model).all()
         solver = create_solver(method, model, **_settings(method, case, model))
     except UsSimError as error:
         trial.refused = True
@@ -131,7 +131,7 @@ def run_trial(
     released = None if case.release == "removed" else LIFTED
     frames = _FRAMES_OF_RELEASE[solver.name in QUASI_STATIC]
     last: Deformation | None = None
-    last_pose: Pose | None = None
+    stuck = 0
     for number, pose in enumerate([*poses, *[released] * frames]):
         start = time.perf_counter()
         try:
@@ -145,16 +145,19 @@ def run_trial(
         if not _finite(deformation):
             trial.finite = False
             return
-        if KEPT in deformation.action:
+        kept = KEPT in deformation.action
+        if kept:
             trial.kept += 1
-            seen = last_pose  # the state is that of the frame before, and so is its residual
-        else:
-            seen = pose
+            residual.forget()
+            same = last is None or np.array_equal(deformation.nodes, last.nodes)
+            if not same or (last is not None and deformation.residual != last.residual):
+                trial.failure = "said that it kept the last good state, and returned another one"
         free = number - len(poses)
         moved = np.abs(deformation.nodes - model.mesh.nodes).max()
         trial.bounded = trial.bounded and bool(moved <= bound)
-        if free < 0 or free < 5 or free % 8 == 0 or free == frames - 1:
-            _compare(trial, deformation.residual, *residual.check(deformation, seen), free < 0)
+        compared = free < 5 or free % 8 == 0 or free == frames - 1
+        if compared and not kept:
+            _compare(trial, deformation.residual, *residual.check(deformation, pose), free < 0)
         if free >= 0:
             away = _from_rest(model, deformation.nodes)
             trial.recovered_mm = 1e3 * away
@@ -164,7 +167,10 @@ def run_trial(
                 trial.recovery_frames = free + 1
             if deformation is last:
                 return  # settled
-        last, last_pose = deformation, seen
+        last = deformation
+        stuck = stuck + 1 if kept else 0
+    if stuck >= frames and _held(model).all():
+        trial.failure = "went on failing after the release, and never left its last good state"
 
 
 def agrees(reported: float, checked: float, rounding: float) -> bool:
@@ -217,7 +223,9 @@ def equations_of(method: str, case: StabilityCase, model: TissueModel) -> Indepe
     def of_springs(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         force = spring_forces(springs.edges, springs.stiffness, mesh.nodes, displacement)
         if with_volume:
-            force += volume_forces(mesh, volume.element, volume.nodal, displacement)
+            force += volume_forces(
+                mesh, volume.element, volume.nodal, displacement, yielding=method == "msds"
+            )
         return force
 
     rounding = 4 * digit * float(np.linalg.norm(springs.stiffness))
@@ -256,14 +264,16 @@ def _finite(deformation: Deformation) -> bool:
     return all(bool(np.isfinite(number).all()) for number in numbers)
 
 
-def _held(model: TissueModel) -> bool:
-    """Whether every connected part has three fixed nodes that are not on one line."""
+def _held(model: TissueModel) -> NDArray[np.bool_]:
+    """(P,) whether each connected part has three fixed nodes that are not on one line."""
     part = parts(model.mesh)
-    for one in range(part.max() + 1):
+    held = np.zeros(part.max() + 1, dtype=bool)
+    for one in range(len(held)):
         nodes = model.mesh.nodes[model.fixed & (part == one)]
-        if len(nodes) < 3 or np.linalg.matrix_rank(nodes[1:] - nodes[0], tol=1e-9) < 2:
-            return False
-    return True
+        if len(nodes) > 2:
+            spread = np.linalg.svd(nodes - nodes.mean(axis=0), compute_uv=False)
+            held[one] = spread[1] > 1e-9 * spread[0]
+    return held
 
 
 def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
@@ -276,7 +286,7 @@ def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
     )
     size = np.ptp(nodes, axis=0)
     bound = 3 * (float(np.linalg.norm(size)) + reach + 2 * float(box[2] + box[3]) + 0.1)
-    return bound if _held(model) else max(bound, 10 * float(size.max()))
+    return bound if _held(model).all() else max(bound, 10 * float(size.max()))
 
 
 def _compare(trial: Trial, reported: float, checked: float, rounding: float, pressed: bool) -> None:
@@ -292,9 +302,9 @@ def _from_rest(model: TissueModel, nodes: NDArray[np.float64]) -> float:
     rest = model.mesh.nodes
     part = parts(model.mesh)
     away = 0.0
-    for one in range(part.max() + 1):
+    for one, held in enumerate(_held(model)):
         there, here = rest[part == one], nodes[part == one]
-        if not model.fixed[part == one].any():
+        if not held:
             there, middle = there - there.mean(axis=0), here.mean(axis=0)
             u, _, v = np.linalg.svd((here - middle).T @ there)
             turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
