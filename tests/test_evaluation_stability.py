@@ -57,6 +57,14 @@ class Failing(FemCg):
         raise np.linalg.LinAlgError("Singular matrix")
 
 
+class Stuck(FemCg):
+    """Deforms once, and then fails in every frame."""
+
+    def _is_plausible(self, _):
+        self._tries = getattr(self, "_tries", 0) + 1
+        return self._tries < 3
+
+
 def tried(solver, case=CASE):
     trial = Trial()
     model = model_of(case)
@@ -92,6 +100,14 @@ def test_a_solver_that_raises_is_caught():
     trial = tried(Failing)
     assert not trial.finite
     assert "LinAlgError" in trial.failure
+
+
+def test_a_solver_that_never_leaves_its_last_good_state_is_caught():
+    trial = tried(Stuck)
+    assert trial.finite
+    assert trial.bounded
+    assert trial.kept > 40
+    assert "never left its last good state" in trial.failure
 
 
 @pytest.mark.parametrize(
