@@ -9,6 +9,7 @@ from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.msds import Msds
+from us_sim.tissue.tangling import count_inverted
 
 FRAME = 20 * 0.01  # s
 
@@ -176,3 +177,25 @@ def test_settings_out_of_range_are_refused(setting, value):
 def test_too_many_substeps_are_refused():
     with pytest.raises(SolverError, match="use stabilisation mass_scaling"):
         Msds(block((6, 4, 4)), stabilisation="substeps", maximum_substeps=20)
+
+
+def test_a_short_frame_in_which_little_moves_is_not_taken_for_rest():
+    # Creeping back takes some times of the damping factor, here thousands of frames.
+    solver = Msds(block((6, 4, 4)), time_step=1e-5, damping_factor=0.1)
+    bent = TissueState.at_rest(len(solver.model.mesh.nodes))
+    bent.displacement[~solver.model.fixed, 2] = 1e-3
+    solver.take_over(bent)
+    first = solver.deform(None)
+    assert solver.deform(None) is not first
+    assert 0 < abs(solver.state.velocity).max() * 20 * 1e-5 < 1e-5
+
+
+def test_fitted_springs_that_keep_volume_tangle_less():
+    tangled = {}
+    for chosen in ({}, {"stiffness": "fitted", "volume": True}):
+        solver = Msds(block((13, 7, 6), RoundedBox(0.05, 0.02, 0.1, 0.003)), **chosen)
+        for frame in range(40):
+            solver.deform(at(z=min(0.001 * frame, 0.02)))
+        nodes = solver.model.mesh.nodes + solver.state.displacement
+        tangled[bool(chosen)] = count_inverted(nodes, solver.model.mesh.tetrahedra)
+    assert tangled[False] > 0 == tangled[True]

@@ -89,7 +89,7 @@ def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
     total = np.zeros(count)
     for factor in factors:
         size = csr_array(factor.multiply(factor) @ merge).sqrt()
-        total += 0.5 * (size.T @ size.sum(axis=1))
+        total += 0.5 * (size.T @ np.asarray(size.sum(axis=1)).ravel())
     return total
 
 
