@@ -67,8 +67,9 @@ def test_the_full_plan_has_every_method_on_every_mesh_and_scene():
     trials = plan(quick=False)
     for method in SOLVERS:
         combinations = {(t.scene.name, t.counts) for t in trials if t.method == method}
-        assert len(combinations) == len(SCENES) * 5
-    assert LARGEST_MESH == (64, 32, 32)
+        assert combinations >= {(scene, mesh) for scene in SCENES for mesh in MESHES}
+        large = {scene for scene, mesh in combinations if mesh == LARGEST_MESH}
+        assert large == {"press_25mm", "press_and_slide", "tilt"}
     assert {t.method for t in plan(quick=True)} == set(SOLVERS)
 
 
