@@ -85,7 +85,7 @@ def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Pa
     pairs = ((_MODULUS, _RATIO), (_CONTRAST, _DEPTH), third)
     rows: tuple[tuple[str, Callable[[Trial], float], LogNorm], ...] = (
         (
-            "farthest node from rest after release / mm",
+            "farthest from rest after release / mm",
             lambda t: t.recovered_mm,
             LogNorm(1e-6, 1e2),
         ),
@@ -96,11 +96,11 @@ def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Pa
         for panel, (x, y) in zip(line, pairs, strict=True):
             image = _draw_cells(panel, tried, x, y, value, norm)
         bar = figure.colorbar(image, ax=list(line), pad=0.01, extend="both")
-        bar.set_label(f"{title}, worst of each cell")
+        bar.set_label(title)
     failed = sum(not trial.passed for _, trial in tried)
     figure.suptitle(
-        f"{method}: {len(tried)} cases, {failed} failed"
-        f"   (grey: all refused; white: none; red ×: not finite, bounded or truthful)"
+        f"{method}: {len(tried)} cases, {failed} failed   "
+        f"(a cell shows its worst case; white: none; grey: all refused; red ×: one failed)"
     )
     figure.savefig(file)
 

@@ -69,7 +69,7 @@ def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
             for way in ways
         ]
     if motion == "upside down":
-        depths = (1.2 * thick, thick - deep, -0.5 * deep, thick - deep)
+        depths = (1.2 * thick, thick - deep, -0.5 * deep, -0.2 * deep)
         return [_at(z=z, angle=np.pi, about=(1.0, 0.0, 0.0)) for z in depths]
     if motion == "scribble":
         random = np.random.default_rng(11)
