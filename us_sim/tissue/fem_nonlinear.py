@@ -107,7 +107,7 @@ class FemNonlinear(TissueSolver):
         self,
         model: TissueModel,
         *,
-        iterations: int = 4,
+        iterations: int = 6,
         frame_tolerance: float = 0.03,
         most_iterations: int | None = None,
         tolerance: float = 1e-5,

@@ -32,6 +32,7 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.neo_hookean import NeoHookean
 from us_sim.tissue.projected_conjugate_gradients import (
     Constraints,
+    apply_blocks,
     inverse_blocks,
     project,
     projected_conjugate_gradients,
@@ -170,9 +171,10 @@ class Newton:
             image[:, touched] -= np.einsum("kij,jk->ik", turn, change[:, touched])
 
         self._grid.touch(touched, normal, _along(blocks[:, touched], normal))
+        inverse = inverse_blocks(blocks, self._share, constraints)
         used, _ = projected_conjugate_gradients(
             product,
-            inverse_blocks(blocks, self._share, constraints),
+            inverse,
             self._grid.add_correction,
             constraints,
             residual,
@@ -180,7 +182,12 @@ class Newton:
             iterations,
             _FORCING,
         )
-        return used, self._search(pose, retreat, self._solution * np.float64(self.imbalance))
+        if self._search(pose, retreat, self._solution * np.float64(self.imbalance)):
+            return used, True
+        # Where a released node is driven back by its neighbours' move, its own way still leads on.
+        own = -self.force
+        project(own, constraints)
+        return used, self._search(pose, retreat, apply_blocks(inverse, own))
 
     def _search(self, pose: Pose, retreat: float, change: NDArray[np.float64]) -> bool:
         """Move by as much of the change as lowers the imbalance or the energy."""
@@ -244,15 +251,7 @@ class Newton:
             largest = float(np.linalg.norm(vector))
             if largest == 0.0:
                 return 1.0
-            image = self.tissue.tangent_product(vector / largest)
-            x, y, z = image
-            vector = np.stack(
-                [
-                    inverse[0] * x + inverse[1] * y + inverse[2] * z,
-                    inverse[1] * x + inverse[3] * y + inverse[4] * z,
-                    inverse[2] * x + inverse[4] * y + inverse[5] * z,
-                ]
-            )
+            vector = apply_blocks(inverse, self.tissue.tangent_product(vector / largest))
         return _LOCAL_SHARE / largest
 
 

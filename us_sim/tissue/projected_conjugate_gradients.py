@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Constraints",
+    "apply_blocks",
     "inverse_blocks",
     "project",
     "projected_conjugate_gradients",
@@ -62,6 +63,13 @@ def inverse_blocks(
         blocks, scale, constraints.fixed, constraints.touched, constraints.normal, inverse
     )
     return inverse
+
+
+def apply_blocks(blocks: NDArray[np.floating], field: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, N): symmetric 3x3 blocks (6, N) times a field (3, N)."""
+    out = np.empty_like(field)
+    _apply_blocks(blocks, field, out)
+    return out
 
 
 def projected_conjugate_gradients(
