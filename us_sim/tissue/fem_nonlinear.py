@@ -58,7 +58,7 @@ _STRIDE = 0.05
 _PREDICTION = 3
 
 # Conjugate-gradient iterations of a frame that may take 33 ms at 10,000 nodes, and of any frame.
-_BUDGET, _LEAST_BUDGET = 36, 12
+_BUDGET, _LEAST_BUDGET = 30, 12
 
 # Of one Newton step: solved further, a step after a large change overshoots.
 _NEWTON = 6
@@ -93,7 +93,7 @@ class FemNonlinear(TissueSolver):
         model: at least three fixed nodes that are not on one line in every connected part.
         iterations: of the conjugate gradients in an ordinary frame.
         frame_tolerance: residual down to which a frame goes on after those.
-        most_iterations: in any frame; what is then left to do waits for the next. By default 36,
+        most_iterations: in any frame; what is then left to do waits for the next. By default 30,
             less on meshes of more than 10,000 nodes.
         tolerance: residual at which the tissue under an unmoved probe has settled.
 
@@ -303,6 +303,8 @@ class FemNonlinear(TissueSolver):
             way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
             actions.append(f"the tissue is {1e3 * max(way, self._retreat):.2g} mm behind")
         contact = newton.contact
+        if newton.imbalance == 0.0 and newton.load == 0.0:
+            self._heaviest = 0.0  # still at rest
         self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
         reference = newton.load or self._heaviest
         residual = newton.imbalance / reference if reference else 0.0
