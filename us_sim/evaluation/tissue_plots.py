@@ -25,6 +25,13 @@ STYLES = {
 }
 # Where a name may stand beside its point: right, above, below, left, and the corners.
 _PLACES = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+# Settings that change the equations, in a plot.
+_WORDS = {
+    "stiffness=fitted": "fitted",
+    "stiffness=algorithm_1": "Algorithm 1",
+    "volume=True": "volume term",
+    "volume=False": "no volume term",
+}
 _FRAME = 1000.0 / 30.0  # ms, of the paper's 30 frames a second
 
 
@@ -114,17 +121,6 @@ def _errors(axes, points: Sequence[Point]) -> list[tuple[float, float, str, str]
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
-    axes.text(
-        _FRAME,
-        0.01,
-        " 30 frames a second",
-        transform=axes.get_xaxis_transform(),
-        color="0.6",
-        fontsize=7.5,
-        rotation=90,
-        va="bottom",
-        ha="right",
-    )
     _ticks(axes)
     axes.margins(0.12)
     return labels
@@ -133,7 +129,7 @@ def _errors(axes, points: Sequence[Point]) -> list[tuple[float, float, str, str]
 def _family(point: Point) -> str:
     """What tells a point's equations from those of the method's default, in a few words."""
     parts = [part for part in point.setting.split(", ") if part.startswith(("stiff", "vol"))]
-    return ", ".join(part.replace("stiffness=", "").replace("=", " ") for part in parts)
+    return ", ".join(_WORDS.get(part, part) for part in parts)
 
 
 def _label(axes, labels: list[tuple[float, float, str, str]], points: Sequence[Point]) -> None:  # type: ignore[no-untyped-def]

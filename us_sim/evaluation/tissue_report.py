@@ -134,7 +134,8 @@ def _text(
         "whole surface, by scikit-fem; what it still changes from one mesh to the next finer is:",
         _reference_table(references),
         "![Error against run time](tissue_error.png)",
-        "Full marks are defaults; lines join a method's settings that solve the same equations.",
+        "Full marks are defaults; lines join a method's settings that solve the same equations; "
+        "the dotted line is 30 frames a second.",
         _table_of_defaults(points),
         "### The Pareto front",
         f"Methods than which no other was both faster and more accurate, on {focus.nodes:,} nodes:",
