@@ -116,7 +116,7 @@ def test_a_jump_and_a_walk_end_alike():
 
 
 def test_force_grows_with_depth_as_hertz_says():
-    """The exponent 3/2 within 3 %; with so coarse a mesh the force itself is 11 to 14 % too large."""
+    """The exponent 3/2 within 3 %; so coarse a mesh makes the force itself 11 to 14 % too large."""
     side = np.cumsum(np.append(np.full(5, 1e-3), 1e-3 * 1.6 ** np.arange(1, 9)))
     across = np.concatenate([-side[::-1], [0.0], side])
     deep = np.append(0.0, np.cumsum(np.append(np.full(4, 1e-3), 1e-3 * 1.6 ** np.arange(1, 9))))

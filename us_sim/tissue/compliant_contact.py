@@ -37,6 +37,9 @@ CLOSED = 1e-9
 
 _ROUNDS = 60
 
+# Part of the spacing: nodes with wider gaps are not looked at unless they turn out to be entered.
+_NEAR = 0.4
+
 # Part of the spacing: open gaps wider than this wait for the next round.
 _AHEAD = 0.25
 
@@ -44,7 +47,7 @@ _AHEAD = 0.25
 _MEMORY = 4
 
 # Force along the surface, over the contact force, that is left when the normals have come to rest.
-_SLIDING = 1e-8
+_SLIDING = 1e-7
 
 #: Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
 #: under it again without end. So a pushed node counts as under the probe until it is this part of
@@ -95,7 +98,7 @@ class CompliantContact:
             Whether all gaps are closed or open as they should be, to a nanometre.
         """
         gap = self._gaps(pose)
-        self.near = (gap < self._spacing) | self.forces.any(axis=1)
+        self.near = (gap < _NEAR * self._spacing) | self.forces.any(axis=1)
         return self._solve(pose)
 
     def overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
