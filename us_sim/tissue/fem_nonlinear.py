@@ -64,7 +64,7 @@ _BUDGET, _LEAST_BUDGET = 30, 12
 _NEWTON = 6
 
 # Iterations of a sub-step that others follow, and the residual with which they may.
-_PASSING, _PASSABLE = 4, 0.15
+_PASSING, _PASSABLE = 4, 0.1
 
 # A sub-step is halved so often before the probe is not followed any further in this frame.
 _HALVINGS = 4
@@ -182,9 +182,12 @@ class FemNonlinear(TissueSolver):
         if taken > 1:
             actions.append(f"sub-stepped {taken} times")
         if taken == 0:
-            # Nothing is new, so a long step does not overshoot.
-            half = max(self._most_iterations // 2, 1)
-            self._improve(self._followed, self._retreat, _Effort(half, half, 1.0, half))
+            effort = _Effort(self._iterations, self._most_iterations, self._frame_tolerance)
+            if newton.imbalance <= self._frame_tolerance * newton.load:
+                # So near the solution a long step does not overshoot.
+                half = max(self._most_iterations // 2, 1)
+                effort = _Effort(half, half, 1.0, half)
+            self._improve(self._followed, self._retreat, effort)
         progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
         return self._outcome(pose, progress, actions)
 
