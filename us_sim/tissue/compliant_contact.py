@@ -35,7 +35,10 @@ __all__ = ["CLOSED", "SKIRT", "CompliantContact", "gaps", "gather", "yielded"]
 #: m. A gap this small is closed, and so is a node that is in the probe by this much.
 CLOSED = 1e-9
 
-_ROUNDS = 60
+# After so many rounds that mixed earlier ones, plain and shorter steps are surer.
+_MIXED = 30
+_ROUNDS = 250
+_SHORT = 0.7
 
 # Part of the spacing: nodes with wider gaps are not looked at unless they turn out to be entered.
 _NEAR = 0.4
@@ -239,6 +242,9 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
             remembered += 1
         else:
             remembered = 0
+        if iteration >= _MIXED:
+            point += _SHORT * step
+            continue
         last_point[:] = point
         last_step[:] = step
         _mix(active, step, points, steps, min(remembered, _MEMORY), point)
