@@ -29,6 +29,7 @@ from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.contact import only_forward, push_out
 from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elastic_balance import ElasticBalance
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solver import TissueSolver, require_count, require_number
 from us_sim.tissue.springs import SpringNetwork, fitted_springs, springs_of
@@ -132,6 +133,7 @@ class Msds(TissueSolver):
         )  # mass: (N,) kg, as simulated
         self._time_step = time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
+        self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
         self._tangling = Tangling(model)
         self._forward = only_forward(model.collider, model.contact_spacing)
 
@@ -159,7 +161,7 @@ class Msds(TissueSolver):
         self._velocity[:] = state.velocity
         self._velocity[self.model.fixed] = 0.0
         self._touched = np.zeros(len(self._normal), dtype=bool)
-        self._heaviest = 0.0  # N, largest norm of contact forces since the tissue was at rest
+        self._balance.forget()
         self._tangling.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
@@ -235,24 +237,20 @@ class Msds(TissueSolver):
     def _outcome(
         self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
     ) -> Deformation:
-        movable = self.model.movable_contact_nodes
-        still = np.zeros_like(self._velocity)
         action = self._put_back_if_tangled()
-        unbalanced = self._springs.forces(self._positions, still)
-        unbalanced += self._volume.forces(self._positions, still)
-        unbalanced[self.model.fixed] = 0.0
-        along = np.einsum("ij,ij->i", unbalanced[movable], self._normal)
-        push = np.where(self._touched, np.maximum(-along, 0.0), 0.0)
-        unbalanced[movable] += push[:, None] * self._normal
-        imbalance = float(np.linalg.norm(unbalanced))
-        load = float(np.linalg.norm(push))
-        self._heaviest = max(self._heaviest, load) or imbalance
-        reference = load or self._heaviest
-        residual = imbalance / reference if reference else 0.0
+        still = np.zeros_like(self._velocity)
+        elastic = self._springs.forces(self._positions, still)
+        elastic += self._volume.forces(self._positions, still)
+        elastic[self.model.fixed] = 0.0
+        touched = self.model.movable_contact_nodes[self._touched]
+        normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._touched]
+        residual = self._balance.residual(-elastic, touched, normal)
 
         frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
         speed = np.abs(self._velocity).max()
-        acceleration = np.abs(unbalanced * self._inverse_mass[:, None]).max()
+        along = np.einsum("ij,ij->i", elastic[touched], normal)
+        elastic[touched] -= np.minimum(along, 0.0)[:, None] * normal
+        acceleration = np.abs(elastic * self._inverse_mass[:, None]).max()
         self._settled = bool(
             max(speed * max(frame, self._damping_factor), acceleration * frame**2)
             < self._rest_tolerance
@@ -263,10 +261,9 @@ class Msds(TissueSolver):
             displaced = np.abs(self._positions - self.model.mesh.nodes).max()
             if not self._touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
                 self._positions[:] = self.model.mesh.nodes
-                self._heaviest = residual = 0.0
-        return Deformation(
-            self._positions.copy(), movable[self._touched], force, torque, residual, action
-        )
+                self._balance.forget()
+                residual = 0.0
+        return Deformation(self._positions.copy(), touched, force, torque, residual, action)
 
     def _put_back_if_tangled(self) -> str:
         """What was done about tetrahedra turned inside out, after what was done for stability."""
@@ -274,6 +271,7 @@ class Msds(TissueSolver):
         if hopeless:
             self._positions[:] = self.model.mesh.nodes
             self._velocity[:] = 0.0
+            self._balance.forget()
         return "; ".join(filter(None, [self._action, words]))
 
 

@@ -35,6 +35,7 @@ from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
 from us_sim.tissue.contact import push_out, wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elastic_balance import ElasticBalance
 from us_sim.tissue.elasticity import shape_gradients
 from us_sim.tissue.incremental_potential import IncrementalPotential
 from us_sim.tissue.model import TissueModel
@@ -136,6 +137,7 @@ class MsdsImplicit(TissueSolver):
             model.collider, model.mesh.nodes[self._touchable], model.contact_spacing
         )
         self._preconditioner = self._factored(springs, term, 1.0 + damping_factor / time_step)
+        self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
         self._tangling = Tangling(model)
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
@@ -173,7 +175,7 @@ class MsdsImplicit(TissueSolver):
         self._preconditioner.confine(np.zeros(0, np.intp), np.zeros((0, 3)))
         self._tangling.forget()
         self._energy = self._potential.elastic(self._positions)[0]  # J, of springs and volumes
-        self._heaviest = 0.0  # N, largest norm of contact forces since the tissue was at rest
+        self._balance.forget()
         self._reference = 0.0  # N, what the tolerance refers to
         self._taken_over = bool(state.displacement.any())
 
@@ -280,7 +282,7 @@ class MsdsImplicit(TissueSolver):
             left = self._unconfined(force)
         self._contact.weigh(-force[self._touchable])
         load = float(np.linalg.norm(np.maximum(self._contact.push, 0.0)))
-        self._reference = load or self._heaviest
+        self._reference = load or self._balance.heaviest
         return start
 
     def _outcome(self, pose: Pose | None, kinetic: float, given: float) -> Deformation:
@@ -289,16 +291,15 @@ class MsdsImplicit(TissueSolver):
         if hopeless:
             self._positions = self.model.mesh.nodes.copy()
             self._velocity[:] = 0.0
-        energy, unbalanced = self._potential.elastic(self._positions)
+            self._balance.forget()
+        energy, elastic = self._potential.elastic(self._positions)
         self._limit_speed(kinetic, given, energy)
-        unbalanced[self.model.fixed] = 0.0
-        along = np.einsum("ij,ij->i", unbalanced[touchable], contact.normal)
-        push = np.where(contact.touched, np.maximum(-along, 0.0), 0.0)
-        unbalanced[touchable] += push[:, None] * contact.normal
-        imbalance, load = float(np.linalg.norm(unbalanced)), float(np.linalg.norm(push))
-        self._heaviest = max(self._heaviest, load) or imbalance
-        reference = load or self._heaviest
-        residual = imbalance / reference if reference else 0.0
+        elastic[self.model.fixed] = 0.0
+        # As they slid, and were moved onto planes, the probe pushes them another way now.
+        normal = contact.normal_at(pose, self._surface())
+        loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
+        pushed = contact.touched & (loaded | (contact.push > 0))
+        residual = self._balance.residual(-elastic, touchable[pushed], normal[pushed])
         self._settled = (
             bool(np.abs(self._velocity).max() * self._rest_time < self._rest_tolerance)
             and residual <= self._tolerance
@@ -309,11 +310,11 @@ class MsdsImplicit(TissueSolver):
             displaced = np.abs(self._positions - self.model.mesh.nodes).max()
             if not contact.touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
                 self._positions = self.model.mesh.nodes.copy()
-                self._heaviest = self._energy = residual = 0.0
-        pushed = contact.push > 0
+                self._balance.forget()
+                self._energy = residual = 0.0
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
-            pushes = contact.push[pushed, None] * contact.normal[pushed]
+            pushes = np.maximum(contact.push[pushed, None], 0.0) * contact.normal[pushed]
             rows = touchable[pushed]
             force, torque = wrench_on_probe(pose, self._positions[rows], pushes)
         return Deformation(
