@@ -163,3 +163,21 @@ def test_a_solver_that_is_not_asked_for_is_not_imported():
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "[]"
+
+
+def test_a_tissue_that_goes_on_failing_is_put_to_rest(solver, monkeypatch):
+    solver.deform(PRESSED)
+    advance = type(solver)._advance
+
+    def fail(self, pose):
+        deformation = advance(self, pose)
+        deformation.nodes[0] = np.nan
+        return deformation
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(solver), "_advance", fail)
+        actions = [solver.deform(Pose([0.0, 0.0, 0.001 * k])).action for k in range(5)]
+    assert all("last good state was kept" in action for action in actions[:4])
+    assert "put to rest" in actions[4]
+    assert not solver.state.displacement.any()
+    assert settled(solver, PRESSED, 60).residual < 0.1

@@ -49,6 +49,13 @@ class AveragedPressure:
         scaled = dia_array((1 / self.capacity[None], [0]), shape=2 * self.capacity.shape)
         return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
 
+    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) N, what holds the nodes at a displacement (N, 3) m."""
+        moved = displacement.ravel()
+        swelling = self.coupling @ moved
+        held = self.element @ moved + self.coupling.T @ (swelling / self.capacity)
+        return held.reshape(-1, 3)
+
 
 def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:
     """Assemble the equations of a mesh."""

@@ -191,10 +191,7 @@ def _rounding(made: SurfaceCompliance, system: AveragedPressure, fixed: NDArray[
         loads += [np.tile(axis, (len(made.nodes), 1)) for axis in np.eye(3)]
     found = []
     for load in loads:
-        moved = made.field(load).ravel()
-        volume = system.coupling @ moved
-        balance = system.element @ moved + system.coupling.T @ (volume / system.capacity)
-        balance = balance.reshape(-1, 3)
+        balance = system.forces(made.field(load))
         balance[made.nodes] -= load
         balance[fixed] = 0.0
         found.append(float(np.linalg.norm(balance) / np.linalg.norm(load)))

@@ -28,9 +28,11 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.pose import Pose
+from us_sim.tissue.averaged_pressure import averaged_pressure
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.compliant_contact import CompliantContact
 from us_sim.tissue.contact import wrench_on_probe
@@ -44,6 +46,9 @@ __all__ = ["CONTACTS", "Fem"]
 #: What holds between the probe and the surface.
 CONTACTS = ("frictionless", "coulomb", "sticking")
 
+# From here on what rounding leaves is computed in every frame.
+_ROUNDING = 3e-6
+
 # How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
 
@@ -51,9 +56,10 @@ _EXTENSIONS = 10
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
-    The residual is what rounding leaves in the stored fields, as measured when they were made, and
-    the forces along the surface where the probe is curved (without friction), or by which the
-    forces had not settled (with it).
+    The residual is what rounding leaves in the stored fields and the forces along the surface where
+    the probe is curved (without friction), or by which the forces had not settled (with it). What
+    rounding leaves is as measured when the fields were made, unless that is much, as with moduli
+    far apart: then it is computed in every frame.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -86,6 +92,8 @@ class Fem(TissueSolver):
         else:
             coefficient = friction if contact == "coulomb" else math.inf
             self._contact = FrictionalContact(*surface, coefficient)
+        imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
+        self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._displacement = np.zeros_like(model.mesh.nodes)
         super().__init__(model)
 
@@ -128,5 +136,14 @@ class Fem(TissueSolver):
         forces = contact.forces[pushed]
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         load = float(np.linalg.norm(forces))
-        residual = float(np.hypot(contact.sliding_force / load, compliance.rounding))
+        residual = math.hypot(contact.sliding_force / load, self._rounding(touched, forces))
         return Deformation(nodes, touched, force, torque, residual, action)
+
+    def _rounding(self, touched: NDArray[np.int32], forces: NDArray[np.float64]) -> float:
+        """Unbalanced force over the norm of the probe's forces (K, 3) N on touched (K,) nodes."""
+        if self._equations is None:
+            return self._compliance.rounding
+        balance = self._equations.forces(self._displacement)
+        balance[touched] -= forces
+        balance[self.model.fixed] = 0.0
+        return float(np.linalg.norm(balance) / np.linalg.norm(forces))

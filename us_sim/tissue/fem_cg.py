@@ -183,16 +183,17 @@ class FemCg(TissueSolver):
         residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
         self._settled = balanced and contact.consistent(pose, displacement[self._touchable])
-        if self._settled and not contact.touched.any():
+        nodes = self.model.mesh.nodes.copy()
+        nodes[self._free] += displacement
+        resting = self._settled or np.array_equal(nodes, self.model.mesh.nodes)
+        if resting and not contact.touched.any():
             # Without a load the exact solution is the rest state.
-            displacement[:] = 0.0
+            nodes, displacement[:] = self.model.mesh.nodes.copy(), 0.0
             self._heaviest = self._reference = residual = 0.0
             self._slope = -1.0
         elif not balanced and self._slope == 0.0:
             # The updated residual has drifted from the true one.
             self._slope = -1.0
-        nodes = self.model.mesh.nodes.copy()
-        nodes[self._free] += displacement
         pushing = push.any(axis=1)
         pushed = self.model.movable_contact_nodes[pushing]
         force, torque = np.zeros(3), np.zeros(3)

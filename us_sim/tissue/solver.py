@@ -59,12 +59,16 @@ SOLVERS = {
 # A node that moved by this many times the mesh's longest side has left the tissue.
 _FARTHEST = 10.0
 
+# Frames in a row that may come to nothing before the tissue is put to rest.
+_PATIENCE = 5
+
 
 class TissueSolver(ABC):
     """Deforms one tissue, frame by frame.
 
     A solver never returns a number that is not finite, nor nodes that flew off: should a frame come
-    out so, the last good state stays and the deformation's ``action`` says it.
+    out so, the last good state stays and the deformation's ``action`` says it. Should that happen
+    again and again, the tissue is put back to rest.
     """
 
     name: ClassVar[str]
@@ -73,6 +77,7 @@ class TissueSolver(ABC):
         self.model = model
         self._pose: Pose | None = None
         self._settled = True
+        self._failures = 0  # frames in a row that came to nothing
         self._reach = _FARTHEST * float(np.ptp(model.mesh.nodes, axis=0).max())
         self._last = self._resting()
 
@@ -90,21 +95,32 @@ class TissueSolver(ABC):
         deformation = self._advance(probe_pose)
         if self._is_plausible(deformation):
             self._pose = probe_pose
+            self._failures = 0
         else:
-            self._restore(good)
-            self._settled = False  # so that the next frame tries again
-            deformation = replace(
-                self._last,
-                action="the frame came out not finite or far away, so the last good state was kept",
-            )
+            deformation = self._recovered(good)
         self._last = deformation
         return deformation
+
+    def _recovered(self, good: TissueState) -> Deformation:
+        """What stands for a frame that came to nothing; the next one tries again."""
+        action = "the frame came out not finite or far away, so the last good state was kept"
+        self._failures += 1
+        if self._failures < _PATIENCE:
+            self._restore(good)
+        else:
+            self.reset()
+            action = (
+                f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
+            )
+        self._settled = False
+        return replace(self._last, action=action)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""
         self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
         self._pose = None
         self._settled = True
+        self._failures = 0
         self._last = self._resting()
 
     def take_over(self, state: TissueState) -> None:
