@@ -51,7 +51,7 @@ Every case is a small tissue (4 to 150 nodes), a collider and a motion of it, an
   returned nodes by other code (NumPy, double precision, from the method's equations:
   `us_sim/evaluation/independent_residual.py`) are within a factor of two, or both below 1e-5, or
   both below what rounding the nodes' coordinates to doubles makes.
-- *kept*: frames of which the solver itself threw away the result and kept the last good state.
+- *kept*: frames that failed, after which the solver itself kept the last good state or rest.
 - *refused*: in one sentence, before the run. To be refused for no reason counts as failed, and so
   does not to refuse a tissue that can move as a whole (quasi-static methods) or broken input.
 - critical damping is that of the root mean square of the nodes' frequencies.

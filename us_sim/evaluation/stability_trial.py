@@ -54,8 +54,8 @@ __all__ = [
 #: Methods without masses: a part that is not held has no position of rest, and is refused.
 QUASI_STATIC = ("fem", "fem_nonlinear", "fem_cg")
 
-#: How a solver begins to say that it kept the last good state.
-KEPT = "the frame came out"
+#: What a solver says of a frame that failed, and of one after which it kept the last good state.
+FAILED, KEPT = "came out not finite or far away", "so the last good state was kept"
 
 # Residuals below this are the same, and above it they agree within this factor.
 _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
@@ -83,7 +83,7 @@ class Trial:
     step_limit_predicted: float = math.nan  # s
     step_limit_observed: float = math.nan  # s
     slowest_ms: float = 0.0
-    kept: int = 0  # frames in which the solver kept its last good state
+    kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
     actions: list[str] = field(default_factory=list)  # what it said, each once
 
     @property
@@ -145,10 +145,12 @@ def run_trial(
         if not _finite(deformation):
             trial.finite = False
             return
+        failed = FAILED in deformation.action
         kept = KEPT in deformation.action
-        if kept:
+        if failed:
             trial.kept += 1
             residual.forget()
+        if kept:
             same = last is None or np.array_equal(deformation.nodes, last.nodes)
             if not same or (last is not None and deformation.residual != last.residual):
                 trial.failure = "said that it kept the last good state, and returned another one"
@@ -156,7 +158,7 @@ def run_trial(
         moved = np.abs(deformation.nodes - model.mesh.nodes).max()
         trial.bounded = trial.bounded and bool(moved <= bound)
         compared = free < 5 or free % 8 == 0 or free == frames - 1
-        if compared and not kept:
+        if compared and not failed:
             _compare(trial, deformation.residual, *residual.check(deformation, pose), free < 0)
         if free >= 0:
             away = _from_rest(model, deformation.nodes)
@@ -168,9 +170,9 @@ def run_trial(
             if deformation is last:
                 return  # settled
         last = deformation
-        stuck = stuck + 1 if kept else 0
+        stuck = stuck + 1 if failed else 0
     if stuck >= frames and _held(model).all():
-        trial.failure = "went on failing after the release, and never left its last good state"
+        trial.failure = "went on failing after the release, in every frame"
 
 
 def agrees(reported: float, checked: float, rounding: float) -> bool:
