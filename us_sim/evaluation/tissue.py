@@ -19,7 +19,7 @@ from typing import Any
 from us_sim.errors import UsSimError
 from us_sim.evaluation.kept_reference import Reference, kept_reference
 from us_sim.evaluation.own_equations import converged, equations, solved_independently
-from us_sim.evaluation.tissue_cases import LARGEST_MESH, MESHES, SCENES, Scene
+from us_sim.evaluation.tissue_cases import LARGEST_MESH, LOCKING, MESHES, SCENES, Scene
 from us_sim.evaluation.tissue_points import (
     COLUMNS,
     Outcome,
@@ -97,24 +97,28 @@ def settings_of(method: str) -> list[dict[str, Any]]:
 def plan(quick: bool) -> list[Trial]:
     """Everything that is run, in order.
 
-    All settings on the paper's finest mesh and, for the main press, on all of the paper's; each
-    method's defaults on the others. The largest mesh takes the quick scenes.
+    The main press takes every mesh, the others the paper's; scenes in which tetrahedra lock the
+    paper's finest. All settings are tried on that, and in the main press on the coarsest;
+    elsewhere each method's defaults.
     """
     trials: list[Trial] = []
     for scene in (SCENES[name] for name in _QUICK_SCENES) if quick else SCENES.values():
-        main = scene.name == MAIN_SCENE
-        meshes = [*MESHES, LARGEST_MESH] if scene.name in _QUICK_SCENES else [*MESHES]
+        main, locking = scene.name == MAIN_SCENE, scene.name in LOCKING[1:]
         if quick:
             meshes = [MESHES[0], MESHES[-1]] if main else [MESHES[-1]]
+        elif main:
+            meshes = [*MESHES, LARGEST_MESH]
+        else:
+            meshes = [MESHES[-1]] if locking else [*MESHES]
         for counts in meshes:
             finest = counts == MESHES[-1]
             for method in SOLVERS:
                 settings = _known_settings(method)
                 if quick:
                     settings = settings[: 1 + _QUICK_SETTINGS if main and finest else 1]
-                elif not (finest or (main and counts != LARGEST_MESH)):
+                elif locking or not (finest or (main and counts == MESHES[0])):
                     settings = settings[:1]
-                own = finest or main
+                own = not locking and (finest or main)
                 trials += [Trial(scene, counts, method, setting, own) for setting in settings]
     return trials
 
@@ -191,7 +195,8 @@ def _references(scenes: list[Scene], quick: bool) -> dict[str, Reference]:
                 progress.update(done + fraction, f"{name}: {text}")
 
             tell(0.0, "")
-            found[scene.name] = kept_reference(scene, _QUICK_SIZES if quick else _SIZES, tell)
+            coarse = quick or scene.name in LOCKING[1:]
+            found[scene.name] = kept_reference(scene, _QUICK_SIZES if coarse else _SIZES, tell)
         progress.update(len(scenes))
     return found
 

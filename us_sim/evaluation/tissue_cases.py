@@ -1,4 +1,4 @@
-"""What `us-sim evaluate tissue` presses: one block, its meshes, and four ways to press it.
+"""What `us-sim evaluate tissue` presses: one block, its meshes, and the ways to press it.
 
 >>> from us_sim.evaluation.tissue_cases import MESHES, SCENES
 >>> scene = SCENES["press_and_slide"]
@@ -25,7 +25,7 @@ from us_sim.tissue.materials import Material, uniform_material
 from us_sim.tissue.mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["LARGEST_MESH", "MESHES", "SCENES", "Scene"]
+__all__ = ["LARGEST_MESH", "LOCKING", "MESHES", "SCENES", "Scene"]
 
 #: Nodes along x, y and z: the paper's four (section VI).
 MESHES = ((20, 10, 10), (24, 12, 12), (28, 14, 14), (32, 16, 16))
@@ -122,5 +122,19 @@ SCENES = {
             _AROUND,
             0.49,
         ),
+        *(
+            Scene(
+                f"press_12mm_nu{ratio}",
+                f"pressed by 12 mm, Poisson's ratio {ratio}",
+                _SPHERE,
+                _press(0.012),
+                _AROUND,
+                ratio,
+            )
+            for ratio in (0.49, 0.499, 0.4999)
+        ),
     )
 }
+
+#: Where linear tetrahedra lock: the same press of ever less compressible tissue.
+LOCKING = ("press_12mm", *(name for name in SCENES if name.startswith("press_12mm_nu")))

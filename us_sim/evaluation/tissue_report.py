@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from us_sim.evaluation.kept_reference import Reference
-from us_sim.evaluation.tissue_cases import MESHES, SCENES
+from us_sim.evaluation.tissue_cases import LOCKING, MESHES, SCENES
 from us_sim.evaluation.tissue_plots import exponent, plot_errors, plot_sizes
 from us_sim.evaluation.tissue_points import Point
 
@@ -61,16 +61,17 @@ def write_report(
     finest = [p for p in points if p.nodes == focus.nodes]
     main = [p for p in points if p.scene == focus.scene]
     nonlinear = [p for p in points if not p.own]
+    shown = [name for name in references if name not in LOCKING[1:]]
     pictures = {
         "tissue_error.png": (
             "Error against run time, to large deformation on fine quadratic elements "
             f"({focus.nodes:,} nodes)",
-            {name: [p for p in finest if p.scene == name and not p.own] for name in references},
+            {name: [p for p in finest if p.scene == name and not p.own] for name in shown},
         ),
         "tissue_own_error.png": (
             "Error against run time, to each method's own converged equations "
             f"({focus.nodes:,} nodes)",
-            {name: [p for p in finest if p.scene == name and p.own] for name in references},
+            {name: [p for p in finest if p.scene == name and p.own] for name in shown},
         ),
         "tissue_meshes.png": (
             f"Error against run time, by mesh, {SCENES[focus.scene].words}",
@@ -139,7 +140,7 @@ def _text(
         _table_of_defaults(points),
         "### The Pareto front",
         f"Methods than which no other was both faster and more accurate, on {focus.nodes:,} nodes:",
-        *(_front(points, name, focus.nodes) for name in references),
+        *(_front(points, name, focus.nodes) for name in references if name not in LOCKING[1:]),
         "![Error against run time on several meshes](tissue_meshes.png)",
         "## Against each method's own equations",
         "The same mesh and method with as many iterations as it takes (`fem` against an "
@@ -147,6 +148,7 @@ def _text(
         "costs; what is left in the picture above is the mesh and the model.",
         "![Error to own equations](tissue_own_error.png)",
         _own_table(points, focus),
+        *_locking(points),
         "## Cost against size",
         "Memory is that of the arrays that a solver holds when it is ready, those of its mesh "
         "included. Set-up is the time to make the solver, which may read its precomputed part from "
@@ -164,6 +166,34 @@ def _text(
             ),
         ]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _locking(points: Sequence[Point]) -> list[str]:
+    """How the reaction grows as tissue becomes incompressible; nothing without those scenes."""
+    found = {(p.scene, p.method): p for p in points if p.default and not p.own and not p.failure}
+    finest = {key: p for key, p in found.items() if p.nodes == _PAPERS_FINEST}
+    ratios = [name for name in LOCKING if any(scene == name for scene, _ in finest)]
+    if len(ratios) < 2:
+        return []
+    head = ["method", *(f"ν = {SCENES[name].poisson_ratio}" for name in ratios)]
+    rows = [
+        [
+            method,
+            *(
+                f"{100 * finest[name, method].force_error:.2g} %"
+                if (name, method) in finest
+                else ""
+                for name in ratios
+            ),
+        ]
+        for method in dict.fromkeys(method for _, method in finest)
+    ]
+    return [
+        "## Locking",
+        f"Error of the reaction to a press of 12 mm on {_PAPERS_FINEST:,} nodes, while the probe "
+        "moves, as the tissue becomes incompressible:",
+        _table(head, rows),
+    ]
 
 
 def _machine() -> str:
