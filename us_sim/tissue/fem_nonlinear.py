@@ -69,6 +69,9 @@ _PASSING, _PASSABLE = 4, 0.1
 # A sub-step is halved so often before the probe is not followed any further in this frame.
 _HALVINGS = 4
 
+# Of a prediction that turns tetrahedra inside out, what is tried instead.
+_SHARES = (0.5, 0.0)
+
 # m. On taking over, a node this near the probe is taken to be pushed.
 _NEAR = 1e-4
 
@@ -187,6 +190,7 @@ class FemNonlinear(TissueSolver):
                 # So near the solution a long step does not overshoot.
                 half = max(self._most_iterations // 2, 1)
                 effort = _Effort(half, half, 1.0, half)
+            newton.settle_on(self._followed, self._retreat)
             self._improve(self._followed, self._retreat, effort)
         progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
         return self._outcome(pose, progress, actions)
@@ -205,7 +209,7 @@ class FemNonlinear(TissueSolver):
         if newton.tissue.smallest_volume_ratio(newton.displacement) <= 0.0:
             return
         self._followed, self._retreat = pose, self._depth(pose, newton.surface)
-        newton.contact.look(pose, self._retreat, newton.surface)
+        newton.contact.aim(pose, self._retreat, newton.surface)
         newton.contact.touched = newton.contact.gap < _NEAR
         newton.settle_on(pose, self._retreat)
 
@@ -249,7 +253,7 @@ class FemNonlinear(TissueSolver):
         """One step; how many iterations it took, or -1 when it came out inside out."""
         newton = self._newton
         assert self._followed is not None
-        start = newton.displacement.copy()
+        start, touched = newton.displacement.copy(), newton.contact.touched.copy()
         step = motion(self._followed, pose, self._lever)
         guess = self._correction.guess(step, pose.rotation[:, 2])
         if guess is not None:
@@ -257,13 +261,41 @@ class FemNonlinear(TissueSolver):
         self._predict(pose, retreat)
         newton.displacement = newton.displacement + self._field
         newton.settle_on(pose, retreat)
+        if newton.tissue.inverted(newton.displacement):
+            self._take_less(pose, retreat, start, touched)
+        used = self._improve(pose, retreat, effort)
         inverted = newton.tissue.inverted(newton.displacement)
         if inverted and inverted > newton.tissue.inverted(start):
-            return -1
-        used = self._improve(pose, retreat, effort)
+            return -max(used, 1)
         if ordinary:
             self._correction.learn(newton.displacement - start - self._field, step)
         return used
+
+    def _take_less(
+        self,
+        pose: Pose,
+        retreat: float,
+        start: NDArray[np.float64],
+        touched: NDArray[np.bool_],
+    ) -> None:
+        """Start from what is left of a prediction that turns tetrahedra inside out, or from none.
+
+        Args:
+            pose, retreat: of the step.
+            start: (3, N) m, before the prediction.
+            touched: (S,), then.
+        """
+        newton = self._newton
+        least, best = newton.tissue.energy(newton.displacement), newton.snapshot()
+        change = newton.displacement - start
+        for share in _SHARES:
+            newton.displacement = start + share * change
+            newton.contact.touched = touched | (newton.contact.touched & (share > 0.0))
+            newton.settle_on(pose, retreat)
+            energy = newton.tissue.energy(newton.displacement)
+            if energy < least:
+                least, best = energy, newton.snapshot()
+        newton.restore(best)
 
     def _improve(self, pose: Pose, retreat: float, effort: _Effort) -> int:
         """Newton steps until the effort is spent; how many iterations were used."""
@@ -284,7 +316,7 @@ class FemNonlinear(TissueSolver):
         """Fill the field with the linear answer to the probe's new pose, and say who touches it."""
         newton, contact = self._newton, self._newton.contact
         before = contact.touched.copy()
-        contact.look(pose, retreat, newton.surface)
+        contact.aim(pose, retreat, newton.surface)
         change, contact.touched = predict_forces(
             self._compliance.matrix,
             contact.gap,

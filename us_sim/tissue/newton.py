@@ -50,8 +50,9 @@ _SINGLE_BULK = 1e3
 # A step is halved so often before it is given up.
 _BACKTRACKS = 6
 
-# Where the probe pushes along one direction, a step may leave so much more imbalance.
-_SLIDE = 1.5
+# With a tetrahedron pressed to this part of its volume, steps along the exact tangent overshoot;
+# with none, those along one without negative eigenvalues fall short.
+_CROWDED = 0.2
 
 # Each step ends when its preconditioned residual has fallen to this part: the next one sees the
 # true slope again.
@@ -135,12 +136,13 @@ class Newton:
 
     def settle_on(self, pose: Pose, retreat: float) -> None:
         """Move nodes that touch or have entered the probe onto it, and weigh the forces."""
+        self.contact.aim(pose, retreat, self.surface)
         self._hold(pose, retreat)
         self._weigh()
 
     def weigh_on(self, pose: Pose) -> None:
         """Weigh the same forces against another pose's normals, moving nothing."""
-        self.contact.look(pose, 0.0, self.surface)
+        self.contact.aim(pose, 0.0, self.surface)
         self._weigh_contact()
 
     def step(self, pose: Pose, retreat: float, iterations: int) -> tuple[int, bool]:
@@ -161,7 +163,8 @@ class Newton:
         constraints = Constraints(self._fixed, touched, normal.astype(self._dtype))
         residual = (self.force * (-1.0 / (self.imbalance or 1.0))).astype(self._dtype)
         project(residual, constraints)
-        self._tangent.linearise(self.displacement.astype(self._dtype))
+        crowded = not self.tissue.smallest_volume_ratio(self.displacement) > _CROWDED
+        self._tangent.linearise(self.displacement.astype(self._dtype), positive=crowded)
         blocks = self._blocks
         turn = contact.curvature(pose, self.surface)
         turn = (turn * contact.push[contact.touched][:, None, None]).astype(self._dtype)
@@ -201,25 +204,17 @@ class Newton:
             smallest = self.tissue.smallest_volume_ratio(self.displacement)
             if not smallest > 0.0 and inverted is None:
                 inverted = self.tissue.inverted(before.displacement)
-            if smallest > 0.0 or self.tissue.inverted(self.displacement) < (inverted or 0):
+            if smallest > 0.0 or inverted:
                 self._weigh()
                 if self.imbalance < before.imbalance:
                     return True
                 if energy is None:
                     energy = self.tissue.energy(before.displacement)
-                if self._descends(before, length * change, energy):
+                if self.tissue.energy(self.displacement) < energy:
                     return True
             length /= 2
         self.restore(before)
         return False
-
-    def _descends(self, before: _Snapshot, change: NDArray[np.float64], energy: float) -> bool:
-        if not self.contact.forward:
-            return self.tissue.energy(self.displacement) < energy
-        # A push that is not along the surface's normal does work as nodes slide, and there is no
-        # energy to make least: the steps do so for nodes held where they are, again and again.
-        slid = self.tissue.energy(before.displacement + change) < energy
-        return slid and self.imbalance < _SLIDE * before.imbalance
 
     def _hold(self, pose: Pose, retreat: float) -> None:
         surface = self.surface

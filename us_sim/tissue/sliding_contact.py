@@ -52,12 +52,14 @@ class SlidingContact:
         self.gap = np.full(count, np.inf)  # (C,) m
         self.normal = np.zeros((count, 3))  # (C, 3), direction in which the probe pushes
         self.push = np.zeros(count)  # (C,) N, of the probe along the normal, negative when it pulls
+        self._height: NDArray[np.float64] | None = None  # (C,) m along the normal, of the surface
 
     def copy(self) -> SlidingContact:
         """A snapshot to come back to."""
         other = SlidingContact(self._collider, self._spacing)
         other.touched, other.gap = self.touched.copy(), self.gap.copy()
         other.normal, other.push = self.normal.copy(), self.push.copy()
+        other._height = self._height  # is replaced, never changed
         return other
 
     def look(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
@@ -68,10 +70,25 @@ class SlidingContact:
             retreat: m, by which all gaps are taken to be wider than they are.
             positions: m, frame ``patient``.
         """
+        if self._height is not None:
+            self.gap = np.einsum("ij,ij->i", positions, self.normal) - self._height
+            return
         margin = np.where(self.touched, _SKIRT * self._spacing, 0.0)
         gap, self.normal = push_out(self._collider, pose, positions, self._spacing, margin)
         self.gap = gap + retreat
         self.touched &= np.isfinite(gap)
+
+    def aim(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
+        """As `look`, and fix how far the probe pushes if it does so along one direction.
+
+        At its rounding the surface that a node meets changes as the node slides, though the push is
+        not along the surface's normal: it has no energy. Fixed where nodes are now, it has one, and
+        can neither grow nor take on others, until the next aim, while that is made least.
+        """
+        self._height = None
+        self.look(pose, retreat, positions)
+        if self.forward:
+            self._height = np.einsum("ij,ij->i", positions, self.normal) - self.gap
 
     def hold(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
         """Add the nodes that the probe has entered, and move all touched ones onto it, in place."""
