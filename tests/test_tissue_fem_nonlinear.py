@@ -260,6 +260,33 @@ def test_the_same_poses_give_the_same_bytes():
         assert first.deform(pose).nodes.tobytes() == second.deform(pose).nodes.tobytes()
 
 
+def test_a_closing_vein_is_followed_as_a_box_slides_over_it():
+    nodes = (21, 11, 11)
+    mesh = block_mesh(nodes)
+    centres = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    vein = (np.abs(centres[:, 0]) < 0.03) & (np.abs(centres[:, 2] - 0.02) < 0.01)
+    materials = TissueMaterials(
+        np.where(vein, 2e3, 50e3), np.where(vein, 0.1, 0.48), np.full(len(vein), 1000.0)
+    )
+    box = RoundedBox(0.014, 0.046, 0.04, 0.004)  # pushes along one direction: less than two cells
+    model = block(nodes, box, materials=materials)
+    solver = FemNonlinear(model)
+    press = [at(z=0.0005 * frame) for frame in range(41)]
+    slide = [at(x=0.0005 * frame, z=0.02) for frame in range(60)]
+    residuals, smallest, behind = [], 1.0, 0
+    for pose in press + slide:
+        deformation = solver.deform(pose)
+        residuals.append(deformation.residual)
+        smallest = min(smallest, smallest_volume_ratio(model, deformation.nodes))
+        behind += bool(deformation.action)
+    assert 0.0 < smallest < 0.25  # the vein does close
+    assert behind == 0
+    assert np.mean(np.array(residuals) < 0.05) > 0.95
+    assert max(residuals) < 0.5
+    assert settle(solver, slide[-1]).residual < 1e-5
+    np.testing.assert_array_equal(solver.deform(None).nodes, mesh.nodes)
+
+
 def test_stiff_bone_in_soft_tissue_hardly_deforms():
     mesh = block_mesh((20, 10, 10))
     centre = mesh.nodes[mesh.tetrahedra].mean(axis=1)
