@@ -66,7 +66,7 @@ _NEWTON = 6
 # Iterations of a sub-step that others follow, and the residual with which they may.
 _PASSING, _PASSABLE = 4, 0.1
 
-# A sub-step is halved so often before the probe is not followed any further in this frame.
+# A sub-step is halved so often, if need be in later frames, before it is tried in full again.
 _HALVINGS = 4
 
 # Of a prediction that turns tetrahedra inside out, what is tried instead.
@@ -158,6 +158,7 @@ class FemNonlinear(TissueSolver):
         self._followed: Pose | None = None  # the pose that the tissue is at
         self._retreat = 0.0  # m, by which it is still kept off the probe there
         self._taken_over = False
+        self._halvings = 0  # of the next step, as longer ones came out inside out
         self._correction.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
@@ -193,6 +194,7 @@ class FemNonlinear(TissueSolver):
             newton.settle_on(self._followed, self._retreat)
             self._improve(self._followed, self._retreat, effort)
         progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
+        progress |= 0 < self._halvings <= _HALVINGS
         return self._outcome(pose, progress, actions)
 
     def _depth(self, pose: Pose | None, points: NDArray[np.float64]) -> float:
@@ -224,13 +226,15 @@ class FemNonlinear(TissueSolver):
     def _follow(self, pose: Pose) -> int:
         """Step towards the pose as far as the frame's iterations go; returns the steps taken."""
         newton, budget = self._newton, self._most_iterations
-        taken = halvings = 0
+        taken = 0
+        if self._halvings > _HALVINGS:
+            self._halvings = 0
         ordinary = self._steps_to(pose) == 1
         if not ordinary:
             self._correction.forget()
         while (steps := self._steps_to(pose)) and budget > 0:
             assert self._followed is not None
-            share = 0.5**halvings / steps
+            share = 0.5**self._halvings / steps
             target, retreat = between(self._followed, pose, share), self._retreat * (1 - share)
             good = newton.snapshot()
             effort = _Effort(_PASSING, budget - _PREDICTION, _PASSABLE)
@@ -241,16 +245,17 @@ class FemNonlinear(TissueSolver):
             if used < 0:
                 newton.restore(good)
                 self._correction.forget()
-                halvings += 1
-                if halvings > _HALVINGS:
+                self._halvings += 1
+                if self._halvings > _HALVINGS:
                     break
             else:
                 self._followed, self._retreat = target, retreat
+                self._halvings = max(self._halvings - 1, 0)
                 taken += 1
         return taken
 
     def _attempt(self, pose: Pose, retreat: float, effort: _Effort, ordinary: bool) -> int:
-        """One step; how many iterations it took, or -1 when it came out inside out."""
+        """One step; how many iterations it took, less than none when it came out inside out."""
         newton = self._newton
         assert self._followed is not None
         start, touched = newton.displacement.copy(), newton.contact.touched.copy()
