@@ -64,7 +64,9 @@ def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> Aver
     weight = shares.nodal * mesh.volumes / 4
     # Of whatever rounding leaves of a share that ought to be zero, nothing is averaged.
     weight[shares.nodal <= 1e-9 * shares.element] = 0.0
-    capacity = np.bincount(mesh.tetrahedra.ravel(), np.repeat(weight, 4), len(mesh.nodes))
+    capacity: NDArray[np.float64] = np.bincount(
+        mesh.tetrahedra.ravel(), np.repeat(weight, 4), len(mesh.nodes)
+    ).astype(np.float64)
     with_pressure = np.flatnonzero(capacity > 0).astype(np.int32)
     number = np.cumsum(capacity > 0) - 1
     near = np.flatnonzero(weight > 0)
