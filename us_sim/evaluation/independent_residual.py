@@ -18,6 +18,7 @@ the returned nodes, so that what a solver rounds, or leaves out, shows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -72,6 +73,7 @@ class IndependentResidual:
         self._forces = forces
         self._rounding = rounding
         self._heaviest = 0.0
+        self._scale = math.inf  # N, what the last residual referred to
 
     def forget(self) -> None:
         """The solver went back to an earlier state: loads before count no more."""
@@ -100,11 +102,11 @@ class IndependentResidual:
                 load = float(np.linalg.norm(push))
             imbalance = float(np.linalg.norm(unbalanced))
         if load == 0.0 and imbalance <= self._rounding:
-            self._heaviest = 0.0  # at rest
-            return 0.0, 0.0
+            self._heaviest = 0.0  # at rest, or as good as
+            return 0.0, self._rounding / self._scale
         self._heaviest = max(self._heaviest, load) or imbalance
-        reference = load or self._heaviest
-        return imbalance / reference, self._rounding / reference
+        self._scale = load or self._heaviest
+        return imbalance / self._scale, self._rounding / self._scale
 
 
 def hooke_forces(mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array) -> Array:

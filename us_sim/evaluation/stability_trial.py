@@ -158,8 +158,10 @@ def run_trial(
         moved = np.abs(deformation.nodes - model.mesh.nodes).max()
         trial.bounded = trial.bounded and bool(moved <= bound)
         compared = free < 5 or free % 8 == 0 or free == frames - 1
-        if compared and not failed:
-            _compare(trial, deformation.residual, *residual.check(deformation, pose), free < 0)
+        if not failed:
+            checked = residual.check(deformation, pose)  # every frame: loads refer to those before
+            if compared:
+                _compare(trial, deformation.residual, *checked, free < 0)
         if free >= 0:
             away = _from_rest(model, deformation.nodes)
             trial.recovered_mm = 1e3 * away
