@@ -72,6 +72,7 @@ class Fem(TissueSolver):
     """
 
     name: ClassVar[str] = "fem"
+    farthest: ClassVar[float] = 3.0  # held as it is
 
     def __init__(
         self, model: TissueModel, *, contact: str = "frictionless", friction: float = 0.3

@@ -64,6 +64,7 @@ class FemCg(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_cg"
+    farthest: ClassVar[float] = 3.0  # held as it is
 
     def __init__(
         self,

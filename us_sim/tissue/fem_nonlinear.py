@@ -105,6 +105,7 @@ class FemNonlinear(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_nonlinear"
+    farthest: ClassVar[float] = 3.0  # held as it is
 
     def __init__(
         self,

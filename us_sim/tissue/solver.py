@@ -56,9 +56,6 @@ SOLVERS = {
     "msds_implicit": ("us_sim.tissue.msds_implicit", "MsdsImplicit"),
 }
 
-# A node that moved by this many times the mesh's longest side has left the tissue.
-_FARTHEST = 10.0
-
 # Frames in a row that may come to nothing before the tissue is put to rest.
 _PATIENCE = 5
 
@@ -73,12 +70,15 @@ class TissueSolver(ABC):
 
     name: ClassVar[str]
 
+    #: A node that moved by this many times the mesh's longest side has left the tissue.
+    farthest: ClassVar[float] = 10.0
+
     def __init__(self, model: TissueModel) -> None:
         self.model = model
         self._pose: Pose | None = None
         self._settled = True
         self._failures = 0  # frames in a row that came to nothing
-        self._reach = _FARTHEST * float(np.ptp(model.mesh.nodes, axis=0).max())
+        self._reach = self.farthest * float(np.ptp(model.mesh.nodes, axis=0).max())
         self._last = self._resting()
 
     def deform(self, probe_pose: Pose | None) -> Deformation:
