@@ -95,7 +95,10 @@ class TissueDeformer(SceneNode):
             if wanted["compare_with"]:
                 self._tissue.prepare(wanted["compare_with"])
                 if wanted["compare_with"] == wanted["solver"]:
-                    raise SolverError(f"{wanted['solver']} cannot be compared with itself")
+                    raise SolverError(
+                        f"{wanted['solver']} cannot be compared with itself: set compare_with to "
+                        f"another method, or to '', first"
+                    )
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
