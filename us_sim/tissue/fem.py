@@ -47,7 +47,7 @@ __all__ = ["CONTACTS", "Fem"]
 CONTACTS = ("frictionless", "coulomb", "sticking")
 
 # From here on what rounding leaves is computed in every frame.
-_ROUNDING = 3e-6
+_ROUNDING = 1e-5
 
 # How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
