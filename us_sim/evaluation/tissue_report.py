@@ -83,7 +83,7 @@ def write_report(
     }
     files = []
     for name, (title, panels) in pictures.items():
-        plot_errors(panels, title, out / name)
+        plot_errors({words: some for words, some in panels.items() if some}, title, out / name)
         files.append(out / name)
     sizes = [p for p in nonlinear if p.default and p.scene == focus.scene]
     plot_sizes(sizes, f"Cost against size, {SCENES[focus.scene].words}", out / "tissue_size.png")
