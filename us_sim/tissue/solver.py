@@ -30,12 +30,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from us_sim.collider import Sphere
 from us_sim.errors import SolverError
 from us_sim.pose import Pose
 from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.materials import Material, uniform_material
-from us_sim.tissue.mesh import box_mesh
+from us_sim.tissue.materials import TissueMaterials
+from us_sim.tissue.mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
 
 __all__ = [
@@ -145,17 +144,30 @@ class TissueSolver(ABC):
         self._last = replace(self._resting(), nodes=self.model.mesh.nodes + state.displacement)
 
     def warm_up(self) -> None:
-        """Compile the kernels on a tissue of one cell; this solver's own state is not touched."""
-        mesh = box_mesh([-0.01, 0.01], [-0.01, 0.01], [0.0, 0.01])
+        """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
+
+        It is like this one in what decides which kernels are used: a box mesh or another, the
+        highest Poisson's ratio, and how far moduli are apart.
+        """
+        side = np.linspace(-0.01, 0.01, 3)
+        mesh = box_mesh(side, side, side + 0.01)
+        if self.model.mesh.planes is None:
+            mesh = TetrahedralMesh(mesh.nodes, mesh.tetrahedra)
+        own, count = self.model.materials, len(mesh.tetrahedra)
         model = TissueModel(
             mesh,
-            uniform_material(mesh, Material(10e3, 0.3, 1000.0)),
-            mesh.nodes[:, 2] > 0.005,
-            Sphere(0.03),
+            TissueMaterials(
+                np.linspace(own.young_modulus.min(), own.young_modulus.max(), count),
+                np.full(count, own.poisson_ratio.max()),
+                np.full(count, own.density.max()),
+            ),
+            mesh.nodes[:, 2] > 0.015,
+            self.model.collider,
             np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
         )
         solver = type(self)(model)
-        solver.deform(Pose(position=np.array([0.0, 0.0, 0.005])))
+        for depth in (0.002, 0.004, 0.015):
+            solver.deform(Pose(position=np.array([depth, 0.0, depth])))
         solver.deform(None)
 
     @property
