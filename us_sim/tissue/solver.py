@@ -166,7 +166,7 @@ class TissueSolver(ABC):
             np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
         )
         solver = type(self)(model)
-        for depth in (0.002, 0.004, 0.015):
+        for depth in (0.002, 0.004):
             solver.deform(Pose(position=np.array([depth, 0.0, depth])))
         solver.deform(None)
 
