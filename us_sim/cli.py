@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     info.set_defaults(command=_bag_info)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
-    subjects = evaluate.add_subparsers(required=True, metavar="SUBJECT")
+    subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability")
     for subject, text, command in (
         ("tissue", "error of every tissue solver against its run time", _evaluate_tissue),
         ("stability", "what every tissue solver does with extreme cases", _evaluate_stability),
