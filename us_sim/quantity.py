@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-__all__ = ["Quantity"]
+__all__ = ["Quantity", "given"]
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -79,3 +81,8 @@ class Quantity:
             if factor != 1.0 and self.minimum <= number * factor <= self.maximum:
                 return f"; did you mean '{number:g} {unit}'?"
         return ""
+
+
+def given(quantity: Quantity | None = None, *, choices: Sequence[str] = (), **kwargs: Any) -> Any:
+    """A dataclass field that a scene may set, with the check its value must pass."""
+    return field(metadata={"quantity": quantity, "choices": tuple(choices)}, **kwargs)

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from us_sim.quantity import Quantity
+from us_sim.quantity import Quantity, given
+from us_sim.slicing.imaging import Imaging
 
 __all__ = [
     "ColliderSection",
@@ -30,19 +31,12 @@ __all__ = [
 _POSITION = Quantity("length", -10.0, 10.0)
 
 
-def _given(
-    quantity: Quantity | None = None, *, choices: tuple[str, ...] = (), **kwargs: Any
-) -> Any:
-    """A dataclass field that the scene may set, with the check its value must pass."""
-    return field(metadata={"quantity": quantity, "choices": choices}, **kwargs)
-
-
 @dataclass(frozen=True)
 class PoseSection:
     """Where the volume's own frame lies in ``patient``: position m, orientation x, y, z, w."""
 
-    position: tuple[float, float, float] = _given(_POSITION, default=(0.0, 0.0, 0.0))
-    orientation: tuple[float, float, float, float] = _given(
+    position: tuple[float, float, float] = given(_POSITION, default=(0.0, 0.0, 0.0))
+    orientation: tuple[float, float, float, float] = given(
         Quantity("number", -1.0, 1.0), default=(0.0, 0.0, 0.0, 1.0)
     )
 
@@ -51,20 +45,20 @@ class PoseSection:
 class VolumeSection:
     """The ultrasound volume: a file, or a procedural phantom made from a seed."""
 
-    file: str | None = _given(default=None)
-    phantom: str | None = _given(default=None, choices=("upper_arm",))
-    seed: int = _given(Quantity("number", 0, 2**31), default=1)
-    voxel_size: float = _given(Quantity("length", 2e-4, 5e-3), default=0.3e-3)
-    pose: PoseSection = _given(default=PoseSection())
+    file: str | None = given(default=None)
+    phantom: str | None = given(default=None, choices=("upper_arm",))
+    seed: int = given(Quantity("number", 0, 2**31), default=1)
+    voxel_size: float = given(Quantity("length", 2e-4, 5e-3), default=0.3e-3)
+    pose: PoseSection = given(default=PoseSection())
 
 
 @dataclass(frozen=True)
 class MaterialSection:
     """An isotropic elastic material."""
 
-    young_modulus: float = _given(Quantity("pressure", 1.0, 1e12))
-    poisson_ratio: float = _given(Quantity("number", 0.0, 0.4999), default=0.45)
-    density: float = _given(Quantity("density", 1.0, 1e5), default=1000.0)
+    young_modulus: float = given(Quantity("pressure", 1.0, 1e12))
+    poisson_ratio: float = given(Quantity("number", 0.0, 0.4999), default=0.45)
+    density: float = given(Quantity("density", 1.0, 1e5), default=1000.0)
 
 
 @dataclass(frozen=True)
@@ -78,28 +72,28 @@ class MeshSection:
     face (a twentieth of the size along that axis where it is not given).
     """
 
-    lower: tuple[float, float, float] | None = _given(_POSITION, default=None)
-    upper: tuple[float, float, float] | None = _given(_POSITION, default=None)
-    nodes: tuple[int, int, int] = _given(Quantity("number", 2, 400), default=(20, 10, 10))
-    planes: dict[str, tuple[float, ...]] = _given(_POSITION, default_factory=dict)
-    file: str | None = _given(default=None)
-    unit: float = _given(Quantity("length", 1e-9, 1e3), default=1.0)
-    pose: PoseSection = _given(default=PoseSection())
-    margin: float | None = _given(Quantity("length", 1e-6, 1.0), default=None)
+    lower: tuple[float, float, float] | None = given(_POSITION, default=None)
+    upper: tuple[float, float, float] | None = given(_POSITION, default=None)
+    nodes: tuple[int, int, int] = given(Quantity("number", 2, 400), default=(20, 10, 10))
+    planes: dict[str, tuple[float, ...]] = given(_POSITION, default_factory=dict)
+    file: str | None = given(default=None)
+    unit: float = given(Quantity("length", 1e-9, 1e3), default=1.0)
+    pose: PoseSection = given(default=PoseSection())
+    margin: float | None = given(Quantity("length", 1e-6, 1.0), default=None)
 
 
 @dataclass(frozen=True)
 class TissueSection:
     """The deformable block, its materials by label name, and the solver that deforms it."""
 
-    mesh: MeshSection = _given()
-    materials: dict[str, MaterialSection] = _given()
-    fixed: tuple[str, ...] = _given(default=("bottom",))
-    solver: str = _given(
+    mesh: MeshSection = given()
+    materials: dict[str, MaterialSection] = given()
+    fixed: tuple[str, ...] = given(default=("bottom",))
+    solver: str = given(
         default="fem",
         choices=("fem", "fem_nonlinear", "fem_cg", "msds", "msds_implicit"),
     )
-    settings: dict[str, dict[str, Any]] = _given(default_factory=dict)
+    settings: dict[str, dict[str, Any]] = given(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -110,64 +104,66 @@ class StructureSection:
     with its own frame at ``pose`` in ``patient``. ``colour`` is red, green, blue.
     """
 
-    label: str | None = _given(default=None)
-    file: str | None = _given(default=None)
-    unit: float = _given(Quantity("length", 1e-9, 1e3), default=1.0)
-    pose: PoseSection = _given(default=PoseSection())
-    colour: tuple[float, float, float] | None = _given(Quantity("number", 0.0, 1.0), default=None)
+    label: str | None = given(default=None)
+    file: str | None = given(default=None)
+    unit: float = given(Quantity("length", 1e-9, 1e3), default=1.0)
+    pose: PoseSection = given(default=PoseSection())
+    colour: tuple[float, float, float] | None = given(Quantity("number", 0.0, 1.0), default=None)
 
 
 @dataclass(frozen=True)
 class SkinSection:
     """The skin membrane: a surface file, or a sheet bent down on both sides of a flat part."""
 
-    file: str | None = _given(default=None)
-    size: tuple[float, float] = _given(Quantity("length", 0.01, 2.0), default=(0.2, 0.2))
-    spacing: float = _given(Quantity("length", 5e-4, 0.05), default=4e-3)
-    flat_width: float = _given(Quantity("length", 0.0, 2.0), default=2.0)
-    radius: float = _given(Quantity("length", 5e-3, 10.0), default=0.05)
-    stiffness: float = _given(Quantity("stiffness", 1e-6, 1e9), default=40.0)
-    anchor_stiffness: float = _given(Quantity("stiffness", 1e-6, 1e9), default=4.0)
-    density: float = _given(Quantity("mass per area", 1e-6, 1e6), default=2.0)
+    file: str | None = given(default=None)
+    size: tuple[float, float] = given(Quantity("length", 0.01, 2.0), default=(0.2, 0.2))
+    spacing: float = given(Quantity("length", 5e-4, 0.05), default=4e-3)
+    flat_width: float = given(Quantity("length", 0.0, 2.0), default=2.0)
+    radius: float = given(Quantity("length", 5e-3, 10.0), default=0.05)
+    stiffness: float = given(Quantity("stiffness", 1e-6, 1e9), default=40.0)
+    anchor_stiffness: float = given(Quantity("stiffness", 1e-6, 1e9), default=4.0)
+    density: float = given(Quantity("mass per area", 1e-6, 1e6), default=2.0)
 
 
 @dataclass(frozen=True)
 class ColliderSection:
     """The probe's shape that pushes tissue and skin."""
 
-    shape: str = _given(choices=("sphere", "capsule", "rounded_box"))
-    radius: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
-    length: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
-    width: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
-    height: float | None = _given(Quantity("length", 1e-4, 0.5), default=None)
-    rounding: float | None = _given(Quantity("length", 1e-5, 0.25), default=None)
+    shape: str = given(choices=("sphere", "capsule", "rounded_box"))
+    radius: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
+    length: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
+    width: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
+    height: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
+    rounding: float | None = given(Quantity("length", 1e-5, 0.25), default=None)
 
 
 @dataclass(frozen=True)
 class ProbeSection:
     """The transducer: what it images, and the shape that presses."""
 
-    aperture: float = _given(Quantity("length", 5e-3, 0.2))
-    depth: float = _given(Quantity("length", 5e-3, 0.4))
-    geometry: str = _given(default="linear", choices=("linear",))
-    image: tuple[int, int] = _given(Quantity("number", 1, 4096), default=(512, 512))
-    collider: ColliderSection | None = _given(default=None)
+    aperture: float = given(Quantity("length", 5e-3, 0.2))
+    depth: float = given(Quantity("length", 5e-3, 0.4))
+    geometry: str = given(default="linear", choices=("linear",))
+    image: tuple[int, int] = given(Quantity("number", 1, 4096), default=(512, 512))
+    collider: ColliderSection | None = given(default=None)
 
 
 @dataclass(frozen=True)
 class SliceSection:
     """How the image is cut."""
 
-    method: str = _given(default="row_subdivision", choices=("row_subdivision",))
-    regions: int = _given(Quantity("number", 1, 4096), default=32)
+    method: str = given(
+        default="scan_conversion", choices=("scan_conversion", "row_subdivision", "per_pixel")
+    )
+    regions: int = given(Quantity("number", 1, 4096), default=32)
 
 
 @dataclass(frozen=True)
 class TrackerSection:
     """Where probe poses come from."""
 
-    source: str = _given(default="pose", choices=("pose",))
-    frame: str = _given(default="patient")
+    source: str = given(default="pose", choices=("pose",))
+    frame: str = given(default="patient")
 
 
 @dataclass(frozen=True)
@@ -183,16 +179,17 @@ class Part:
 class Scene:
     """A whole scene. Only ``volume`` and ``probe`` must be there."""
 
-    name: str = _given()
-    volume: VolumeSection = _given()
-    probe: ProbeSection = _given()
-    tissue: TissueSection | None = _given(default=None)
-    structures: dict[str, StructureSection] = _given(default_factory=dict)
-    skin: SkinSection | None = _given(default=None)
-    slice: SliceSection = _given(default=SliceSection())
-    tracker: TrackerSection = _given(default=TrackerSection())
-    path: str | None = _given(default=None)
-    description: str = _given(default="")
+    name: str = given()
+    volume: VolumeSection = given()
+    probe: ProbeSection = given()
+    tissue: TissueSection | None = given(default=None)
+    structures: dict[str, StructureSection] = given(default_factory=dict)
+    skin: SkinSection | None = given(default=None)
+    slice: SliceSection = given(default=SliceSection())
+    imaging: Imaging = given(default=Imaging())
+    tracker: TrackerSection = given(default=TrackerSection())
+    path: str | None = given(default=None)
+    description: str = given(default="")
     origin: str = "scene"
 
     def parts(self) -> list[Part]:

@@ -151,6 +151,10 @@ def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:
         if kind is int and number != int(number):
             raise SceneError(f"{at}{value!r} is not a whole number")
         return kind(number)
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise SceneError(f"{at}must be true or false, not {value!r}")
+        return value
     if kind is str:
         if not isinstance(value, str) or not value:
             raise SceneError(f"{at}must be a text, not {value!r}")

@@ -31,6 +31,10 @@ class SlicePlane:
 
     Every probe whose image is a flat grid of pixels gives one of these, whatever its beams.
 
+    Args:
+        spans: for an image that does not fill its grid, as a fan: up to two half-open runs of
+            columns of each row that show something; the rest is black.
+
     Raises:
         ProbeError: a number is not finite, the two steps are parallel or zero, or the grid has
             no pixel or more than 4096 a side.
@@ -41,6 +45,7 @@ class SlicePlane:
     row_step: NDArray[np.float64]  # (3,) m, from one row to the next
     columns: int
     rows: int
+    spans: NDArray[np.int32] | None = None  # (rows, 2, 2): first and end column of two runs
 
     def __post_init__(self) -> None:
         for name in ("origin", "column_step", "row_step"):
@@ -71,6 +76,14 @@ class SlicePlane:
         """(3, 4) affine map from a position (m) to column, row and height above the plane."""
         inverse = np.linalg.inv(self.basis)
         return np.ascontiguousarray(np.column_stack([inverse, -inverse @ self.origin]))
+
+    def is_shown(self) -> NDArray[np.bool_]:
+        """(rows, columns): which pixels show something."""
+        if self.spans is None:
+            return np.ones((self.rows, self.columns), dtype=np.bool_)
+        column = np.arange(self.columns)[None, :]
+        first, end = self.spans[:, :, 0, None], self.spans[:, :, 1, None]
+        return np.asarray(((column[:, None] >= first) & (column[:, None] < end)).any(axis=1))
 
     def pixels(self) -> NDArray[np.float64]:
         """(rows, columns, 3) m: the position of every pixel centre."""
