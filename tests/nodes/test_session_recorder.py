@@ -56,17 +56,18 @@ def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
     assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
 
 
-def test_structures_are_recorded_only_by_name(bench, tmp_path):
-    structures = bench.peer.create_publisher(String, "tissue/structures", 10)
+@pytest.mark.parametrize("topic", ["tissue/structures", "ultrasound/image_annotated"])
+def test_what_is_for_the_eye_is_recorded_only_by_name(bench, tmp_path, topic):
+    shown = bench.peer.create_publisher(String, topic, 10)
     other = bench.peer.create_publisher(String, "tissue/nodes", 10)
     bench.make(SessionRecorder, file=str(tmp_path / "all.mcap"))
     bench.spin_until(lambda: other.get_subscription_count() > 0)
     bench.spin_for(30)
-    assert structures.get_subscription_count() == 0
+    assert shown.get_subscription_count() == 0
     named = tmp_path / "named" / "one.mcap"
     named.parent.mkdir()
-    bench.make(SessionRecorder, file=str(named), topics=["/tissue/structures"])
-    bench.spin_until(lambda: structures.get_subscription_count() > 0)
+    bench.make(SessionRecorder, file=str(named), topics=[f"/{topic}"])
+    bench.spin_until(lambda: shown.get_subscription_count() > 0)
 
 
 def test_a_recording_is_not_overwritten(bench, tmp_path):

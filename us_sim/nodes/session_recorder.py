@@ -19,6 +19,8 @@ from us_sim.recording.writer import BagWriter
 __all__ = ["SessionRecorder", "main"]
 
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
+FOR_THE_EYE = ("tissue/structures", "ultrasound/image_annotated")
+"""What is not computed either where only a recorder would want it."""
 QUEUE = 1000
 """Messages a topic may be ahead of the disk."""
 
@@ -27,8 +29,8 @@ class SessionRecorder(Node):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
     Parameters: ``file`` (.mcap), ``compression`` (none or zstd), ``topics`` (full names; empty:
-    all), ``exclude``. The surfaces of ``tissue/structures`` are recorded only where ``topics``
-    names them: they are large, and follow from ``tissue/nodes``.
+    all), ``exclude``. ``tissue/structures`` and ``ultrasound/image_annotated`` are recorded only
+    where ``topics`` names them: they are large, and follow from the other topics.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -37,7 +39,7 @@ class SessionRecorder(Node):
         compression = fixed_parameter(self, "compression", "none", "none or zstd")
         self._topics = {t for t in fixed_parameter(self, "topics", [""], "topics; empty: all") if t}
         self._excluded = {*fixed_parameter(self, "exclude", [""], "left out"), *NOT_THE_SESSION}
-        self._excluded |= {self.resolve_topic_name("tissue/structures")} - self._topics
+        self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._topics
         self._refused: set[str] = set()
         self._subscribed: set[str] = set()
         taken = Path(file).with_name("metadata.yaml").exists()
