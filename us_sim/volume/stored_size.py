@@ -25,7 +25,7 @@ from typing import BinaryIO
 
 from us_sim.errors import VolumeError
 
-__all__ = ["check_stored_size"]
+__all__ = ["check_stored_size", "metaimage_header"]
 
 # MetaImage's element types and their bytes (MetaIO, metaTypes.h).
 _ELEMENT_BYTES = {
@@ -71,7 +71,7 @@ def check_stored_size(path: Path) -> None:
 
 
 def _check_metaimage(path: Path) -> None:
-    fields, header_bytes = _metaimage_header(path)
+    fields, header_bytes = metaimage_header(path)
     try:
         size = [int(length) for length in fields["DimSize"].split()]
         element = _ELEMENT_BYTES[fields["ElementType"]]
@@ -97,7 +97,7 @@ def _check_metaimage(path: Path) -> None:
     _compare(path, stored, expected)
 
 
-def _metaimage_header(path: Path) -> tuple[dict[str, str], int]:
+def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     """The fields of a MetaImage header, and the bytes it takes; ElementDataFile ends it."""
     fields: dict[str, str] = {}
     with path.open("rb") as file:
