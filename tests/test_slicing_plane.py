@@ -37,10 +37,10 @@ def test_to_pixel_undoes_pixels():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"aperture": 0.004}, "aperture is 0.004 m: give 5 to 200 mm"),
-        ({"aperture": float("nan")}, "aperture is nan"),
-        ({"depth": 0.5}, "depth is 0.5 m: give 5 to 400 mm"),
-        ({"depth": "deep"}, "depth is 'deep'"),
+        ({"aperture": 0.004}, "probe.aperture: 0.004 m is outside 0.005 to 0.2 m"),
+        ({"aperture": float("nan")}, "probe.aperture: nan is not finite"),
+        ({"depth": 0.5}, "probe.depth: 0.5 m is outside 0.005 to 0.4 m"),
+        ({"depth": "deep"}, "probe.depth: 'deep' is not a length"),
         ({"columns": 0}, "0 columns"),
         ({"rows": 4097}, "4097 rows"),
         ({"rows": 2.5}, "2.5 rows"),
