@@ -21,7 +21,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh_check import EDGES, FACES, check_mesh, face_order, signed_volumes
+from us_sim.tissue.mesh_check import (
+    EDGES,
+    boundary_faces,
+    boundary_triangles,
+    check_mesh,
+    signed_volumes,
+)
 
 __all__ = ["TetrahedralMesh", "box_mesh", "uniform_planes"]
 
@@ -73,18 +79,12 @@ class TetrahedralMesh:
     @cached_property
     def boundary(self) -> NDArray[np.int32]:
         """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
-        return self.tetrahedra[:, FACES].reshape(-1, 3)[self._boundary_faces]
+        return boundary_triangles(self.tetrahedra)
 
     @cached_property
     def boundary_tetrahedra(self) -> NDArray[np.int32]:
         """(F,) the tetrahedron that each triangle of the boundary belongs to."""
-        return (self._boundary_faces // 4).astype(np.int32)
-
-    @cached_property
-    def _boundary_faces(self) -> NDArray[np.intp]:
-        """(F,) face f of tetrahedron t has the number 4 t + f."""
-        order, starts, counts = face_order(self.tetrahedra)
-        return np.sort(order[starts[counts == 1]])
+        return (boundary_faces(self.tetrahedra) // 4).astype(np.int32)
 
     @cached_property
     def parts(self) -> NDArray[np.int32]:

@@ -25,6 +25,8 @@ __all__ = [
     "EDGES",
     "FACES",
     "MOST_NODES",
+    "boundary_faces",
+    "boundary_triangles",
     "check_arrays",
     "check_mesh",
     "face_order",
@@ -137,6 +139,18 @@ def face_order(
     keys = keys[order]
     starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
     return order, starts, np.diff(np.append(starts, len(keys)))
+
+
+def boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
+    """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
+    faces = tetrahedra[:, FACES].reshape(-1, 3)[boundary_faces(tetrahedra)]
+    return np.ascontiguousarray(faces, dtype=np.int32)
+
+
+def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
+    """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
+    order, starts, counts = face_order(tetrahedra)
+    return np.sort(order[starts[counts == 1]])
 
 
 def _check_places(nodes: NDArray[np.float64]) -> None:
