@@ -50,6 +50,15 @@ def test_extent_encloses_the_voxels_faces():
     np.testing.assert_allclose(Volume(GREY, matrix).extent, expected, atol=1e-12)
 
 
+def test_one_voxel_is_a_volume_with_faces_half_a_step_around_its_centre():
+    matrix = np.diag([2e-3, 1e-3, 4e-3, 1.0])
+    matrix[:3, 3] = 0.1
+    volume = Volume(GREY[:1, :1, :1], matrix)
+    assert volume.shape == (1, 1, 1)
+    expected = [[0.099, 0.0995, 0.098], [0.101, 0.1005, 0.102]]
+    np.testing.assert_allclose(volume.extent, expected, atol=1e-12)
+
+
 def test_arrays_are_read_only_views_and_the_callers_stay_writable():
     grey = GREY.copy()
     volume = Volume(grey, MILLIMETRES, labels=GREY)
@@ -78,7 +87,7 @@ def test_replacing_the_placement_replaces_its_inverse():
     [
         ({"intensities": GREY.astype(np.int16)}, "uint8 array, not 3-dimensional int16"),
         ({"intensities": GREY[0]}, "not 2-dimensional"),
-        ({"intensities": GREY[:, :1]}, "two voxels or more"),
+        ({"intensities": GREY[:, :0]}, "a voxel or more along each axis"),
         ({"labels": GREY[:, :, :5]}, "must have the same shape"),
         ({"labels": GREY.astype(float)}, "the labels of a volume must be"),
         ({"index_to_patient": np.eye(3)}, "finite 4×4"),

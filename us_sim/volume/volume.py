@@ -38,7 +38,7 @@ class Volume:
 
     Raises:
         VolumeError: an array is not three-dimensional uint8, the two shapes differ, an axis has
-            fewer than two voxels, or the affine is not finite or not invertible.
+            no voxel, or the affine is not finite or not invertible.
     """
 
     intensities: NDArray[np.uint8]  # (i, j, k)
@@ -89,10 +89,9 @@ def _voxels(array: NDArray[np.uint8], what: str) -> NDArray[np.uint8]:
             f"the {what} of a volume must be a three-dimensional uint8 array, "
             f"not {array.ndim}-dimensional {array.dtype}"
         )
-    if min(array.shape) < 2:
+    if not array.size:
         raise VolumeError(
-            f"the {what} have shape {array.shape}; a volume needs two voxels or more along "
-            f"each axis"
+            f"the {what} have shape {array.shape}; a volume needs a voxel or more along each axis"
         )
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
