@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError, SceneError
+from us_sim.errors import BagError, ProbeError, SceneError
 from us_sim.pose import Pose
 from us_sim.scene import PoseSection, Scene, TissueSection
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from us_sim.collider import Collider
     from us_sim.recording.path import ProbePath
     from us_sim.skin.membrane import SkinMembrane
-    from us_sim.slicing.probe import LinearProbe
+    from us_sim.slicing.probe import Probe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
     from us_sim.volume.volume import Volume
@@ -81,21 +81,42 @@ def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
     return path
 
 
-def probe_of(scene: Scene) -> LinearProbe:
-    """The transducer that images."""
+def probe_of(scene: Scene) -> Probe:
+    """The transducer that images.
+
+    Raises:
+        SceneError: a key of its geometry is missing, one is given that it does not have, or values
+            do not go together.
+    """
+    from us_sim.slicing.fan_probe import ConvexProbe, SectorProbe
     from us_sim.slicing.probe import LinearProbe
 
-    columns, rows = scene.probe.image
-    return LinearProbe(
-        aperture=scene.probe.aperture, depth=scene.probe.depth, columns=columns, rows=rows
-    )
+    section = scene.probe
+    geometries: dict[str, Any] = {
+        "linear": LinearProbe,
+        "convex": ConvexProbe,
+        "sector": SectorProbe,
+    }
+    geometry = geometries[section.geometry]
+    given = {f.name: getattr(section, f.name) for f in dataclasses.fields(section)}
+    image = given.pop("image") or ((512, 512) if section.geometry == "linear" else 512)
+    del given["collider"]
+    kind = f"{given.pop('geometry')} probe"
+    given = _keys_of(geometry, given, f"{scene.origin}: probe", kind, ("columns", "rows"))
+    try:
+        if isinstance(image, int):
+            return geometry.with_square_pixels(image, **given)
+        return geometry(columns=image[0], rows=image[1], **given)
+    except ProbeError as error:
+        raise SceneError(f"{scene.origin}: {error}") from error
 
 
 def collider_of(scene: Scene) -> Collider:
     """The probe's shape that presses.
 
     Raises:
-        SceneError: a dimension of that shape is missing, or one is given that it does not have.
+        SceneError: a dimension of that shape is missing, one is given that it does not have, or
+            they do not go together.
     """
     from us_sim import collider
 
@@ -107,22 +128,37 @@ def collider_of(scene: Scene) -> Collider:
         "capsule": collider.Capsule,
         "rounded_box": collider.RoundedBox,
     }
-    shape = shapes[section.shape]
-    needed = [f.name for f in dataclasses.fields(shape)]
-    given = {k: v for k, v in dataclasses.asdict(section).items() if k != "shape" and v is not None}
+    given = dataclasses.asdict(section)
+    name = given.pop("shape")
+    given = _keys_of(shapes[name], given, f"{scene.origin}: probe.collider", name)
+    try:
+        return shapes[name](**given)
+    except ProbeError as error:
+        raise SceneError(f"{scene.origin}: probe.collider: {error}") from error
+
+
+def _keys_of(
+    made: Any, values: dict[str, Any], at: str, kind: str, apart: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """The values that are given, which are to be fields of the dataclass ``made``.
+
+    Args:
+        made: whose fields without a default must be given, but for those named in ``apart``.
+        values: by key, None where the scene does not give one.
+        at: the section in the scene.
+        kind: what is made, for a person.
+    """
+    fields = [f for f in dataclasses.fields(made) if f.name not in apart]
+    needed = [f.name for f in fields if f.default is dataclasses.MISSING]
+    known = [f.name for f in fields]
+    given = {name: value for name, value in values.items() if value is not None}
     for name in needed:
         if name not in given:
-            raise SceneError(
-                f"{scene.origin}: probe.collider.{name}: is missing; a {section.shape} needs "
-                f"{', '.join(needed)}"
-            )
+            raise SceneError(f"{at}.{name}: is missing; a {kind} needs {', '.join(needed)}")
     for name in given:
-        if name not in needed:
-            raise SceneError(
-                f"{scene.origin}: probe.collider.{name}: a {section.shape} has no {name}; it has "
-                f"{', '.join(needed)}"
-            )
-    return shape(**given)
+        if name not in known:
+            raise SceneError(f"{at}.{name}: a {kind} has no {name}; it has {', '.join(known)}")
+    return given
 
 
 def tissue_model_of(

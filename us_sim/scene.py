@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,12 +140,25 @@ class ColliderSection:
 
 @dataclass(frozen=True)
 class ProbeSection:
-    """The transducer: what it images, and the shape that presses."""
+    """The transducer: its geometry, what it images, and the shape that presses.
 
-    aperture: float = given(Quantity("length", 5e-3, 0.2))
+    A linear array has an ``aperture``, a convex one the ``radius`` of its face and an
+    ``opening_angle``, a sector (phased array) ``aperture`` and ``opening_angle``, and a ``radius``
+    if its beams radiate from an apex behind the face. ``image`` is [columns, rows], or the number
+    of rows of square pixels; not given it is [512, 512] of a linear array, else 512.
+    """
+
     depth: float = given(Quantity("length", 5e-3, 0.4))
-    geometry: str = given(default="linear", choices=("linear",))
-    image: tuple[int, int] = given(Quantity("number", 1, 4096), default=(512, 512))
+    geometry: str = given(default="linear", choices=("linear", "convex", "sector"))
+    aperture: float | None = given(Quantity("length", 3e-3, 0.2), default=None)
+    radius: float | None = given(Quantity("length", 0.0, 0.3), default=None)
+    opening_angle: float | None = given(
+        Quantity("angle", math.radians(1), math.radians(180)), default=None
+    )
+    focus: float | None = given(Quantity("length", 1e-3, 0.4), default=None)
+    lines: int | None = given(Quantity("number", 1, 4096), default=None)
+    samples: int | None = given(Quantity("number", 1, 16384), default=None)
+    image: tuple[int, int] | int | None = given(Quantity("number", 1, 4096), default=None)
     collider: ColliderSection | None = given(default=None)
 
 

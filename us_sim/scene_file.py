@@ -19,6 +19,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
+from us_sim.assembly import probe_of
 from us_sim.errors import SceneError
 from us_sim.quantity import Quantity
 from us_sim.scene import PoseSection, Scene, TissueSection, VolumeSection
@@ -80,6 +81,7 @@ def parse_scene(document: object, *, origin: str = "scene", folder: Path | None 
     scene: Scene = _build(Scene, _with_named_structures(document), origin, "")
     scene = dataclasses.replace(scene, origin=origin)
     _check_volume(scene.volume, origin)
+    probe_of(scene)
     if scene.tissue is not None:
         _check_tissue(scene, scene.tissue, origin)
     _check_structures(scene, origin)
@@ -132,7 +134,9 @@ def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:
     if get_origin(kind) in (Union, UnionType):
         if value is None:
             return None
-        kind = next(option for option in get_args(kind) if option is not type(None))
+        options = [option for option in get_args(kind) if option is not type(None)]
+        fitting = (o for o in options if (get_origin(o) is tuple) == isinstance(value, list))
+        kind = next(fitting, options[0])
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return _build(kind, value, origin, key)
     if get_origin(kind) is tuple:

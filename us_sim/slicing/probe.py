@@ -202,7 +202,10 @@ class Probe(ABC):
             except ValueError as error:
                 raise ProbeError(f"probe.{field.name}: {error}") from error
             object.__setattr__(self, field.name, int(number) if field.type == "int" else number)
-        require_pixel_counts(self.columns, self.rows)
+        try:
+            require_pixel_counts(self.columns, self.rows)
+        except ProbeError as error:
+            raise ProbeError(f"probe.image: {error}") from error
 
 
 @dataclass(frozen=True)
