@@ -125,7 +125,7 @@ def test_row_subdivision_equals_a_search_of_every_pixel(seed, strength, regions,
         nodes = mesh.nodes + (nodes - mesh.nodes) * 0.3
     pose = Pose(rng.uniform(-0.5, 0.5, 3) * SIZE, rng.normal(size=4))
     plane = LinearProbe(rng.uniform(0.01, 0.12), rng.uniform(0.01, 0.12), *shape).plane(pose)
-    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, regions)
+    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, regions=regions)
     np.testing.assert_allclose(
         slicer.rest_coordinates(nodes, plane), expected_rest(mesh, nodes, plane), atol=1e-9
     )
@@ -253,7 +253,9 @@ def test_threads_and_regions_do_not_change_a_byte():
     plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
     nodes = pressed(mesh)
     images = [
-        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions, threads).image(nodes, plane)
+        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions=regions, threads=threads).image(
+            nodes, plane
+        )
         for regions, threads in ((32, 1), (32, 2), (32, 3), (7, 2), (1, 4))
     ]
     for image in images[1:]:

@@ -26,10 +26,10 @@ from numba import njit
 
 from us_sim.slicing.section import INSIDE, row_span
 
-__all__ = ["MOVED_AWAY", "cells", "leave_black", "subdivide_rows"]
+__all__ = ["BLACK", "cells", "leave_black", "subdivide_rows"]
 
-MOVED_AWAY = -1
-"""The element of a pixel outside the deformed mesh that the mesh covers at rest."""
+BLACK = -1
+"""The element of a pixel that shows nothing, as where tissue moved away."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -205,4 +205,4 @@ def leave_black(barycentric, bounds, none, outside, elements):
                 low, high = row_span(barycentric, e, row, 0, columns - 1)
                 for i in range(low, high + 1):
                     if elements[row, i] == none:
-                        elements[row, i] = MOVED_AWAY
+                        elements[row, i] = BLACK

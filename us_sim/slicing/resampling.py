@@ -27,10 +27,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.slicing.location import BLACK
 from us_sim.slicing.plane import SlicePlane
+from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.trilinear import inside_volume, sample_linear
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from us_sim.volume.volume import Volume
 
 __all__ = [
@@ -43,24 +47,21 @@ __all__ = [
 ]
 
 
-def sample_plane(volume: Volume, plane: SlicePlane) -> NDArray[np.uint8]:
-    """The image (rows, columns) on a plane through the volume as it is, without tissue."""
-    image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
-    maps, elements = _one_rigid_map(volume, plane)
-    sample_linear(*voxels_of(volume.intensities), maps, elements, 0, plane.rows, image)
-    return image
+def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
+    """The image (rows, columns) on a plane through the volume as it is, without tissue.
+
+    It does not depend on the number of threads that share its rows.
+    """
+    return _sample(sample_linear, *voxels_of(volume.intensities), volume, plane, threads)
 
 
-def sample_labels(volume: Volume, plane: SlicePlane) -> NDArray[np.uint8]:
+def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
     """The label image (rows, columns) on a plane through the volume as it is.
 
     Raises:
         VolumeError: the volume has no labels.
     """
-    image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
-    maps, elements = _one_rigid_map(volume, plane)
-    sample_nearest(*label_voxels(volume), maps, elements, 0, plane.rows, image)
-    return image
+    return _sample(sample_nearest, *label_voxels(volume), volume, plane, threads)
 
 
 def pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
@@ -91,11 +92,21 @@ def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     return voxels_of(volume.labels)
 
 
-def _one_rigid_map(
-    volume: Volume, plane: SlicePlane
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _sample(
+    kernel: Callable[..., None],
+    voxels: NDArray[np.uint8],
+    shape: NDArray[np.int64],
+    volume: Volume,
+    plane: SlicePlane,
+    threads: int,
+) -> NDArray[np.uint8]:
+    maps = pixel_to_index(volume, plane)[None]
     elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
-    return pixel_to_index(volume, plane)[None], elements
+    if plane.spans is not None:
+        elements[~plane.is_shown()] = BLACK
+    image = np.empty(elements.shape, dtype=np.uint8)
+    share_rows(threads, plane.rows, lambda a, b: kernel(voxels, shape, maps, elements, a, b, image))
+    return image
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -29,14 +29,13 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.pose import Pose
-from us_sim.slicing.location import MOVED_AWAY, cells, leave_black, subdivide_rows
+from us_sim.slicing.location import BLACK, cells, leave_black, subdivide_rows
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import (
@@ -45,7 +44,9 @@ from us_sim.slicing.resampling import (
     sample_nearest,
     voxels_of,
 )
+from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import RestMesh, finite_nodes
+from us_sim.slicing.slicer import Slicer
 from us_sim.slicing.trilinear import sample_linear
 
 if TYPE_CHECKING:
@@ -56,32 +57,25 @@ if TYPE_CHECKING:
 __all__ = ["RowSubdivision", "warm_up"]
 
 
-class RowSubdivision:
-    """Cuts images from a volume that is carried by a deformed tetrahedral mesh.
+class RowSubdivision(Slicer):
+    """The paper's method, for comparison.
 
     Args:
-        volume: in frame ``patient``.
-        rest_nodes: (N, 3) m, where the mesh lies in the undeformed volume.
-        tetrahedra: (M, 4) indices into the nodes.
         regions: into how many bands of rows an image is split, and each band into as many cells;
             every cell has a list of the tetrahedra that cross it. The paper found 32 best.
-        threads: how many threads share the bands; the image does not depend on it.
 
     Raises:
-        MeshError: the mesh is not finite, or its tetrahedra name nodes that are not there.
         ValueError: regions or threads below 1.
     """
-
-    skipped: int
-    """Inverted or flat tetrahedra on the latest image, which were left out."""
 
     def __init__(
         self,
         volume: Volume,
         rest_nodes: ArrayLike,
         tetrahedra: ArrayLike,
-        regions: int = 32,
+        *,
         threads: int = 1,
+        regions: int = 32,
     ) -> None:
         if regions < 1 or threads < 1:
             raise ValueError(f"give at least one region and one thread, not {regions}, {threads}")
@@ -91,17 +85,8 @@ class RowSubdivision:
         )
         self._regions = regions
         self._threads = threads
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        self.skipped = 0
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the mesh at ``nodes`` (N, 3) m.
-
-        Grey values are trilinear in the undeformed volume and 0 where there is nothing.
-
-        Raises:
-            MeshError: another number of nodes than at rest, or nodes that are not finite.
-        """
         voxels, shape = voxels_of(self._volume.intensities)
         elements, maps = self._locate(nodes, plane)
         image = np.empty(elements.shape, dtype=np.uint8)
@@ -111,12 +96,6 @@ class RowSubdivision:
         return image
 
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
-
-        Raises:
-            VolumeError: the volume has no labels.
-            MeshError: as for `image`.
-        """
         voxels, shape = label_voxels(self._volume)
         elements, maps = self._locate(nodes, plane)
         image = np.empty(elements.shape, dtype=np.uint8)
@@ -126,18 +105,11 @@ class RowSubdivision:
         return image
 
     def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
-        """Where each pixel's tissue lies at rest: (rows, columns, 3) m, frame ``patient``.
-
-        Outside the mesh that is the pixel itself, and NaN where tissue moved away.
-
-        Raises:
-            MeshError: as for `image`.
-        """
         elements, maps = self._locate(nodes, plane)
         column, row = np.meshgrid(np.arange(plane.columns), np.arange(plane.rows))
         pixel = np.stack([np.ones(column.shape), column, row], axis=-1)
         index = np.einsum("rcij,rcj->rci", maps[elements], pixel)
-        index[elements == MOVED_AWAY] = np.nan
+        index[elements == BLACK] = np.nan
         to_patient = self._volume.index_to_patient
         return index @ to_patient[:3, :3].T + to_patient[:3, 3]
 
@@ -163,17 +135,13 @@ class RowSubdivision:
         if outside.any() and not np.array_equal(moved, self._mesh.nodes):
             rest = self._mesh.cut(self._mesh.nodes, plane)
             leave_black(rest.barycentric, rest.bounds, len(section.bounds), outside, elements)
+        if plane.spans is not None:
+            elements[~plane.is_shown()] = BLACK
         return elements, section.rest_index
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
         """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
-        if self._pool is None:
-            work(0, plane.rows)
-            return
-        band = -(-plane.rows // self._regions)
-        share = band * -(-plane.rows // (band * self._threads))
-        starts = range(0, plane.rows, share)
-        list(self._pool.map(lambda a: work(a, min(a + share, plane.rows)), starts))
+        share_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))
 
 
 def warm_up() -> None:
