@@ -16,14 +16,17 @@ from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStampe
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh, MeshTriangle
-from std_msgs.msg import Int32MultiArray, MultiArrayDimension
+from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker
 
-from us_sim.errors import MeshError, VolumeError
+from us_sim.errors import MeshError, ProbeError, VolumeError
 from us_sim.pose import Pose
 
 __all__ = [
+    "affine_from",
+    "affine_message",
     "cloud_message",
+    "colour_image_message",
     "image_message",
     "mesh_message",
     "pixels_from",
@@ -98,14 +101,23 @@ def wrench_message(
 
 def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
     """A ``mono8`` image of (rows, columns) pixels."""
+    return _image(pixels, "mono8", 1, stamp, frame)
+
+
+def colour_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """An ``rgb8`` image of (rows, columns, 3) pixels: red, green, blue."""
+    return _image(pixels, "rgb8", 3, stamp, frame)
+
+
+def _image(pixels: NDArray[np.uint8], encoding: str, size: int, stamp: Time, frame: str) -> Image:
     message = Image()
     message.header.stamp = stamp
     message.header.frame_id = frame
-    message.height, message.width = pixels.shape
-    message.encoding = "mono8"
+    message.height, message.width = pixels.shape[:2]
+    message.encoding = encoding
     message.is_bigendian = 0
-    message.step = pixels.shape[1]
-    message.data = array("B", pixels.tobytes())
+    message.step = size * message.width
+    message.data = _bytes(pixels)
     return message
 
 
@@ -203,6 +215,40 @@ def tetrahedra_from(message: Int32MultiArray) -> NDArray[np.int32]:
     return indices.reshape(-1, 4)
 
 
+def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
+    """A (4, 4) affine map, row after row."""
+    message = Float64MultiArray()
+    message.layout.dim = [
+        MultiArrayDimension(label="row", size=4, stride=16),
+        MultiArrayDimension(label="column", size=4, stride=4),
+    ]
+    message.data = array("d", np.ascontiguousarray(matrix, dtype=np.float64).tobytes())
+    return message
+
+
+def affine_from(message: Float64MultiArray) -> NDArray[np.float64]:
+    """The (4, 4) affine map in a message.
+
+    Raises:
+        ProbeError: it is no 4 by 4 matrix, not finite, or its last row is not 0 0 0 1.
+    """
+    sizes = tuple(dimension.size for dimension in message.layout.dim)
+    strides = tuple(dimension.stride for dimension in message.layout.dim)
+    count, offset = len(message.data), message.layout.data_offset
+    if sizes != (4, 4) or strides[1] != 4 or count != offset + 16:
+        raise ProbeError(
+            f"the matrix has {count} numbers from {offset} on in dimensions {list(sizes)} with "
+            f"strides {list(strides)}; it must be 4 by 4, row after row (strides 16 and 4)"
+        )
+    matrix = np.array(message.data[offset:], dtype=np.float64).reshape(4, 4)
+    if not (np.isfinite(matrix).all() and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()):
+        raise ProbeError(
+            f"the matrix {matrix.tolist()} is not an affine map: give finite numbers, and 0 0 0 1 "
+            f"as the last row"
+        )
+    return matrix
+
+
 def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> Mesh:
     """(N, 3) m and (T, 3) as a shape."""
     return Mesh(
@@ -249,3 +295,10 @@ def _marker(surface: Surface, stamp: Time, frame: str, offset: int) -> list[byte
 
 def _points(vertices: NDArray[np.floating]) -> list[Point]:
     return [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
+
+
+def _bytes(values: NDArray[np.uint8]) -> array[int]:
+    """Their bytes in order, copied once."""
+    data = array("B")
+    data.frombytes(np.ascontiguousarray(values).data)
+    return data

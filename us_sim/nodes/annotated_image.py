@@ -1,0 +1,140 @@
+"""Shows the image with millimetres, outlines and its age to those who subscribe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+
+from us_sim.errors import UsSimError
+from us_sim.nodes.conversions import colour_image_message
+from us_sim.nodes.pose_age import PoseAge
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.slicing.annotation import Annotation, Badge
+from us_sim.slicing.probe import Probe
+from us_sim.structures import colour_of
+
+__all__ = ["AnnotatedImage"]
+
+CHECKS = 5.0
+"""Times a second that the age of the newest pose is looked at."""
+
+_AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
+_NEVER = TimeMessage()
+"""The stamp of a picture of no pose: zero."""
+
+Pixels = NDArray[np.uint8]
+
+
+class AnnotatedImage:
+    """``ultrasound/image_annotated``: the image, what is in it, and whether it is live.
+
+    A picture is drawn for each image while somebody subscribes. When no pose has come for a
+    while, or the newest is old by its stamp, the last image is sent again with a badge, under
+    its own stamp; before the first pose a black one. In lockstep nothing ages.
+
+    Args:
+        node: that publishes it.
+        probe: whose images they are.
+        label_names: of the volume's labels.
+    """
+
+    def __init__(self, node: SceneNode, probe: Probe, label_names: Mapping[int, str]) -> None:
+        self._node = node
+        numbers = {name: number for number, name in label_names.items()}
+        self._structures = {
+            numbers[given.label or name]: (name, colour_of(node.scene, name))
+            for name, given in node.scene.structures.items()
+            if not given.file and (given.label or name) in numbers
+        }
+        self._publisher = node.stream(Image, "ultrasound/image_annotated")
+        self._came = False
+        self._image: Pixels | None = None
+        self._labels: Callable[[], Pixels] | None = None
+        self._outlined: Pixels | None = None
+        self._stamp = _NEVER
+        self.show_probe(probe)
+        self._age: PoseAge | None = None
+        if not node.lockstep:
+            self._age = PoseAge(node)
+            node.create_timer(1.0 / CHECKS, self._check)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes."""
+        return bool(self._publisher.get_subscription_count() > 0)
+
+    @property
+    def state(self) -> str:
+        """Of the probe's pose: ``waiting`` for the first, ``live``, ``stale`` or ``lost``."""
+        if self._age is None:
+            return "live" if self._came else "waiting"
+        return self._age.word(self._age.pose)
+
+    def show_probe(self, probe: Probe) -> None:
+        """The images that come are of another probe; those before it are not shown again."""
+        self._probe = probe
+        self._annotation = Annotation(probe, self._structures)
+        self._image = self._labels = self._outlined = None
+        self._stamp = _NEVER
+
+    def pose_came(self, stamp: TimeMessage) -> None:
+        """A pose that can be used has come, whether or not an image is made at it."""
+        self._came = True
+        if self._age is not None:
+            self._age.came(stamp)
+
+    def show(
+        self, image: Pixels, stamp: TimeMessage, labels: Callable[[], Pixels] | None = None
+    ) -> None:
+        """Keep the (rows, columns) image of the pose with that stamp, and send it if wanted.
+
+        Args:
+            image: is kept, not copied: it must not be written to again.
+            labels: gives the labels of its pixels (rows, columns); called only when they are
+                drawn, once, perhaps later.
+        """
+        self._image, self._stamp = image, stamp
+        self._labels = labels if self._structures else None
+        self._outlined = None
+        if self.is_wanted:
+            self._send(self._badge())
+
+    def _check(self) -> None:
+        """Send the last image again, marked, once it is old; a black one where there is none."""
+        badge = self._badge()
+        if badge is not None and self.is_wanted:
+            self._send(badge)
+
+    def _badge(self) -> Badge | None:
+        """What marks an image that is not live."""
+        if self._age is None:
+            return None
+        word = self.state
+        if word == "waiting":
+            return Badge("NO PROBE POSE", _GREY)
+        if word == "lost":
+            return Badge("LOST", _RED)
+        if self._image is None:
+            return Badge("NO IMAGE YET", _GREY)
+        age = self._age.image(self._stamp)
+        if self._age.word(age) == "live":
+            return None
+        return Badge(f"STALE {age:.1f} s", _AMBER)
+
+    def _send(self, badge: Badge | None) -> None:
+        if self._labels is not None:
+            labels, self._labels = self._labels, None
+            try:
+                self._outlined = labels()
+            except UsSimError as error:
+                self._node.health.problem("labels", f"{error}; nothing is outlined")
+        image = self._image
+        if image is None:
+            image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
+        picture = self._annotation.draw(image, self._outlined, badge)
+        self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
+        self._node.health.published("ultrasound/image_annotated")
