@@ -23,6 +23,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
     "stiffness": {"N/m": 1.0, "N/mm": 1e3},
     "mass per area": {"kg/m2": 1.0, "kg/m^2": 1.0},
+    "level": {"dB": 1.0},
     "number": {},
 }
 _NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
@@ -83,6 +84,13 @@ class Quantity:
         return ""
 
 
-def given(quantity: Quantity | None = None, *, choices: Sequence[str] = (), **kwargs: Any) -> Any:
-    """A dataclass field that a scene may set, with the check its value must pass."""
-    return field(metadata={"quantity": quantity, "choices": tuple(choices)}, **kwargs)
+def given(
+    quantity: Quantity | None = None,
+    *,
+    choices: Sequence[str] = (),
+    description: str = "",
+    **kwargs: Any,
+) -> Any:
+    """A dataclass field that a scene may set: the check its value must pass, and what it is."""
+    metadata = {"quantity": quantity, "choices": tuple(choices), "description": description}
+    return field(metadata=metadata, **kwargs)
