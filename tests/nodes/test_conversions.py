@@ -11,12 +11,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
-from us_sim.errors import MeshError, VolumeError
+from us_sim.errors import MeshError, ProbeError, VolumeError
 from us_sim.nodes.conversions import (
+    affine_from,
+    affine_message,
     cloud_message,
+    colour_image_message,
     image_message,
     mesh_message,
     pixels_from,
@@ -153,3 +156,49 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in vertices[triangles.ravel()].tolist()]
         expected.markers.append(marker)
     assert structure_markers(given_ones, STAMP, frame) == serialize_message(expected)
+
+
+@quick
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
+def test_colour_images_hold_red_green_blue_of_each_pixel(pixels):
+    for view in (pixels, pixels[:, ::-1]):
+        message = colour_image_message(view, STAMP, "probe")
+        rows, columns = pixels.shape[:2]
+        assert (message.height, message.width, message.encoding) == (rows, columns, "rgb8")
+        assert message.step * rows == 3 * columns * rows == len(message.data)
+        assert list(message.data) == view.ravel().tolist()
+
+
+@quick
+@given(arrays(np.float64, (3, 4), elements=st.floats(-1e300, 1e300)))
+def test_affine_maps_round_trip(upper):
+    matrix = np.vstack([upper, [0, 0, 0, 1]])
+    sent = deserialize_message(serialize_message(affine_message(matrix)), Float64MultiArray)
+    assert [(d.label, d.size, d.stride) for d in sent.layout.dim] == [
+        ("row", 4, 16),
+        ("column", 4, 4),
+    ]
+    assert list(sent.data) == matrix.ravel().tolist()  # row after row
+    np.testing.assert_array_equal(affine_from(sent), matrix)
+
+
+def test_an_affine_map_may_start_at_an_offset():
+    message = affine_message(np.diag([2.0, 3.0, 4.0, 1.0]))
+    message.layout.data_offset = 2
+    message.data = array("d", [7.0, 7.0]) + message.data
+    np.testing.assert_array_equal(affine_from(message), np.diag([2.0, 3.0, 4.0, 1.0]))
+
+
+def test_what_is_no_affine_map_is_refused():
+    columns_first = affine_message(np.eye(4))
+    columns_first.layout.dim[0].stride, columns_first.layout.dim[1].stride = 4, 16
+    too_short = affine_message(np.eye(4))
+    too_short.data = too_short.data[:15]
+    too_wide = affine_message(np.eye(4))
+    too_wide.layout.dim.append(MultiArrayDimension(label="depth", size=1, stride=1))
+    for message in (Float64MultiArray(), columns_first, too_short, too_wide):
+        with pytest.raises(ProbeError, match="it must be 4 by 4, row after row"):
+            affine_from(message)
+    for matrix in (np.diag([1.0, np.nan, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0])):
+        with pytest.raises(ProbeError, match="give finite numbers, and 0 0 0 1"):
+            affine_from(affine_message(matrix))
