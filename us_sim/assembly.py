@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from us_sim.collider import Collider
     from us_sim.recording.path import ProbePath
     from us_sim.skin.membrane import SkinMembrane
+    from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe import Probe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
@@ -36,6 +37,7 @@ __all__ = [
     "membrane_of",
     "path_of",
     "probe_of",
+    "scanner_of",
     "tissue_model_of",
     "volume_of",
 ]
@@ -109,6 +111,15 @@ def probe_of(scene: Scene) -> Probe:
         return geometry(columns=image[0], rows=image[1], **given)
     except ProbeError as error:
         raise SceneError(f"{scene.origin}: {error}") from error
+
+
+def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
+    """The scanner that makes the scene's images; its tissue's mesh is for it to be told."""
+    from us_sim.slicing.b_mode import BMode
+
+    method = scene.slice.method
+    settings = {"regions": scene.slice.regions} if method == "row_subdivision" else {}
+    return BMode(volume, probe_of(scene), scene.imaging, method=method, threads=threads, **settings)
 
 
 def collider_of(scene: Scene) -> Collider:

@@ -1,15 +1,19 @@
 """The slicing node: an image for every pose, from the deformed nodes with the same stamp."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from bench import pose_at
 from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.assembly import probe_of, tissue_model_of, volume_of
 from us_sim.nodes.conversions import (
+    affine_from,
     cloud_message,
     pixels_from,
     pose_from,
@@ -18,7 +22,7 @@ from us_sim.nodes.conversions import (
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.scene_file import load_scene
 from us_sim.slicing.resampling import sample_plane
-from us_sim.slicing.row_subdivision import RowSubdivision
+from us_sim.slicing.slicer import create_slicer
 
 BARE = """
 name: bare
@@ -58,9 +62,8 @@ def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_s
     assert images[0].header.stamp.sec == 1
     assert images[0].header.frame_id == "probe"
     scene = load_scene(small_scene)
-    cutter = RowSubdivision(
-        volume_of(scene), mesh.nodes.astype(np.float32).astype(np.float64), mesh.tetrahedra
-    )
+    rest = mesh.nodes.astype(np.float32).astype(np.float64)
+    cutter = create_slicer("scan_conversion", volume_of(scene), rest, mesh.tetrahedra)
     expected = cutter.image(moved, probe_of(scene).plane(pose_from(pose_at(0.003, 1))))
     np.testing.assert_array_equal(pixels_from(images[0]), expected)
     assert expected.std() > 5  # there is something in the picture
@@ -101,3 +104,89 @@ def test_without_tissue_the_volume_is_cut_as_it_is(bench, tmp_path):
     plane = probe_of(scene).plane(pose_from(pose_at(0.002, 9)))
     np.testing.assert_array_equal(pixels_from(images[0]), sample_plane(volume_of(scene), plane))
     assert "tissue/nodes" not in dict(bench.peer.get_topic_names_and_types())
+
+
+@pytest.fixture
+def rigid(bench, tmp_path):
+    """A slicing node without tissue, its images, and what publishes poses to it."""
+    file = tmp_path / "bare.yaml"
+    file.write_text(BARE)
+    node = bench.make(SliceInterpolator, scene=str(file), lockstep=True)
+    images = bench.collect(Image, "ultrasound/image")
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image") > 0)
+    return node, images, poses
+
+
+def image_at(bench, images, poses, second):
+    poses.publish(pose_at(0.002, second))
+    bench.spin_until(lambda: images and images[-1].header.stamp.sec == second)
+    return pixels_from(images[-1])
+
+
+def test_the_console_is_changed_while_running(bench, rigid):
+    node, images, poses = rigid
+    before = image_at(bench, images, poses, 1).astype(int)
+    results = node.set_parameters([Parameter("gain", value=6.0)])
+    assert results[0].successful
+    after = image_at(bench, images, poses, 2)
+    # 6 dB of the 60 dB from black to white; what sends no echo stays black.
+    expected = np.where(before > 0, np.minimum(before + 25.5, 255), 0)
+    assert np.abs(after - expected).max() <= 1
+    node.set_parameters([Parameter("gain", value=0.0)])
+    np.testing.assert_array_equal(image_at(bench, images, poses, 3), before)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("gain", 100.0, "gain"),
+        ("gain", float("nan"), "gain"),
+        ("grey_map", "purple", "'purple' is not one of linear"),
+        ("time_gain", [0.0, 200.0], "time_gain: 200 dB is outside"),
+        ("elevation_planes", 99, "elevation_planes"),
+        ("depth", 3.0, "depth"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_and_nothing_changes(
+    bench, rigid, name, value, sentence
+):
+    node, images, poses = rigid
+    before = node.get_parameter(name).value
+    image = image_at(bench, images, poses, 1)
+    result = node.set_parameters([Parameter(name, value=value)])[0]
+    assert not result.successful
+    assert sentence in result.reason
+    assert node.get_parameter(name).value == before
+    np.testing.assert_array_equal(image_at(bench, images, poses, 2), image)
+
+
+def test_pixels_are_placed_in_millimetres_also_after_a_change_of_depth(bench, rigid):
+    node, images, poses = rigid
+    places = bench.collect(Float64MultiArray, "ultrasound/image_to_probe", latched=True)
+    bench.spin_until(lambda: places)
+    scene = load_scene(node.get_parameter("scene").value)
+    last = [59, 49, 0, 1]  # column, row
+    middle = affine_from(places[-1]) @ last
+    np.testing.assert_allclose(middle[:3], [20e-3 - 40e-3 / 120, 0, 40e-3 - 40e-3 / 100])
+    assert node.set_parameters([Parameter("depth", value=0.03)])[0].successful
+    bench.spin_until(lambda: len(places) == 2)
+    assert (affine_from(places[-1]) @ last)[2] == pytest.approx(30e-3 - 30e-3 / 100)
+    shallow = dataclasses.replace(probe_of(scene), depth=0.03)
+    plane = shallow.plane(pose_from(pose_at(0.002, 5)))
+    expected = sample_plane(volume_of(scene), plane)
+    np.testing.assert_array_equal(image_at(bench, images, poses, 5), expected)
+
+
+def test_a_probe_in_the_air_shows_no_tissue_once_contact_matters(bench, rigid):
+    node, images, poses = rigid
+    poses.publish(pose_at(-0.004, 1))
+    bench.spin_until(lambda: images)
+    seen = pixels_from(images[-1])
+    assert seen[6:].mean() > 20  # through 4 mm of nothing the arm is seen all the same
+    assert node.set_parameters([Parameter("contact", value=True)])[0].successful
+    poses.publish(pose_at(-0.004, 2))
+    bench.spin_until(lambda: len(images) == 2)
+    air = pixels_from(images[-1])
+    assert air[:6].max() > air[25:].max()  # reverberation near the face
+    assert air[25:].mean() < 0.3 * seen[25:].mean()

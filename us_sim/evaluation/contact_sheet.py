@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from us_sim.assembly import probe_of
 from us_sim.errors import BagError
 from us_sim.evaluation.session import LumenAreas, Session
 from us_sim.scene import Scene
@@ -28,7 +29,9 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     FigureCanvasAgg(figure)
     rows = 2 if areas is None else 3
     grid = figure.add_gridspec(rows, 3, height_ratios=[1.0, 1.0, 0.55][:rows])
-    width, depth = scene.probe.aperture * 1e3, scene.probe.depth * 1e3
+    probe = probe_of(scene)
+    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
+    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     first = min(session.poses)
     images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
@@ -38,7 +41,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
             cmap="gray",
             vmin=0,
             vmax=255,
-            extent=(-width / 2, width / 2, depth, 0),
+            extent=(left, right, bottom, top),
         )
         press = session.poses[stamp].position[2] * 1e3
         axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, probe at {press:+.1f} mm")

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.assembly import probe_of, volume_of
+from us_sim.assembly import scanner_of, volume_of
 from us_sim.errors import BagError
 from us_sim.nodes.conversions import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.pose import Pose
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene import Scene
-from us_sim.slicing.row_subdivision import RowSubdivision
 from us_sim.volume.measure import label_area
 
 __all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
@@ -118,15 +117,15 @@ class Session:
         vessels = [name for name in VESSELS if name in numbers]
         if volume.labels is None or not vessels or self.rest is None or self.tetrahedra is None:
             return None
-        probe = probe_of(scene)
-        cutter = RowSubdivision(volume, self.rest, self.tetrahedra, regions=scene.slice.regions)
+        scanner = scanner_of(scene, volume)
+        scanner.carry(self.rest, self.tetrahedra)
         stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
         chosen = [stamps[i] for i in picked]
-        pixel = probe.aperture * probe.depth / (probe.columns * probe.rows)
+        pixel = float(np.prod(scanner.probe.pixel_spacing))
         area: dict[str, list[float]] = {name: [] for name in vessels}
         for done, stamp in enumerate(chosen, start=1):
-            labels = cutter.labels(self.nodes[stamp], probe.plane(self.poses[stamp]))
+            labels = scanner.labels(self.poses[stamp], self.nodes[stamp])
             for name in vessels:
                 area[name].append(label_area(labels, numbers[name], pixel))
             if progress is not None:

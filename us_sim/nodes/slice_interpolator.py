@@ -1,24 +1,33 @@
-"""Cuts the B-mode image at the probe's plane through the deformed tissue."""
+"""Makes the B-mode image at the probe's plane through the deformed tissue."""
 
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.assembly import probe_of, volume_of
+from us_sim.assembly import scanner_of, volume_of
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import image_message, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.annotated_image import AnnotatedImage
+from us_sim.nodes.console import Console
+from us_sim.nodes.conversions import (
+    affine_message,
+    image_message,
+    pose_from,
+    tetrahedra_from,
+    vectors_from,
+)
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.pose import Pose
-from us_sim.slicing.resampling import sample_plane
-from us_sim.slicing.row_subdivision import RowSubdivision, warm_up
+from us_sim.slicing.imaging import Imaging
+from us_sim.slicing.probe import Probe
 
 __all__ = ["SliceInterpolator", "main"]
 
@@ -29,98 +38,124 @@ REMEMBERED = 256
 class SliceInterpolator(SceneNode):
     """``probe/pose`` and, with tissue, ``tissue/nodes`` in; ``ultrasound/image`` out.
 
-    With tissue an image is cut for every set of nodes, at the pose with the same stamp; without,
-    for every pose, through the volume as it is.
+    With tissue an image is made for every set of nodes, at the pose with the same stamp; without,
+    for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
+    its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`; what a
+    sonographer sets are parameters, see `Console`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
-        self._volume = volume_of(self.scene)
-        self._probe = probe_of(self.scene)
+        volume = volume_of(self.scene)
+        self._scanner = scanner_of(self.scene, volume, threads=self.threads)
+        console = Console(
+            self, self._scanner.probe, self.scene.imaging, self._scanner.prepare, self._use
+        )
         self.get_logger().info(f"preparing {self.scene.slice.method} on {self.scene.volume_name}")
-        warm_up()
-        self._cutter: RowSubdivision | None = None
+        self._scanner.prepare(console.probe, console.imaging)
+        self._scanner.use(console.probe, console.imaging)
         self._rest: Any = None
         self._tetrahedra: Any = None
+        self._carried = False
         self._poses: dict[int, Pose] = {}
         self._unpaired: PointCloud2 | None = None
         self._images = self.stream(Image, "ultrasound/image")
+        self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
+        self._places.publish(affine_message(console.probe.image_to_probe))
+        self._annotated = AnnotatedImage(self, console.probe, volume.label_names)
         if self.scene.tissue is None:
-            self.newest(PoseStamped, "probe/pose", self._slice_rigid)
+            self.newest(PoseStamped, "probe/pose", self._image_rigid)
         else:
             self.listen(PointCloud2, "tissue/rest", self._take_rest, LATCHED)
             self.listen(Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra, LATCHED)
             self.listen(PoseStamped, "probe/pose", self._remember)
-            self.newest(PointCloud2, "tissue/nodes", self._slice_deformed)
+            self.newest(PointCloud2, "tissue/nodes", self._image_deformed)
         self.health.state = "ready"
         self.get_logger().info("ready")
 
+    def _use(self, probe: Probe, imaging: Imaging) -> None:
+        """Go on with what was set at the console."""
+        changed = probe != self._scanner.probe
+        self._scanner.use(probe, imaging)
+        if changed:
+            self._places.publish(affine_message(probe.image_to_probe))
+            self._annotated.show_probe(probe)
+
     def _take_rest(self, message: PointCloud2) -> None:
         self._rest = message
-        self._make_cutter()
+        self._take_mesh()
 
     def _take_tetrahedra(self, message: Int32MultiArray) -> None:
         self._tetrahedra = message
-        self._make_cutter()
+        self._take_mesh()
 
-    def _make_cutter(self) -> None:
-        """Once both halves of the mesh are there."""
+    def _take_mesh(self) -> None:
+        """Once both halves of it are there."""
         if self._rest is None or self._tetrahedra is None:
             return
         try:
-            self._cutter = RowSubdivision(
-                self._volume,
-                vectors_from(self._rest),
-                tetrahedra_from(self._tetrahedra),
-                regions=self.scene.slice.regions,
-                threads=self.threads,
-            )
+            self._scanner.carry(vectors_from(self._rest), tetrahedra_from(self._tetrahedra))
+            self._carried = True
         except UsSimError as error:
             self.health.problem("mesh", f"tissue mesh: {error}")
 
     def _remember(self, message: PoseStamped) -> None:
         """Keep the pose until the nodes deformed by it arrive."""
-        try:
-            pose = pose_from(message)
-        except UsSimError as error:
-            self.health.problem("pose", f"probe/pose: {error}; it is not used")
+        pose = self._pose(message)
+        if pose is None:
             return
         self._poses[_nanoseconds(message)] = pose
         while len(self._poses) > REMEMBERED:
             del self._poses[next(iter(self._poses))]
         if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
-            self._slice_deformed(self._unpaired)
+            self._image_deformed(self._unpaired)
 
-    def _slice_deformed(self, message: PointCloud2) -> None:
+    def _pose(self, message: PoseStamped) -> Pose | None:
+        """The pose in a message, if it can be used."""
+        try:
+            pose = pose_from(message)
+        except UsSimError as error:
+            self.health.problem("pose", f"probe/pose: {error}; it is not used")
+            return None
+        self._annotated.pose_came(message.header.stamp)
+        return pose
+
+    def _image_deformed(self, message: PointCloud2) -> None:
         pose = self._poses.get(_nanoseconds(message))
-        if pose is None or self._cutter is None:
+        if pose is None or not self._carried:
             self._unpaired = message
             return
         self._unpaired = None
-        if not self._images.get_subscription_count():
-            return
-        try:
-            pixels = self._cutter.image(vectors_from(message), self._probe.plane(pose))
-        except UsSimError as error:
-            self.health.problem("mesh", f"tissue/nodes: {error}; no image is made of them")
-            return
-        self._publish(pixels, message)
+        self._image(message, pose, message)
 
-    def _slice_rigid(self, message: PoseStamped) -> None:
-        if not self._images.get_subscription_count():
-            return
-        try:
-            plane = self._probe.plane(pose_from(message))
-        except UsSimError as error:
-            self.health.problem("pose", f"probe/pose: {error}; no image is made at it")
-            return
-        self._publish(sample_plane(self._volume, plane), message)
+    def _image_rigid(self, message: PoseStamped) -> None:
+        pose = self._pose(message)
+        if pose is not None:
+            self._image(message, pose, None)
 
-    def _publish(self, pixels: Any, source: PoseStamped | PointCloud2) -> None:
+    def _image(
+        self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
+    ) -> None:
+        """Make and publish the image at ``pose``, under the stamp of what it is made from."""
+        if not (self._images.get_subscription_count() or self._annotated.is_wanted):
+            return
         stamp = source.header.stamp
-        self._images.publish(image_message(pixels, stamp, "probe"))
-        self.health.published("ultrasound/image", stamp)
+        try:
+            nodes = None if tissue is None else vectors_from(tissue)
+            pixels = self._scanner.image(pose, nodes)
+        except UsSimError as error:
+            kind, topic = ("pose", "probe/pose") if tissue is None else ("mesh", "tissue/nodes")
+            self.health.problem(kind, f"{topic}: {error}; no image is made of it")
+            return
+        if self._images.get_subscription_count():
+            self._images.publish(image_message(pixels, stamp, "probe"))
+            self.health.published("ultrasound/image", stamp)
+        self._annotated.show(pixels, stamp, partial(self._scanner.labels, pose, nodes))
         self.health.state = "imaging"
+        self.health.values = {
+            "probe_pose": self._annotated.state,
+            "skipped_tetrahedra": str(self._scanner.skipped),
+        }
 
 
 def _nanoseconds(message: PoseStamped | PointCloud2) -> int:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.pose import Pose
 from us_sim.slicing.plane import SlicePlane
 
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["METHODS", "Slicer", "create_slicer"]
+__all__ = ["METHODS", "Slicer", "create_slicer", "warm_up"]
 
 METHODS = {
     "scan_conversion": "us_sim.slicing.scan_conversion:ScanConversion",
@@ -88,7 +89,7 @@ def create_slicer(
     threads: int = 1,
     **settings: int,
 ) -> Slicer:
-    """The slicer of that name, its kernels loaded.
+    """The slicer of that name.
 
     Raises:
         KeyError: there is no method of that name.
@@ -97,3 +98,18 @@ def create_slicer(
     module, _, cls = METHODS[name].partition(":")
     method: type[Slicer] = getattr(importlib.import_module(module), cls)
     return method(volume, rest_nodes, tetrahedra, threads=threads, **settings)
+
+
+def warm_up(name: str, threads: int = 1) -> None:
+    """Compile every kernel of a method, or load it from numba's cache, by cutting a tiny image."""
+    from us_sim.slicing.probe import LinearProbe
+    from us_sim.volume.volume import Volume
+
+    voxels = np.zeros((2, 2, 2), dtype=np.uint8)
+    volume = Volume(voxels, np.eye(4), voxels, {0: "nothing"})
+    nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
+    slicer = create_slicer(name, volume, nodes, np.array([[0, 1, 2, 3]]), threads=threads)
+    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
+    slicer.image(1.1 * nodes, plane)
+    slicer.labels(nodes, plane)
+    slicer.rest_coordinates(nodes, plane)

@@ -1,0 +1,174 @@
+"""The scanner as a whole: what a probe shows of a volume, with deformed tissue or without.
+
+>>> from us_sim.assembly import probe_of, volume_of
+>>> from us_sim.pose import Pose
+>>> from us_sim.scene_file import parse_scene
+>>> from us_sim.slicing.b_mode import BMode
+>>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm", "voxel_size": "1 mm"},
+...                      "probe": {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]}})
+>>> scanner = BMode(volume_of(scene), probe_of(scene))
+>>> scanner.image(Pose([0, 0, 0.002])).shape
+(30, 40)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.pose import Pose
+from us_sim.slicing.image_formation import ImageFormation
+from us_sim.slicing.imaging import Imaging
+from us_sim.slicing.plane import SlicePlane
+from us_sim.slicing.probe import Probe
+from us_sim.slicing.resampling import sample_labels, sample_plane
+from us_sim.slicing.slicer import Slicer, create_slicer, warm_up
+
+if TYPE_CHECKING:
+    from us_sim.slicing.coupling import ContactSurface
+    from us_sim.volume.volume import Volume
+
+__all__ = ["BMode"]
+
+# Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward.
+_BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+
+
+class BMode:
+    """Makes B-mode images: cuts slices and forms the picture, with as much as the settings ask.
+
+    Args:
+        volume: in frame ``patient``.
+        probe: its geometry; may be set to another one later.
+        imaging: the console's settings.
+        method: how slices through deformed tissue are cut, see `slicer.METHODS`.
+        threads: among which a slice is shared.
+        settings: of the method, as `RowSubdivision`'s ``regions``.
+    """
+
+    def __init__(
+        self,
+        volume: Volume,
+        probe: Probe,
+        imaging: Imaging | None = None,
+        *,
+        method: str = "scan_conversion",
+        threads: int = 1,
+        **settings: int,
+    ) -> None:
+        self._volume = volume
+        self._method = method
+        self._threads = threads
+        self._settings = settings
+        self._mesh: tuple[NDArray[np.float64], NDArray[np.int32]] | None = None
+        self._slicer: Slicer | None = None
+        self._surface: ContactSurface | None = None
+        self.use(probe, imaging or Imaging())
+
+    @property
+    def probe(self) -> Probe:
+        """The probe in use."""
+        return self._probe
+
+    @property
+    def skipped(self) -> int:
+        """Inverted or flat tetrahedra that the latest slice left out."""
+        return self._slicer.skipped if self._slicer else 0
+
+    def use(self, probe: Probe, imaging: Imaging) -> None:
+        """Another probe, or other settings, from the next image on."""
+        self._probe = probe
+        self._formation = ImageFormation(probe, imaging)
+
+    def prepare(self, probe: Probe, imaging: Imaging) -> None:
+        """Load what images with these settings will use, so that the first is not late.
+
+        Raises:
+            ProbeError: they do not go together.
+        """
+        warm_up(self._method, self._threads)
+        formation = ImageFormation(probe, imaging)
+        blank = np.zeros((probe.rows, probe.columns), dtype=np.uint8)
+        coupling = None
+        if formation.needs_contact:
+            surface = self._contact_surface(deformed=False)
+            coupling = surface.coupling(surface.rest_nodes, probe, Pose())
+        formation.form([blank for _ in formation.planes(Pose())], coupling)
+
+    def carry(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
+        """Have the volume carried by this mesh: (N, 3) m at rest, and (M, 4) indices into them.
+
+        Raises:
+            MeshError: the mesh cannot be used; then what was carried before still is.
+        """
+        slicer = create_slicer(
+            self._method,
+            self._volume,
+            rest_nodes,
+            tetrahedra,
+            threads=self._threads,
+            **self._settings,
+        )
+        self._slicer = slicer
+        self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
+        self._surface = None
+
+    def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+        """The B-mode image (rows, columns) with the probe at ``pose``.
+
+        Args:
+            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is.
+
+        Raises:
+            MeshError: the nodes are not as many as at rest, or not finite.
+            ProbeError: the pose is nowhere near.
+        """
+        slices = [self._slice(plane, nodes) for plane in self._formation.planes(pose)]
+        coupling = None
+        if self._formation.needs_contact:
+            surface = self._contact_surface(nodes is not None)
+            where = surface.rest_nodes if nodes is None else nodes
+            coupling = surface.coupling(where, self._probe, pose)
+        return self._formation.form(slices, coupling)
+
+    def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+        """The volume's label at each pixel (rows, columns), 0 where there is nothing.
+
+        Raises:
+            VolumeError: the volume has no labels.
+            MeshError: as for `image`.
+        """
+        plane = self._probe.plane(pose)
+        if nodes is None or self._slicer is None:
+            return sample_labels(self._volume, plane)
+        return self._slicer.labels(nodes, plane)
+
+    def _slice(self, plane: SlicePlane, nodes: NDArray[np.float64] | None) -> NDArray[np.uint8]:
+        if nodes is None or self._slicer is None:
+            return sample_plane(self._volume, plane)
+        return self._slicer.image(nodes, plane)
+
+    def _contact_surface(self, deformed: bool) -> ContactSurface:
+        """What the transducer's face can touch: the tissue, or the box of a volume without."""
+        if self._surface is None:
+            from us_sim.slicing.coupling import ContactSurface
+
+            if deformed and self._mesh is not None:
+                from us_sim.tissue.mesh_check import boundary_triangles
+
+                rest_nodes, tetrahedra = self._mesh
+                self._surface = ContactSurface(rest_nodes, boundary_triangles(tetrahedra))
+            else:
+                return ContactSurface(*_outer_box(self._volume))
+        return self._surface
+
+
+def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The outer faces of a volume's voxels: 8 corners (8, 3) m and 12 triangles."""
+    bits = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)])
+    index = bits * np.array(volume.shape) - 0.5
+    to_patient = volume.index_to_patient
+    triangles = [(a, *pair) for a, b, c, d in _BOX_FACES for pair in ((b, c), (c, d))]
+    return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
