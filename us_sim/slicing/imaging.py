@@ -91,6 +91,12 @@ class Imaging:
         for field in dataclasses.fields(self):
             object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
 
+    @property
+    def changes_grey_levels(self) -> bool:
+        """Whether an echo is shown otherwise than by its own grey value in the volume."""
+        plain = (0.0, ECHO_RANGE, "linear")
+        return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)
+
 
 def _checked(field: dataclasses.Field[object], value: object) -> object:
     """The value of a field as its type says, within its range or choices."""
