@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -212,8 +212,18 @@ class Scene:
             Part("probe_tracker", True, f"poses come from `{self.tracker.source}`"),
             _part("tissue_deformer", self.tissue, "tissue", "the volume is sliced rigidly"),
             _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
-            Part("slice_interpolator", True, f"images are cut by `{self.slice.method}`"),
+            Part("slice_interpolator", True, self._imaged()),
         ]
+
+    def _imaged(self) -> str:
+        """How images are made, for a person."""
+        asked = [
+            entry.name
+            for entry in fields(Imaging)
+            if getattr(self.imaging, entry.name) != entry.default
+        ]
+        formed = f"formed with {', '.join(asked)}" if asked else "shown as they are cut"
+        return f"{self.probe.geometry} images are cut by `{self.slice.method}`, {formed}"
 
     @property
     def volume_name(self) -> str:
