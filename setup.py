@@ -69,7 +69,7 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
-        "evaluate": ["scikit-fem>=10"],
+        "evaluate": ["scikit-fem>=10", "vtk>=9.3"],
         "meshes": ["meshio>=5.3"],
         "test": [
             "hypothesis>=6.100",

@@ -96,10 +96,11 @@ def _parser() -> argparse.ArgumentParser:
     info.set_defaults(command=_bag_info)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
-    subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability")
+    subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice")
     for subject, text, command in (
         ("tissue", "error of every tissue solver against its run time", _evaluate_tissue),
         ("stability", "what every tissue solver does with extreme cases", _evaluate_stability),
+        ("slice", "error of every slicing method against its run time", _evaluate_slice),
     ):
         measured = subjects.add_parser(subject, help=text)
         measured.add_argument(
@@ -204,6 +205,12 @@ def _evaluate_stability(args: argparse.Namespace) -> int:
     from us_sim.evaluation.stability import evaluate_stability
 
     return evaluate_stability(args.out, args.quick)
+
+
+def _evaluate_slice(args: argparse.Namespace) -> int:
+    from us_sim.evaluation.slice import evaluate_slice
+
+    return evaluate_slice(args.out, args.quick)
 
 
 def _parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -1,0 +1,181 @@
+"""One point of error against run time: a method, a case, and what it got wrong.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.slice_points import Timing
+>>> timing = Timing(np.arange(1.0, 102.0))
+>>> timing.median, timing.p99
+(51.0, 100.0)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation.slice_cases import Frame
+from us_sim.evaluation.slice_reference import ExactSlice, voxel_distance
+from us_sim.volume.volume import Volume
+
+__all__ = ["COLUMNS", "Contender", "Errors", "Point", "Timing", "compare", "timed_together"]
+
+_AGAIN = 5  # images in a turn of a method that takes less than _SHORT
+_SHORT = 8.0  # ms
+_FEWEST = 3  # turns of each method
+# Voxels by which tissue must have moved before taking it for the rigid volume can be told.
+_MOVED = 0.01
+
+
+class Errors(NamedTuple):
+    """How much an image differs from what it must show."""
+
+    coverage_mismatch_px: int  # pixels that show tissue, the rigid volume or black wrongly
+    max_grey_difference: float
+    mean_grey_difference: float
+    max_voxel_error: float  # of the place at rest, over the pixels without a mismatch
+
+
+@dataclass(frozen=True)
+class Point:
+    """A row of slice.csv, and what the report says beyond it."""
+
+    method: str
+    size: int  # columns, and rows
+    nodes: int
+    tets: int
+    threads: int
+    ms_median: float = float("nan")
+    ms_p99: float = float("nan")
+    coverage_mismatch_px: int = 0
+    max_grey_difference: float = float("nan")
+    mean_grey_difference: float = float("nan")
+    max_voxel_error: float = float("nan")
+    deformation: str = ""
+    plane: str = ""
+    filter_ms: float = float("nan")  # of VTK: finding the pixels in the mesh
+    sampling_ms: float = float("nan")  # of VTK: sampling the volume
+    images: int = 0  # that were timed
+    failure: str = field(default="", metadata={"column": False})
+
+    @property
+    def row(self) -> list[str]:
+        """As in the file."""
+        values = (getattr(self, name) for name in COLUMNS)
+        return [_cell(value) for value in values]
+
+
+#: Of slice.csv, in order.
+COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long one method's images took."""
+
+    milliseconds: NDArray[np.float64]
+
+    @property
+    def median(self) -> float:
+        """ms, of an image."""
+        return float(np.median(self.milliseconds))
+
+    @property
+    def p99(self) -> float:
+        """ms, which one image in a hundred exceeds."""
+        return float(np.percentile(self.milliseconds, 99))
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method ready to cut a case's images."""
+
+    method: str
+    threads: int
+    image: Callable[[Frame], NDArray[np.uint8]]
+    rest_coordinates: Callable[[Frame], NDArray[np.float64]]
+    parts: Callable[[], tuple[float, float]] | None = None  # ms of the latest image, where known
+
+
+def timed_together(
+    contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
+) -> list[tuple[Timing, tuple[float, float]]]:
+    """Times of all contenders, taken in turns, so that a noisy machine is as noisy for all.
+
+    Each is called once before, so that nothing is compiled while it is timed. The probe moves on
+    from image to image. Where a method says what parts its images took, their medians come too.
+
+    Args:
+        contenders: to be timed.
+        frames: what they cut, over and over.
+        seconds: after which no further turn begins, if each has had a few.
+    """
+    for contender in contenders:
+        contender.image(frames[0])
+    found: list[list[float]] = [[] for _ in contenders]
+    parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
+    begin = time.perf_counter()
+    turn = 0
+    while turn < _FEWEST or time.perf_counter() - begin < seconds:
+        for number, contender in enumerate(contenders):
+            again = _AGAIN if not found[number] or min(found[number]) < _SHORT else 1
+            for image in range(again):
+                frame = frames[(turn + image) % len(frames)]
+                before = time.perf_counter()
+                contender.image(frame)
+                found[number].append((time.perf_counter() - before) * 1e3)
+                if contender.parts is not None:
+                    parts[number].append(contender.parts())
+        turn += 1
+    missing = [(float("nan"), float("nan"))]
+    medians = [np.median(known or missing, axis=0) for known in parts]
+    return [
+        (Timing(np.array(ms)), (float(one), float(other)))
+        for ms, (one, other) in zip(found, medians, strict=True)
+    ]
+
+
+def compare(
+    volume: Volume,
+    frame: Frame,
+    exact: ExactSlice,
+    image: NDArray[np.uint8],
+    rest: NDArray[np.float64],
+    tissue_only: bool = False,
+) -> Errors:
+    """How wrong an image (rows, columns), and where it took it from (rows, columns, 3) m, are.
+
+    Args:
+        volume: that was cut.
+        frame: what was cut.
+        exact: what it must show.
+        image: grey values.
+        rest: NaN where the method found nothing.
+        tissue_only: the method knows nothing of the rigid volume outside the mesh: grey values
+            and places are compared where both find tissue.
+    """
+    expected = np.where(exact.tissue[..., None], exact.rest, np.nan) if tissue_only else exact.rest
+    known, seen = np.isfinite(expected[..., 0]), np.isfinite(rest[..., 0])
+    pixels = frame.plane.pixels()
+    moved = voxel_distance(volume, expected, pixels) > _MOVED
+    seen_moved = voxel_distance(volume, rest, pixels) > _MOVED / 2
+    # Tissue that hardly moved is where the rigid volume is, and shows the same.
+    right = known & seen & ~(moved & ~seen_moved) & (exact.tissue | ~seen_moved)
+    greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
+    grey = np.abs(image - np.rint(exact.grey))[greys]
+    distance = voxel_distance(volume, rest, expected)[right]
+    return Errors(
+        int(((known | seen) & ~right).sum()),
+        float(grey.max(initial=0.0)),
+        float(grey.mean()) if grey.size else 0.0,
+        float(distance.max(initial=0.0)),
+    )
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return "" if np.isnan(value) else f"{value:.4g}"
+    return str(value)

@@ -1,0 +1,243 @@
+"""slice.md: what was asked and seen, the tables, the pictures, and how it was measured."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from os import cpu_count
+from pathlib import Path
+
+import numpy as np
+
+from us_sim.evaluation.slice_cases import DEPTHS, MAIN, PLANES
+from us_sim.evaluation.slice_plots import plot_errors, plot_meshes, plot_pixels
+from us_sim.evaluation.slice_points import Point
+from us_sim.evaluation.slice_targets import (
+    Target,
+    exponent,
+    main_points,
+    mesh_points,
+    size_points,
+    targets,
+)
+from us_sim.evaluation.slice_vtk import HOW_TO_GET
+
+__all__ = ["table", "write_report"]
+
+
+def table(points: Sequence[Point]) -> str:
+    """What the command prints: every method in the main case, and its worst in all of them."""
+    return _table(*_summary(points))
+
+
+def write_report(
+    out: Path,
+    points: Sequence[Point],
+    sections: Sequence[str],
+    peak_memory: int | None,
+    quick: bool,
+    seconds: float,
+) -> list[Path]:
+    """Write slice.md and its plots; returns the plots' files.
+
+    Args:
+        out: folder.
+        points: all rows.
+        sections: that other parts of the evaluation add, in Markdown.
+        peak_memory: bytes that a process held with a volume of 512³ voxels, where known.
+        quick: whether it was the short run.
+        seconds: that the run took.
+    """
+    in_sizes = size_points(points)
+    on_meshes = mesh_points(points)
+    panels = {
+        f"{size} × {size}": [p for p in in_sizes if p.size == size]
+        for size in sorted({p.size for p in in_sizes})
+    }
+    files = [out / f"slice_{name}.png" for name in ("error", "meshes", "pixels")]
+    if points and panels:
+        plot_errors(panels, files[0])
+        plot_meshes(on_meshes, f"{MAIN.size} × {MAIN.size}, pressed by 12 mm", files[1])
+        plot_pixels(in_sizes, f"{int(np.prod(MAIN.counts)):,} nodes, pressed by 12 mm", files[2])
+    else:
+        files = []
+    text = _text(points, targets(points, peak_memory), sections, quick, seconds)
+    (out / "slice.md").write_text(text, encoding="utf-8")
+    return files
+
+
+def _text(
+    points: Sequence[Point],
+    asked: Sequence[Target],
+    sections: Sequence[str],
+    quick: bool,
+    seconds: float,
+) -> str:
+    without_vtk = not any(p.method == "vtk" for p in points)
+    views = "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items())
+    parts = [
+        "# Slices: error against run time",
+        f"`us-sim evaluate slice{' --quick' if quick else ''}`, {seconds:.0f} s, on {_machine()}. "
+        "Every row is in [slice.csv](slice.csv).",
+        "A block of 0.2 × 0.1 × 0.1 m in a volume of speckle (0.4 mm voxels, 5 mm of it around the "
+        "block, which stays rigid) is dented by a smooth field, down and aside, by up to 30 mm. "
+        "Every method cuts the same images of 60 × 80 mm in one run, in turns, while the probe "
+        "trembles and the dent changes, so that no image repeats another. Each is held against "
+        "brute force in float64 by NumPy and SciPy, which shares no code with any of them.",
+        HOW_TO_GET + "." if without_vtk else "",
+        "## What is asked",
+        _table(("", "asked", "seen", "met"), [target.cells for target in asked]),
+        "Times are of this run and this machine; ratios are of methods that took turns.",
+        "## Error against run time",
+        "![Error against run time](slice_error.png)",
+        _table(*_summary(points)),
+        f"Times are of {MAIN.size} × {MAIN.size} pixels on 8,192 nodes pressed by 12 mm, the "
+        "errors the worst of all cases. VTK knows nothing of the rigid volume around the block: "
+        "its errors count where tissue is. Voxels are those by which `rest_coordinates` misses.",
+        *sections,
+        "## Images' sizes",
+        "![Time against pixels](slice_pixels.png)",
+        _across(size_points(points), "size", lambda p: p.size**2, lambda p: f"{p.size}²"),
+        "## Meshes' sizes",
+        "![Time against nodes](slice_meshes.png)",
+        _across(mesh_points(points), "nodes", lambda p: p.nodes, lambda p: f"{p.nodes:,}"),
+        "## Deformations and planes",
+        f"Planes lie {views}. Times are of one thread; wrong pixels are those whose coverage "
+        "(tissue, rigid volume or nothing) is not the reference's.",
+        _cases_table(points),
+        *_vtk_apart(points),
+        "## How it was measured",
+        "Wall clock of one call that returns the image, for the methods here and for VTK from the "
+        "deformed nodes as an array to the image as an array. A turn has five images in a row of "
+        "methods that take less than 8 ms, one of the others; medians and 99th percentiles are "
+        "over all turns, the first image (which may compile) not counted. Coverage, grey values "
+        "and rest coordinates are of one image a case. A pixel is at fault where the method finds "
+        "nothing and the reference something, or the reverse, or where it takes tissue that moved "
+        "by more than a hundredth of a voxel for the rigid volume, or the reverse. The memory is "
+        "the peak of a process of its own.",
+    ]
+    failures = [p for p in points if p.failure]
+    if failures:
+        parts += [
+            "## Failed",
+            "\n".join(
+                f"- {p.method}, {p.size} px, {p.nodes:,} nodes, {p.deformation}, {p.plane}: "
+                f"{p.failure}"
+                for p in failures
+            ),
+        ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]]]:
+    head = ("method", "threads", "ms", "p99", "wrong px", "max grey", "mean grey", "max voxel")
+    rows: list[Sequence[str]] = []
+    for p in main_points(points):
+        mine = [q for q in points if (q.method, q.threads) == (p.method, p.threads)]
+        mine = [q for q in mine if not q.failure]
+        rows.append(
+            (
+                p.method,
+                f"{p.threads}",
+                f"{p.ms_median:.2f}",
+                f"{p.ms_p99:.2f}",
+                f"{sum(q.coverage_mismatch_px for q in mine)}",
+                f"{max(q.max_grey_difference for q in mine):g}",
+                f"{max(q.mean_grey_difference for q in mine):.2g}",
+                f"{max(q.max_voxel_error for q in mine):.2g}",
+            )
+        )
+    return head, rows
+
+
+def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
+    """Times of every method along one axis, and the exponent."""
+    steps = sorted({across(p): word(p) for p in points}.items())
+    rows = []
+    for method, threads in dict.fromkeys((p.method, p.threads) for p in points):
+        mine = [p for p in points if (p.method, p.threads) == (method, threads)]
+        times = {across(p): p.ms_median for p in mine}
+        cells = [f"{times[at]:.2f}" if at in times else "" for at, _ in steps]
+        power = exponent(mine, across)
+        rows.append((method, f"{threads}", *cells, f"{power:.2f}" if np.isfinite(power) else ""))
+    words = [f"{what} {name}, ms" for _, name in steps]
+    return _table(("method", "threads", *words, "exponent"), rows)
+
+
+def _cases_table(points: Sequence[Point]) -> str:
+    shown = [
+        p
+        for p in points
+        if p.threads == 1
+        and p.nodes == int(np.prod(MAIN.counts))
+        and p.size == MAIN.size
+        and not p.failure
+    ]
+    methods = list(dict.fromkeys(p.method for p in shown))
+    rows = []
+    for deformation in DEPTHS:
+        for plane in PLANES:
+            mine = {p.method: p for p in shown if (p.deformation, p.plane) == (deformation, plane)}
+            if not mine:
+                continue
+            cells = [f"{mine[m].ms_median:.2f}" if m in mine else "" for m in methods]
+            wrong = [f"{mine[m].coverage_mismatch_px}" if m in mine else "" for m in methods]
+            rows.append((deformation, plane, *cells, *wrong))
+    return _table(
+        (
+            "deformation",
+            "plane",
+            *(f"{m}, ms" for m in methods),
+            *(f"{m}, wrong px" for m in methods),
+        ),
+        rows,
+    )
+
+
+def _vtk_apart(points: Sequence[Point]) -> list[str]:
+    mine = [p for p in size_points(points) if p.method == "vtk"]
+    if not mine:
+        return []
+    rows = [
+        (f"{p.size}²", f"{p.threads}", f"{p.filter_ms:.1f}", f"{p.sampling_ms:.1f}")
+        for p in sorted(mine, key=lambda p: (p.size, p.threads))
+    ]
+    return [
+        "## VTK's two parts",
+        "`vtkProbeFilter` finds the pixels in the deformed `vtkUnstructuredGrid` and interpolates "
+        "the rest coordinates of its nodes (filter); another samples the volume there (sampling). "
+        "The mesh is given in the image's own coordinates, for the filter ignores an image's "
+        "direction. VTK's wheels use one thread unless told otherwise.",
+        _table(("size", "threads", "filter ms", "sampling ms"), rows),
+    ]
+
+
+def _machine() -> str:
+    processor = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                processor = line.partition(":")[2].strip()
+                break
+    except OSError:
+        pass
+    libraries = []
+    for name in ("numpy", "scipy", "numba", "vtk"):
+        try:
+            libraries.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return (
+        f"{processor}, {cpu_count()} cores, {platform.system()}, Python "
+        f"{platform.python_version()}, {', '.join(libraries)}"
+    )
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
+    lines = [head, ["-" * max(width, 1) for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
+        for line in lines
+    )

@@ -1,0 +1,141 @@
+"""What is asked of the slices, against what was seen in one run.
+
+>>> from us_sim.evaluation.slice_targets import Target
+>>> Target("an image", "at most 2 ms", "1.5 ms", True).cells
+('an image', 'at most 2 ms', '1.5 ms', 'yes')
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from us_sim.evaluation.slice_cases import MAIN
+from us_sim.evaluation.slice_points import Point
+
+__all__ = ["Target", "exponent", "main_points", "mesh_points", "size_points", "targets"]
+
+_METHOD = "scan_conversion"
+_MESH_NODES = int(np.prod(MAIN.counts))
+_LARGE = 512  # voxels a side, of the volume whose memory is asked for
+
+
+@dataclass(frozen=True)
+class Target:
+    """One line of the table."""
+
+    what: str
+    asked: str
+    seen: str
+    met: bool | None  # None where it was not measured
+
+    @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """Of the table."""
+        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
+
+
+def main_points(points: Sequence[Point]) -> list[Point]:
+    """Those of the case by which methods are compared."""
+    return [p for p in mesh_points(points) if p.nodes == _MESH_NODES]
+
+
+def mesh_points(points: Sequence[Point]) -> list[Point]:
+    """The same image on every mesh."""
+    return [p for p in _of_main_image(points) if p.size == MAIN.size]
+
+
+def size_points(points: Sequence[Point]) -> list[Point]:
+    """The same image in every size."""
+    return [p for p in _of_main_image(points) if p.nodes == _MESH_NODES]
+
+
+def exponent(points: Sequence[Point], across: Callable[[Point], float]) -> float:
+    """k in time ~ across^k, by least squares of the logarithms; NaN with fewer than two."""
+    known = {across(p): p.ms_median for p in points if np.isfinite(p.ms_median)}
+    if len(known) < 2:
+        return float("nan")
+    return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
+
+
+def targets(points: Sequence[Point], peak_memory: int | None) -> list[Target]:
+    """Every measure that is asked for; ``peak_memory`` in bytes, for a volume of 512³ voxels."""
+    main = {(p.method, p.threads): p.ms_median for p in main_points(points)}
+    one = main.get((_METHOD, 1), float("nan"))
+    own = [p for p in points if p.method == _METHOD and not p.failure]
+    meshes = [p for p in mesh_points(points) if p.method == _METHOD and p.threads == 1]
+    sizes = [p for p in size_points(points) if p.method == _METHOD and p.threads == 1]
+    image = f"{MAIN.size} × {MAIN.size} on 34,875 tetrahedra pressed 12 mm"
+    return [
+        _at_most(f"{image}, one core", 2.0, one, "ms"),
+        _at_most(f"{image}, two cores", 1.2, main.get((_METHOD, 2), float("nan")), "ms"),
+        _at_least("times as fast as VTK (filter and sampling)", 20, main.get(("vtk", 1)), one),
+        _at_least("times as fast as `row_subdivision`", 5, main.get(("row_subdivision", 1)), one),
+        _count(
+            f"pixels of {sum(p.size**2 for p in own if p.threads == 1):,} with a wrong coverage",
+            0,
+            sum(p.coverage_mismatch_px for p in own if p.threads == 1) if own else None,
+        ),
+        _count(
+            "grey levels that a pixel is off, at most",
+            1,
+            max((p.max_grey_difference for p in own), default=None),
+        ),
+        _growth(meshes),
+        _linear(sizes),
+        _memory(peak_memory),
+    ]
+
+
+def _of_main_image(points: Sequence[Point]) -> list[Point]:
+    return [
+        p
+        for p in points
+        if (p.deformation, p.plane) == (MAIN.deformation, MAIN.plane) and not p.failure
+    ]
+
+
+def _at_most(what: str, asked: float, seen: float, unit: str) -> Target:
+    if not np.isfinite(seen):
+        return Target(what, f"at most {asked:g} {unit}", "not measured", None)
+    return Target(what, f"at most {asked:g} {unit}", f"{seen:.2f} {unit}", seen <= asked)
+
+
+def _at_least(what: str, asked: float, slow: float | None, fast: float) -> Target:
+    if slow is None or not np.isfinite(slow * fast):
+        return Target(what, f"at least {asked:g}", "not measured", None)
+    return Target(what, f"at least {asked:g}", f"{slow / fast:.1f}", slow / fast >= asked)
+
+
+def _count(what: str, asked: int, seen: float | None) -> Target:
+    if seen is None:
+        return Target(what, f"{asked}", "not measured", None)
+    return Target(what, f"{asked}", f"{seen:g}", seen <= asked)
+
+
+def _growth(meshes: Sequence[Point]) -> Target:
+    """The longest time over the smallest mesh's."""
+    what, asked = "time on 65,536 nodes over that on 2,000", "at most 1.5"
+    times = {p.nodes: p.ms_median for p in meshes}
+    if len(times) < 2:
+        return Target(what, asked, "not measured", None)
+    ratio = times[max(times)] / times[min(times)]
+    return Target(what, asked, f"{ratio:.2f}", ratio <= 1.5)
+
+
+def _linear(sizes: Sequence[Point]) -> Target:
+    what, asked = "k in time ~ pixels^k", "at most 1 (linear)"
+    found = exponent(sizes, lambda p: p.size**2)
+    if not np.isfinite(found):
+        return Target(what, asked, "not measured", None)
+    return Target(what, asked, f"{found:.2f}", round(found, 2) <= 1.0)
+
+
+def _memory(peak: int | None) -> Target:
+    what = f"memory beyond the volume's own, {_LARGE}³ voxels, Python and libraries included"
+    if peak is None:
+        return Target(what, "at most 300 MB", "not measured", None)
+    beyond = (peak - _LARGE**3) / 1e6
+    return Target(what, "at most 300 MB", f"{beyond:.0f} MB", beyond <= 300)
