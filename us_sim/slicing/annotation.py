@@ -56,6 +56,7 @@ class Annotation:
         self, probe: Probe, structures: Mapping[int, tuple[str, tuple[float, float, float]]]
     ) -> None:
         self._rows, self._columns = probe.rows, probe.columns
+        self._picture: Box = (0, 0, self._columns, self._rows)
         self._text = int(np.clip(round(min(self._rows, self._columns) / 40), 8, 48))
         self._line = max(1, round(self._text / 12))
         self._frame = max(2, self._text // 3)
@@ -69,9 +70,9 @@ class Annotation:
         self._focus: NDArray[np.int32] | None = None
         matrix = probe.image_to_probe
         self._lay_out_depth(matrix[2, 3], matrix[2, 1])
-        self._lay_out_width(matrix[0, 3], matrix[0, 0])
         if probe.focus is not None:
-            self._lay_out_focus((probe.focus - matrix[2, 3]) / matrix[2, 1])
+            self._lay_out_focus(round((probe.focus - matrix[2, 3]) / matrix[2, 1]))
+        self._lay_out_width(matrix[0, 3], matrix[0, 0])
 
     def draw(
         self,
@@ -102,12 +103,12 @@ class Annotation:
 
     def _lay_out_depth(self, first: float, spacing: float) -> None:
         """Ticks and labels along the right side, of depth below the face."""
-        step = _step(spacing, 2.2 * self._text)
-        for depth in _multiples(step / 2, max(first - spacing, 0.0), first + self._rows * spacing):
+        step, between = _steps(spacing, self._rows, 2.2 * self._text)
+        edge = self._columns - 1
+        for depth in _multiples(between, max(first - spacing, 0.0), first + self._rows * spacing):
             row = int(np.clip(round((depth - first) / spacing), 0, self._rows - 1))
             labelled = abs(depth / step - round(depth / step)) < 1e-6
             length = self._text if labelled else self._text // 2
-            edge = self._columns - 1
             self._ticks.append(np.array([[edge - length, row], [edge, row]], np.int32))
             if labelled:
                 text = f"{1e3 * depth:g}" + (" mm" if depth == 0 else "")
@@ -118,84 +119,87 @@ class Annotation:
 
     def _lay_out_width(self, first: float, spacing: float) -> None:
         """Ticks and labels along the bottom, of the way along the array from its middle."""
-        widest = lettering(f"-{1e3 * abs(first):.0f}", self._text, _SCALE).width
-        step = _step(spacing, 1.6 * widest)
+        widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
+        step, between = _steps(spacing, self._columns, 1.5 * widest)
         edge = self._rows - 1
-        for x in _multiples(step / 2, first, first + (self._columns - 1) * spacing):
+        above = edge - self._text
+        beside_depth = self._columns - 2 * self._text
+        for x in _multiples(between, first, first + (self._columns - 1) * spacing):
             column = round((x - first) / spacing)
-            if any(
-                left <= column < right and bottom > edge - self._text
-                for left, _, right, bottom in self._occupied
-            ):
+            if column >= beside_depth or _is_taken((column, above, column, edge), self._occupied):
                 continue
             labelled = abs(x / step - round(x / step)) < 1e-6
             length = self._text if labelled else self._text // 2
             self._ticks.append(np.array([[column, edge - length], [column, edge]], np.int32))
             if labelled:
                 label = lettering(f"{1e3 * x:g}", self._text, _SCALE)
-                self._place(label, column - label.width // 2, edge - self._text - 2 - label.height)
+                self._place(label, column - label.width // 2, above - 2 - label.height)
 
-    def _lay_out_focus(self, row: float) -> None:
+    def _lay_out_focus(self, row: int) -> None:
         """A triangle that points at the depth scale."""
-        if not 0 <= row <= self._rows - 1:
+        if not 0 <= row < self._rows:
             return
-        size = self._text // 2
-        tip = self._columns - 1 - self._text - 4 * self._text
+        size = max(3, round(0.6 * self._text))
+        across = (0, row - size, self._columns, row + size)
+        edge = self._columns - 1 - self._text
+        tip = min([edge, *(box[0] for box in self._occupied if _overlap(box, across))]) - 2
         self._focus = np.array(
-            [[tip, round(row)], [tip - size, round(row) - size], [tip - size, round(row) + size]],
-            np.int32,
+            [[tip, row], [tip - size, row - size], [tip - size, row + size]], np.int32
         )
 
     def _place(self, label: Label, column: int, row: int) -> None:
         """Draw that label with every picture, if it lies inside and on no other."""
-        box = (column, row, column + label.width, row + label.height)
-        inside = column >= 0 and row >= 0 and box[2] <= self._columns and box[3] <= self._rows
-        if inside and not any(_overlap(box, other) for other in self._occupied):
+        box = _box(label, column, row)
+        if _lies_in(box, self._picture) and not _is_taken(box, self._occupied):
             self._labels.append((label, column, row))
             self._occupied.append(box)
 
     def _outline(self, picture: NDArray[np.uint8], labels: NDArray[np.uint8]) -> None:
-        """Thin outlines of the structures, and their names once."""
-        taken = list(self._occupied)
+        """Thin outlines of the structures, and the name of each once, at its longest outline."""
+        named: list[tuple[Label, Box]] = []
         for number, (name, colour) in self._structures.items():
-            outlines = label_outlines(labels, number, smoothing=self._text / 4)
+            outlines = label_outlines(labels, number, smoothing=self._text / 2.5)
             if not outlines:
                 continue
             chains = [np.rint(outline * (1 << _FINE)).astype(np.int32) for outline in outlines]
             cv2.polylines(picture, chains, True, colour, self._line, cv2.LINE_AA, _FINE)
-            label = lettering(name, self._text, colour)
-            for column, row in self._beside(outlines[0], label):
-                box = (column, row, column + label.width, row + label.height)
-                if any(_overlap(box, other) for other in taken):
-                    continue
-                if label.draw(picture, column, row):
-                    taken.append(box)
-                    break
+            left, top = np.floor(outlines[0].min(axis=0)).astype(int).tolist()
+            right, bottom = np.ceil(outlines[0].max(axis=0)).astype(int).tolist()
+            named.append((lettering(name, self._text, colour), (left, top, right, bottom)))
+        taken = list(self._occupied)
+        around = [box for _, box in named]
+        for label, outline in named:
+            places = self._beside(label, outline)
+            free = [box for box in places if not _is_taken(box, taken)]
+            clear = [box for box in free if not _is_taken(box, around)]
+            for box in clear[:1] or free[:1]:
+                label.draw(picture, box[0], box[1])
+                taken.append(box)
 
-    def _beside(self, outline: NDArray[np.float64], label: Label) -> list[tuple[int, int]]:
+    def _beside(self, label: Label, outline: Box) -> list[Box]:
         """Where a name may stand: above the outline, below, right, left, or in its middle."""
-        left, top = np.floor(outline.min(axis=0)).astype(int)
-        right, bottom = np.ceil(outline.max(axis=0)).astype(int)
-        column = int(np.clip((left + right - label.width) // 2, 0, self._columns))
-        row = int(np.clip((top + bottom - label.height) // 2, 0, self._rows))
-        return [
-            (column, int(top) - label.height),
-            (column, int(bottom) + 1),
-            (int(right) + 2, row),
-            (int(left) - label.width - 1, row),
+        left, top, right, bottom = outline
+        column = max(0, min((left + right - label.width) // 2, self._columns - label.width))
+        row = max(0, min((top + bottom - label.height) // 2, self._rows - label.height))
+        places = [
+            (column, top - label.height),
+            (column, bottom + 1),
+            (right + 2, row),
+            (left - label.width - 1, row),
             (column, row),
         ]
+        boxes = [_box(label, *place) for place in places]
+        return [box for box in boxes if _lies_in(box, self._picture)]
 
     def _mark(self, picture: NDArray[np.uint8], badge: Badge) -> None:
         """A frame around the picture and the badge's text at its top."""
         width = self._frame
+        for height in range(2 * self._text, 5, -1):
+            label = lettering(badge.text, height, badge.colour)
+            if label.draw(picture, (self._columns - label.width) // 2, width):
+                break
         picture[:width] = picture[-width:] = badge.colour
         picture[:, :width] = picture[:, -width:] = badge.colour
-        for height in range(3 * self._text // 2, 5, -1):
-            label = lettering(badge.text, height, badge.colour)
-            column = (self._columns - label.width) // 2
-            if label.draw(picture, column, width):
-                return
 
 
 def _bright(colour: tuple[float, float, float]) -> Colour:
@@ -204,14 +208,20 @@ def _bright(colour: tuple[float, float, float]) -> Colour:
     return red, green, blue
 
 
-def _step(spacing: float, pixels: float) -> float:
-    """The smallest of 5, 10, 20, 50, … mm that is at least that many pixels long, m."""
-    step = 5e-3
-    for factor in (2, 2, 2.5) * 4:
-        if step / spacing >= pixels:
-            break
-        step *= factor
-    return step
+def _steps(spacing: float, count: int, pixels: float) -> tuple[float, float]:
+    """From label to label, at least that many pixels, and from tick to tick: m.
+
+    Labels are 5, 10, 20, 50, … mm apart, in a very small image 1, 2, 5, … mm.
+    """
+    step, between = (5e-3, 1e-3) if count * spacing >= 15e-3 else (1e-3, 5e-4)
+    coarser = {1: (2e-3, 1e-3), 2: (5e-3, 1e-3), 5: (1e-2, 5e-3)}
+    scale = 1.0
+    while step / spacing < pixels:
+        digit = round(1e3 * step / scale)
+        step, between = (scale * length for length in coarser[digit])
+        if digit == 5:
+            scale *= 10
+    return step, between if between / spacing >= 4 else step
 
 
 def _multiples(step: float, lowest: float, highest: float) -> NDArray[np.float64]:
@@ -220,5 +230,17 @@ def _multiples(step: float, lowest: float, highest: float) -> NDArray[np.float64
     return np.arange(first, last + 1) * step + 0.0  # without -0
 
 
+def _box(label: Label, column: int, row: int) -> Box:
+    return column, row, column + label.width, row + label.height
+
+
+def _lies_in(one: Box, other: Box) -> bool:
+    return other[0] <= one[0] and other[1] <= one[1] and one[2] <= other[2] and one[3] <= other[3]
+
+
 def _overlap(one: Box, other: Box) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def _is_taken(box: Box, taken: list[Box]) -> bool:
+    return any(_overlap(box, other) for other in taken)

@@ -11,6 +11,8 @@ array([9., 5.])
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +35,7 @@ def label_outlines(
 
     Returns:
         Of each outline (P, 2) column and row, in pixels: between the pixels that have the label
-        and those that have not.
+        and those that have not, at most about half of ``smoothing`` apart.
     """
     mask = cv2.inRange(labels, (float(label),), (float(label),))
     left, top, width, height = cv2.boundingRect(mask)
@@ -46,7 +48,7 @@ def label_outlines(
     return [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
 
 
-def _smooth(chain: NDArray[np.int32], smoothing: float) -> NDArray[np.float64]:
+def _smooth(chain: NDArray[Any], smoothing: float) -> NDArray[np.float64]:
     """A chain of neighbouring pixels on the inside (P, 2), smoothed and moved half a pixel out.
 
     A Gaussian in the outline's Fourier series, applied as g (2 - g) so that circles hardly shrink.
@@ -58,4 +60,5 @@ def _smooth(chain: NDArray[np.int32], smoothing: float) -> NDArray[np.float64]:
     outline = np.fft.ifft(series)
     along = np.fft.ifft(1j * frequency * series)
     outline += 0.5j * along / np.maximum(np.abs(along), 1e-9)
-    return np.column_stack([outline.real, outline.imag])
+    apart = max(1, int(smoothing / 2))
+    return np.column_stack([outline.real[::apart], outline.imag[::apart]])

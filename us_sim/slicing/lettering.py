@@ -28,7 +28,7 @@ _FINER = 4
 """Letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged."""
 
 _CAPITAL = 21
-"""Height of a capital letter of OpenCV's font at scale 1, px."""
+"""Height of a capital letter of OpenCV's font at scale 1, px, without its strokes."""
 
 _HALO = 2
 """Pixels around the letters."""
@@ -65,7 +65,7 @@ class Label:
         return True
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=64)
 def lettering(text: str, height: int, colour: Colour) -> Label:
     """``text`` with capital letters about ``height`` px high."""
     letters = _letters(text, height)
@@ -80,20 +80,26 @@ def lettering(text: str, height: int, colour: Colour) -> Label:
 def _letters(text: str, height: int) -> NDArray[np.float32]:
     """How much of each pixel the letters cover, cropped to them."""
     large = _FINER * height
-    canvas = np.zeros((3 * large, large * (len(text) + 2)), np.uint8)
-    cv2.putText(
-        canvas,
-        text,
-        (large // 2, 2 * large),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        large / _CAPITAL,
-        (255,),
-        max(1, round(large / 8)),
-        cv2.LINE_AA,
-    )
-    left, top, width, depth = cv2.boundingRect(canvas)
-    columns, rows = -(-width // _FINER) or 1, -(-depth // _FINER) or 1
-    cropped = np.zeros((rows * _FINER, columns * _FINER), np.uint8)
-    cropped[:depth, :width] = canvas[top : top + depth, left : left + width]
-    averaged = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
+    letters = _cropped(text, large, _scale(large))
+    rows, columns = (-(-side // _FINER) for side in letters.shape)
+    whole = np.zeros((rows * _FINER, columns * _FINER), np.uint8)
+    whole[: letters.shape[0], : letters.shape[1]] = letters
+    averaged = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
     return averaged.astype(np.float32) / np.float32(255)
+
+
+@lru_cache(maxsize=64)
+def _scale(large: int) -> float:
+    """The scale at which capitals are that high; strokes add to it in some versions of OpenCV."""
+    first = large / _CAPITAL
+    return first * large / _cropped("H", large, first).shape[0]
+
+
+def _cropped(text: str, large: int, scale: float) -> NDArray[np.uint8]:
+    """White on black, in letters about ``large`` px high."""
+    canvas = np.zeros((3 * large, 2 * large * (len(text) + 1)), np.uint8)
+    stroke = max(1, round(large / 7))
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(canvas, text, (large, 2 * large), font, scale, (255,), stroke, cv2.LINE_AA)
+    left, top, width, height = cv2.boundingRect(canvas)
+    return canvas[top : top + max(1, height), left : left + max(1, width)]
