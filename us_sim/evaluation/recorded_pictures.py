@@ -94,6 +94,6 @@ def _plot_correlation(axes, rows: Sequence[RecordedFrame]) -> None:  # type: ign
     axes.axhline(0.8, color="0.3", ls=":", lw=1.2, label="asked: 0.8")
     axes.set_xlabel("frame")
     axes.set_ylabel("normalised\ncross-correlation")
-    axes.set_ylim(0, 1.02)
+    axes.set_ylim(0, 1.06)
     axes.margins(x=0.01)
     axes.legend(loc="lower left", fontsize=9, ncols=4)
