@@ -22,7 +22,6 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -32,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.resampling import label_voxels
+from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import INSIDE, RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
 
@@ -43,8 +43,6 @@ __all__ = ["PerPixel"]
 # As for a section: pixels off the plane that count as on it, and a flat share of the rest volume.
 _ON_PLANE = 1e-9
 _FLAT = 1e-6
-# Pixels beyond which no image reaches, so that boxes fit their integers.
-_FAR = 1e9
 # Voxels by which a point may miss the volume's outer faces, as for `trilinear`.
 _SLACK = 1e-6
 
@@ -60,7 +58,6 @@ class PerPixel(Slicer):
         self._volume = volume
         self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
         self._threads = threads
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         inside, index = self._voxels(nodes, plane)
@@ -109,65 +106,46 @@ class PerPixel(Slicer):
         self, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> tuple[NDArray[np.float64], int]:
         """Rest positions (rows, columns, 3) m, NaN outside the mesh, and the number skipped."""
-        tetrahedra, rest_nodes = self._mesh.tetrahedra, self._mesh.nodes
-        pixel = nodes @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
-        boxes = _boxes(pixel, tetrahedra)
-        first, last = boxes[:, ::2], boxes[:, 1::2]
-        met = ((last >= 0) & (first < [plane.columns, plane.rows])).all(axis=1)
-        size, rest_size = (
-            np.linalg.det(n[tetrahedra][:, 1:] - n[tetrahedra][:, :1]) for n in (nodes, rest_nodes)
-        )
+        now, places = nodes[self._mesh.tetrahedra], self._mesh.nodes[self._mesh.tetrahedra]
+        corners = now @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
+        first, last = _boxes(corners)
+        met = ((last >= 0) & (first <= [plane.columns - 1, plane.rows - 1])).all(axis=1)
+        size, rest_size = (np.linalg.det(x[:, 1:] - x[:, :1]) for x in (now, places))
         valid = size * np.sign(rest_size) > _FLAT * np.abs(rest_size)
-        kept = np.flatnonzero(met & valid)
-        corners, places = pixel[tetrahedra[kept]], rest_nodes[tetrahedra[kept]]
+        kept = met & valid
+        first, last = (np.clip(x[kept], -1, 1e6).astype(np.int64) for x in (first, last))
         rest = np.full((plane.rows, plane.columns, 3), np.nan)
-        share = -(-plane.rows // self._threads)
-        starts = range(0, plane.rows, share)
-        ends = [min(start + share, plane.rows) for start in starts]
-        locate = partial(_locate, corners, places, boxes[kept], rest)
-        list((self._pool.map if self._pool else map)(locate, starts, ends))
+        locate = partial(_locate, corners[kept], places[kept], first, last, rest)
+        share_rows(self._threads, plane.rows, locate)
         return rest, int((met & ~valid).sum())
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _boxes(pixel, tetrahedra):
-    """First and last column, first and last row of each tetrahedron's cut; empty without one.
+def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M, 2) least and greatest column and row of each tetrahedron's cut; inf, -inf without one.
 
     Args:
-        pixel: (N, 3) column, row and height above the plane of each node.
+        corners: (M, 4, 3) column, row and height above the plane.
     """
-    boxes = np.empty((len(tetrahedra), 4), dtype=np.int64)
-    low = np.empty(2)
-    high = np.empty(2)
-    for e in range(len(tetrahedra)):
-        low[:] = _FAR
-        high[:] = -_FAR
-        for m in tetrahedra[e]:
-            for n in tetrahedra[e]:
-                if pixel[m, 2] > 0.0 > pixel[n, 2]:
-                    t = pixel[m, 2] / (pixel[m, 2] - pixel[n, 2])
-                elif m == n and abs(pixel[m, 2]) <= _ON_PLANE:
-                    t = 0.0
-                else:
-                    continue
-                for a in range(2):
-                    x = pixel[m, a] + t * (pixel[n, a] - pixel[m, a])
-                    margin = 1e-6 * (1.0 + abs(x))
-                    low[a] = min(low[a], x - margin)
-                    high[a] = max(high[a], x + margin)
-        for a in range(2):
-            boxes[e, 2 * a] = np.ceil(max(low[a], -_FAR))
-            boxes[e, 2 * a + 1] = np.floor(min(high[a], _FAR))
-    return boxes
+    one, other = corners[:, :, None], corners[:, None, :]
+    above, below = one[..., 2], other[..., 2]
+    on_edge = (above > 0.0) & (below < 0.0)
+    on_node = np.eye(4, dtype=np.bool_) & (np.abs(above) <= _ON_PLANE)
+    way = np.where(on_edge, above / np.where(on_edge, above - below, 1.0), 0.0)[..., None]
+    points = one[..., :2] + way * (other - one)[..., :2]
+    margin = 1e-6 * (1.0 + np.abs(points))
+    on_plane = (on_edge | on_node)[..., None]
+    first = np.where(on_plane, points - margin, np.inf).min(axis=(1, 2))
+    last = np.where(on_plane, points + margin, -np.inf).max(axis=(1, 2))
+    return np.ceil(first), np.floor(last)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _locate(corners, places, boxes, rest, first_row, end_row):
+def _locate(corners, places, first, last, rest, first_row, end_row):
     """Rest positions of the pixels of some rows; a pixel in several tetrahedra takes the first.
 
     Args:
         corners: (E, 4, 3) column, row and height of the tetrahedra's nodes.
-        places: (E, 4, 3) m, the nodes at rest. boxes: (E, 4), as `_boxes` gives them.
+        places: (E, 4, 3) m, the nodes at rest. first, last: (E, 2) columns and rows.
         rest: (rows, columns, 3) m, NaN, filled here where a tetrahedron is.
     """
     weights = np.empty(4)
@@ -175,8 +153,8 @@ def _locate(corners, places, boxes, rest, first_row, end_row):
     for e in range(len(corners)):
         corner = corners[e].copy()
         size = _six_volumes(corner)
-        for row in range(max(first_row, boxes[e, 2]), min(end_row, boxes[e, 3] + 1)):
-            for column in range(max(0, boxes[e, 0]), min(rest.shape[1], boxes[e, 1] + 1)):
+        for row in range(max(first_row, first[e, 1]), min(end_row, last[e, 1] + 1)):
+            for column in range(max(0, first[e, 0]), min(rest.shape[1], last[e, 0] + 1)):
                 if not np.isnan(rest[row, column, 0]):
                     continue
                 pixel[0] = column
