@@ -127,6 +127,17 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     assert node.annotated.state == "live"
 
 
+def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench, show):
+    node = show(stale_after=0.2, lost_after=0.5)
+    bench.spin_until(lambda: node.health.values.get("probe_pose") == "waiting")
+    assert node.health.problems("pose age") == 0
+    for times in (1, 2):
+        node.annotated.pose_came(node.stamp())
+        bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
+        bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
+        assert node.health.problems("pose age") == times
+
+
 def test_a_pose_that_is_old_by_its_stamp_is_never_shown_as_live(bench, show):
     node = show(stale_after=5.0, lost_after=20.0)
     pictures = subscribed(bench, node)

@@ -51,7 +51,7 @@ class AnnotatedImage:
             if not given.file and (given.label or name) in numbers
         }
         self._publisher = node.stream(Image, "ultrasound/image_annotated")
-        self._came = False
+        self._came = self._missing = False
         self._image: Pixels | None = None
         self._labels: Callable[[], Pixels] | None = None
         self._outlined: Pixels | None = None
@@ -105,9 +105,25 @@ class AnnotatedImage:
 
     def _check(self) -> None:
         """Send the last image again, marked, once it is old; a black one where there is none."""
+        self._report()
         badge = self._badge()
         if badge is not None and self.is_wanted:
             self._send(badge)
+
+    def _report(self) -> None:
+        """Say that poses stay away, and that they have come back, once."""
+        node, state = self._node, self.state
+        node.health.values["probe_pose"] = state
+        missing = state in ("stale", "lost")
+        if missing and not self._missing and self._age is not None:
+            node.health.problem(
+                "pose age",
+                f"the newest probe pose is {self._age.pose:.1f} s old: the image is frozen; look "
+                f"at the tracker",
+            )
+        elif self._missing and state == "live":
+            node.get_logger().info("probe poses come again")
+        self._missing = missing
 
     def _badge(self) -> Badge | None:
         """What marks an image that is not live."""
