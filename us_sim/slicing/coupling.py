@@ -22,13 +22,16 @@ from us_sim.errors import MeshError
 from us_sim.pose import Pose
 from us_sim.slicing.probe import Probe
 
-__all__ = ["FULL_PRESS", "GEL_FILM", "LIGHT_CONTACT", "ContactSurface"]
+__all__ = ["FULL_PRESS", "GEL_BEAD", "GEL_FILM", "LIGHT_CONTACT", "ContactSurface"]
 
 GEL_FILM = (0.15e-3, 0.3e-3)
-"""m: gel fills gaps between face and skin up to the first; from the second on there is air.
+"""m: gel fills gaps between face and skin up to the first; from the second on there is air."""
 
-Tissue solvers keep nodes off the probe, not the triangles between them, so gaps under a pressed
-face are not exactly zero either; the film takes them up.
+GEL_BEAD = 0.2
+"""How much wider a gap the gel fills, of the way that the face is pressed in beside it.
+
+Gel that is squeezed out gathers in the wedge where skin leaves a pressed face. It is also as far
+as the triangles of a coarse mesh stand off a face that its nodes touch.
 """
 
 LIGHT_CONTACT = 0.2
@@ -80,7 +83,8 @@ class ContactSurface:
         """
         gap, press = self.gaps(nodes, probe, pose)
         near, far = GEL_FILM
-        wet = 1.0 - _smooth((gap - near) / (far - near))
+        bead = GEL_BEAD * np.maximum(press, 0.0)
+        wet = 1.0 - _smooth((gap - bead - near) / (far - near))
         firm = LIGHT_CONTACT + (1.0 - LIGHT_CONTACT) * _smooth(press / FULL_PRESS)
         return np.asarray(wet * firm, dtype=np.float32)
 
@@ -129,8 +133,10 @@ def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, press):
-    """Where each beam enters the surface: the last time before the face if it has not left it
-    again, else the first time after it.
+    """Where each beam enters the surface: last before the face if it is inside, else first after.
+
+    Folds of a surface that was pushed hard overlap, so what counts is how often a beam has
+    entered more than it has left, not what it did last.
 
     Args:
         nodes, rest: (N, 3); triangles (T, 3), normals outward.
@@ -140,7 +146,7 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
     """
     lines = len(starts)
     entered = np.full(lines, -np.inf)
-    left = np.full(lines, -np.inf)
+    depth = np.zeros(lines, dtype=np.int64)  # of the face: times entered less times left before it
     moved = np.zeros(lines)
     gap[:] = np.inf
     press[:] = 0.0
@@ -208,17 +214,15 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
                 ends[0, 3] + share * (ends[1, 3] - ends[0, 3])
             ) * z
             inward = normal_x * x + normal_z * z < 0.0
-            if not inward:
-                if way <= 0.0:
-                    left[line] = max(left[line], way)
-            elif way <= 0.0:
-                if way > entered[line]:
+            if way <= 0.0:
+                depth[line] += 1 if inward else -1
+                if inward and way > entered[line]:
                     entered[line] = way
                     moved[line] = along
-            elif way < gap[line]:
+            elif inward and way < gap[line]:
                 gap[line] = way
                 press[line] = along - way
     for line in range(lines):
-        if entered[line] > left[line]:
+        if depth[line] > 0:
             gap[line] = entered[line]
             press[line] = moved[line] - entered[line]
