@@ -5,10 +5,12 @@ import copy
 import pytest
 import yaml
 
-from us_sim.assembly import collider_of
+from us_sim.assembly import collider_of, probe_of
 from us_sim.errors import SceneError
 from us_sim.scene_file import find_scene, load_scene, parse_scene
 from us_sim.share import shared_path
+from us_sim.slicing.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe import LinearProbe
 
 COMPLETE = yaml.safe_load(
     """
@@ -65,6 +67,14 @@ def test_units_are_si_inside():
         ("probe.image", [512], "probe.image: needs 2 values, not 1"),
         ("probe.image", [512, 1.5], r"probe.image\[1\]: 1.5 is not a whole number"),
         ("probe.geometry", "round", "probe.geometry: 'round' is not one of linear"),
+        ("probe.image", 512.5, "probe.image: 512.5 is not a whole number"),
+        ("probe.image", [4097, 5], r"probe.image\[0\]: 4097 is outside 1 to 4096"),
+        ("probe.radius", "5 cm", "probe.radius: a linear probe has no radius; it has aperture"),
+        ("probe.opening_angle", 60, "60 rad is outside .* did you mean '60 deg'"),
+        ("probe.geometry", "convex", "probe.radius: is missing; a convex probe needs radius, op"),
+        ("probe.geometry", "sector", "probe.opening_angle: is missing; a sector probe needs"),
+        ("probe.lines", 96.5, "probe.lines: 96.5 is not a whole number"),
+        ("probe.focus", -0.01, "probe.focus: -0.01 m is outside"),
         ("probe.collider", None, "probe.collider: is missing"),
         ("volume", None, "volume: is missing"),
         ("volume.phantom", "leg", "volume.phantom: 'leg' is not one of upper_arm"),
@@ -129,6 +139,51 @@ def test_structures_need_a_tissue():
     document = changed("tissue", None) | {"structures": ["vein"]}
     with pytest.raises(SceneError, match=r"my\.yaml: structures: need `tissue` to carry them"):
         parse_scene(document, origin="my.yaml")
+
+
+def scene_with_probe(**probe):
+    document = copy.deepcopy(COMPLETE)
+    del document["tissue"], document["skin"]
+    document["probe"] = probe
+    return parse_scene(document, origin="my.yaml")
+
+
+def test_a_linear_probe_has_512_by_512_pixels_unless_told():
+    probe = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", focus="2 cm", lines=128))
+    assert isinstance(probe, LinearProbe)
+    assert (probe.columns, probe.rows, probe.lines) == (512, 512, 128)
+    assert (probe.aperture, probe.depth, probe.focus) == pytest.approx((0.04, 0.03, 0.02))
+    square = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", image=300))
+    assert (square.columns, square.rows) == (400, 300)
+
+
+def test_fans_have_square_pixels_unless_told():
+    convex = {"geometry": "convex", "radius": "60 mm", "opening_angle": "60 deg", "depth": "14 cm"}
+    probe = probe_of(scene_with_probe(**convex))
+    assert isinstance(probe, ConvexProbe)
+    assert (probe.width, probe.rows) == pytest.approx((0.2, 512))
+    assert probe.pixel_spacing[0] == pytest.approx(probe.pixel_spacing[1], rel=1e-3)
+    probe = probe_of(scene_with_probe(**convex, image=[200, 100], samples=300))
+    assert (probe.columns, probe.rows, probe.samples) == (200, 100, 300)
+    sector = {"geometry": "sector", "opening_angle": "90°", "depth": "16 cm", "aperture": "2 cm"}
+    probe = probe_of(scene_with_probe(**sector, radius="5 mm", image=400))
+    assert isinstance(probe, SectorProbe)
+    assert (probe.radius, probe.rows) == (0.005, 400)
+    assert probe.width == pytest.approx(0.01 + 0.16 * 2**0.5)
+
+
+def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read():
+    sector = {"geometry": "sector", "opening_angle": "90 deg", "depth": "16 cm"}
+    with pytest.raises(SceneError, match=r"my.yaml: probe.aperture: is missing"):
+        scene_with_probe(**sector)
+    with pytest.raises(SceneError, match=r"my.yaml: probe.aperture: 10 mm is less than the 20 mm"):
+        scene_with_probe(**sector, aperture="1 cm", radius="1 cm")
+    with pytest.raises(
+        SceneError, match=r"my.yaml: probe.aperture: 0.1 m is outside 0.003 to 0.05"
+    ):
+        scene_with_probe(**sector, aperture="10 cm")
+    with pytest.raises(SceneError, match=r"my.yaml: probe.image: the image has 5793 columns"):
+        scene_with_probe(**sector, aperture="2 cm", image=4096)
 
 
 def test_a_collider_needs_its_own_dimensions_and_no_others():

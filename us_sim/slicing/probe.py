@@ -173,13 +173,14 @@ class Probe(ABC):
             spans=self._spans,
         )
 
-    @cached_property
+    @property
     def _spans(self) -> NDArray[np.int32] | None:
-        """The runs of columns of each row that beams reach, None when they reach all."""
-        reached = np.isfinite(self.pixel_beams[0])
-        if reached.all():
-            return None
-        return _kept(_runs(reached))
+        """(rows, 2, 2): runs of columns of each row that beams reach, None when they reach all."""
+        return self._reached_runs
+
+    @cached_property
+    def _reached_runs(self) -> NDArray[np.int32]:
+        return _kept(_runs(np.isfinite(self.pixel_beams[0])))
 
     @property
     def _line_parts(self) -> NDArray[np.float64]:
@@ -234,6 +235,10 @@ class LinearProbe(Probe):
     @property
     def _outline(self) -> tuple[float, float, float]:
         return 0.5 * self.aperture, 0.0, self.depth
+
+    @property
+    def _spans(self) -> None:
+        """Beams reach every pixel."""
 
     def _beam(
         self, x: NDArray[np.float64], z: NDArray[np.float64]
