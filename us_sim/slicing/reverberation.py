@@ -33,10 +33,10 @@ BAND_SPACING = 1.2e-3
 """m: how thick a lens of 0.8 mm seems, which sound crosses at 1000 m/s instead of 1540."""
 
 _BAND_LOSS = 5.0  # dB, of each passage
-_BAND_LENGTH = 0.25e-3  # m, standard deviation of the first band
+_BAND_LENGTH = 0.2e-3  # m, standard deviation of the first band
 _BAND_GROWTH = 0.12  # of the length, with each passage
-_HAZE = -16.0  # dB, of the haze at the face from the first band
-_HAZE_LOSS = 1.1e3  # dB/m
+_HAZE = -26.0  # dB, of the haze at the face from the first band
+_HAZE_LOSS = 1.0e3  # dB/m
 _APERTURE = 1.0e-3  # m, standard deviation of the part of the face that forms a line
 _FINE = 8  # places between lines at which their coupling is tabulated
 _GREYS_PER_DECIBEL = 255.0 / ECHO_RANGE
@@ -64,7 +64,7 @@ class Reverberation:
         half = len(self._aperture) // 2
         formed = np.convolve(np.pad(coupling, half, mode="edge"), self._aperture, mode="valid")
         formed = np.interp(self._at, np.arange(len(coupling)), formed)
-        losses = _losses(formed) | _losses((1.0 - formed) ** 2) << 8
+        losses = _losses(formed) | _losses((1.0 - formed) ** 4) << 8
         out = np.empty_like(image)
         air, place = self._air.reshape(-1), self._place.reshape(-1)
         _brighter(image.reshape(-1), air, place, losses, out.reshape(-1))
