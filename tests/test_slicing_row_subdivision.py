@@ -14,7 +14,8 @@ from us_sim.slicing import location, resampling, section, trilinear
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import sample_labels, sample_plane
-from us_sim.slicing.row_subdivision import RowSubdivision, warm_up
+from us_sim.slicing.row_subdivision import RowSubdivision
+from us_sim.slicing.slicer import warm_up
 from us_sim.tissue.mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
@@ -303,7 +304,7 @@ def test_other_bad_input_is_refused():
 
 
 def test_nothing_is_left_to_compile_after_warming_up():
-    warm_up()
+    warm_up("row_subdivision")
     kernels = (section._cut, location.cells, location.subdivide_rows, location.leave_black,
                trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]

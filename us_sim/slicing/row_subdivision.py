@@ -34,10 +34,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.pose import Pose
 from us_sim.slicing.location import BLACK, cells, leave_black, subdivide_rows
 from us_sim.slicing.plane import SlicePlane
-from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import (
     label_voxels,
     pixel_to_index,
@@ -54,7 +52,7 @@ if TYPE_CHECKING:
 
     from us_sim.volume.volume import Volume
 
-__all__ = ["RowSubdivision", "warm_up"]
+__all__ = ["RowSubdivision"]
 
 
 class RowSubdivision(Slicer):
@@ -142,16 +140,3 @@ class RowSubdivision(Slicer):
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
         """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
         share_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))
-
-
-def warm_up() -> None:
-    """Compile every kernel, or load it from numba's cache, by cutting one tiny image."""
-    from us_sim.volume.volume import Volume
-
-    voxels = np.zeros((2, 2, 2), dtype=np.uint8)
-    volume = Volume(voxels, np.eye(4), voxels, {0: "nothing"})
-    nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
-    slicer = RowSubdivision(volume, nodes, np.array([[0, 1, 2, 3]]))
-    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
-    slicer.image(1.1 * nodes, plane)
-    slicer.labels(nodes, plane)

@@ -1,4 +1,9 @@
-"""Exact images of deformed tissue: every tetrahedron that the image cuts is scan-converted.
+"""Exact images of deformed tissue: every tetrahedron that an image cuts is scan-converted.
+
+The tetrahedra that the image may meet are found by `clusters` and cut by `cut_polygons`: each
+gets its polygon and the affine map from pixels to where its tissue lay at rest. `spans` says which
+pixels are in which polygon, every one exactly once, and `span_sampling` looks them up in the
+volume. `rest_outline` tells tissue that was pushed away from what lies beside it.
 
 >>> import numpy as np
 >>> from us_sim.pose import Pose
@@ -21,47 +26,78 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.pose import Pose
-from us_sim.slicing.location import BLACK, leave_black
+from us_sim.slicing.clusters import Clusters
+from us_sim.slicing.cut_polygons import cut_tetrahedra, room_for_cuts
+from us_sim.slicing.location import BLACK
 from us_sim.slicing.plane import SlicePlane
-from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import label_voxels, pixel_to_index, sample_nearest, voxels_of
-from us_sim.slicing.section import RestMesh, finite_nodes, row_span
+from us_sim.slicing.rest_outline import RestSurface
+from us_sim.slicing.row_bands import share_rows
+from us_sim.slicing.section import RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
-from us_sim.slicing.trilinear import sample_linear
+from us_sim.slicing.span_sampling import fill_elements, sample_spans
+from us_sim.slicing.spans import convert_cuts
+from us_sim.tissue.mesh_check import face_order
 
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["ScanConversion", "warm_up"]
+__all__ = ["ScanConversion"]
 
 
 class ScanConversion(Slicer):
-    """Cuts exact images."""
+    """Cuts exact images, and fast."""
 
     def __init__(
         self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
     ) -> None:
         if threads < 1:
             raise ValueError(f"give at least one thread, not {threads}")
+        self._threads = threads
         self._volume = volume
-        self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+        mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+        self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
+        self._determinants = mesh.determinants[self._clusters.order]
+        self._rest_index = mesh.rest_index
+        self._within = _among_centres(mesh.rest_index, self._clusters.tetrahedra, volume.shape)
+        self._neighbours = _neighbours(self._clusters.tetrahedra)
+        self._surface = RestSurface(
+            mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
+        )
+        self._pairs, self._shape = _pairs_of_voxels(volume.intensities)
+        self._moved = np.empty(mesh.nodes.shape)
+        self._cuts = room_for_cuts(256)
+        self._spans = np.empty((0, 0), dtype=np.int64)
+        self._used = np.empty(0, dtype=np.int32)
+        self._full = np.empty((0, 2, 2), dtype=np.int32)
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        elements, maps = self._locate(nodes, plane)
-        image = np.empty(elements.shape, dtype=np.uint8)
-        voxels, shape = voxels_of(self._volume.intensities)
-        sample_linear(voxels, shape, maps, elements, 0, plane.rows, image)
+        count, pieces = self._cut(nodes, plane)
+        outline = self._surface.cut(plane)
+        runs = self._shown(plane)
+        image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
+
+        def draw(first_row: int, end_row: int) -> None:
+            spans = self._convert(count, pieces, runs, first_row, end_row)
+            sample_spans(
+                self._pairs, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
+                self._used, runs, *outline, first_row, end_row, image,
+            )  # fmt: skip
+
+        share_rows(self._threads, plane.rows, draw)
         return image
 
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         voxels, shape = label_voxels(self._volume)
         elements, maps = self._locate(nodes, plane)
         image = np.empty(elements.shape, dtype=np.uint8)
-        sample_nearest(voxels, shape, maps, elements, 0, plane.rows, image)
+        share_rows(
+            self._threads,
+            plane.rows,
+            lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+        )
         return image
 
     def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
@@ -76,43 +112,95 @@ class ScanConversion(Slicer):
     def _locate(
         self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        moved = finite_nodes(nodes, len(self._mesh.nodes))
-        section = self._mesh.cut(moved, plane)
-        self.skipped = section.skipped
-        section.rest_index[-1] = pixel_to_index(self._volume, plane)
-        none = len(section.bounds)
-        elements = np.full((plane.rows, plane.columns), none, dtype=np.int32)
-        _fill(section.barycentric, section.bounds, elements)
-        outside = (elements == none).any(axis=1)
-        if outside.any():
-            rest = self._mesh.cut(self._mesh.nodes, plane)
-            leave_black(rest.barycentric, rest.bounds, none, outside, elements)
+        """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
+        count, pieces = self._cut(nodes, plane)
+        outline = self._surface.cut(plane)
+        runs = self._shown(plane)
+        spans = self._convert(count, pieces, runs, 0, plane.rows)
+        elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
+        fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
+        return elements, self._cuts.maps[: count + 1]
+
+    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int]:
+        """Fills the cuts; how many there are, and how many outlines. The rigid map is the next."""
+        moved = self._as_kernels_take(nodes)
+        near = self._clusters.near(moved, plane)
+        if 4 * len(near) >= len(self._cuts.sides):
+            self._cuts = room_for_cuts(2 * len(near))
+        count, pieces, self.skipped = cut_tetrahedra(
+            near, moved, plane.to_pixel, float(np.linalg.det(plane.basis)), plane.columns,
+            plane.rows, self._clusters.tetrahedra, self._neighbours, self._determinants,
+            self._rest_index, self._within, self._cuts,
+        )  # fmt: skip
+        self._cuts.maps[count] = pixel_to_index(self._volume, plane)
+        return count, pieces
+
+    def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
+        """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""
+        array = np.asarray(nodes)
+        if array.shape != self._moved.shape:
+            finite_nodes(array, len(self._moved))
+        if array.dtype == np.float64 and array.flags.c_contiguous:
+            return array
+        self._moved[:] = array
+        return self._moved
+
+    def _shown(self, plane: SlicePlane) -> NDArray[np.int32]:
+        """(rows, 2, 2) the runs of columns that an image shows, once there is room for its spans.
+
+        A row has no more spans than pixels, unless deformed tissue overlaps itself.
+        """
+        if len(self._used) < plane.rows or self._spans.shape[1] < plane.columns:
+            self._used = np.empty(plane.rows, dtype=np.int32)
+            self._spans = np.empty((plane.rows, plane.columns), dtype=np.int64)
         if plane.spans is not None:
-            elements[~plane.is_shown()] = BLACK
-        return elements, section.rest_index
+            return plane.spans
+        if len(self._full) != plane.rows or self._full[0, 0, 1] != plane.columns:
+            self._full = np.zeros((plane.rows, 2, 2), dtype=np.int32)
+            self._full[:, 0, 1] = plane.columns
+        return self._full
+
+    def _convert(
+        self, count: int, pieces: int, runs: NDArray[np.int32], first_row: int, end_row: int
+    ) -> NDArray[np.int64]:
+        """The spans of a run of rows."""
+        cuts, spans = self._cuts, self._spans
+        while True:
+            most = convert_cuts(
+                cuts.corners, cuts.sides, count, cuts.outlines, cuts.points, cuts.owner, pieces,
+                runs, first_row, end_row, spans, self._used,
+            )  # fmt: skip
+            if most <= spans.shape[1]:
+                return spans
+            spans = np.empty((end_row, most), dtype=np.int64)
 
 
-def warm_up() -> None:
-    """Compile every kernel, or load it from numba's cache, by cutting one tiny image."""
-    from us_sim.volume.volume import Volume
-
-    voxels = np.zeros((2, 2, 2), dtype=np.uint8)
-    volume = Volume(voxels, np.eye(4), voxels, {0: "nothing"})
-    nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
-    slicer = ScanConversion(volume, nodes, np.array([[0, 1, 2, 3]]))
-    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
-    slicer.image(1.1 * nodes, plane)
-    slicer.labels(nodes, plane)
+def _among_centres(
+    rest_index: NDArray[np.float64], tetrahedra: NDArray[np.int32], shape: tuple[int, int, int]
+) -> NDArray[np.bool_]:
+    """(M,) which tetrahedra lie among the centres of the volume's voxels."""
+    among = (rest_index >= 0) & (rest_index <= np.array(shape) - 1)
+    return np.asarray(among[tetrahedra].all(axis=(1, 2)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill(barycentric, bounds, elements):
-    """Writes each tetrahedron's number where it lies on the image."""
-    rows, columns = elements.shape
-    for e in range(len(bounds)):
-        top = int(max(0.0, np.ceil(bounds[e, 2])))
-        bottom = int(min(rows - 1.0, np.floor(bounds[e, 3])))
-        for row in range(top, bottom + 1):
-            low, high = row_span(barycentric, e, row, 0, columns - 1)
-            for i in range(low, high + 1):
-                elements[row, i] = e
+def _neighbours(tetrahedra: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none."""
+    order, starts, counts = face_order(tetrahedra)
+    neighbours = np.full(4 * len(tetrahedra), -1, dtype=np.int32)
+    first = starts[counts == 2]
+    one, other = order[first], order[first + 1]
+    neighbours[one], neighbours[other] = other // 4, one // 4
+    return neighbours.reshape(-1, 4)
+
+
+def _pairs_of_voxels(
+    intensities: NDArray[np.uint8],
+) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    """Each voxel with the next one along the last axis, as one number, and the shape (3,)."""
+    if intensities.shape[2] == 1:
+        # Nothing follows the last voxel; a volume so thin is small.
+        intensities = np.repeat(intensities, 2, axis=2)
+    flat, shape = voxels_of(np.ascontiguousarray(intensities))
+    pairs = np.ndarray((len(flat) - 1,), dtype="<u2", buffer=flat, strides=(1,))
+    pairs.flags.writeable = False
+    return pairs, shape

@@ -76,8 +76,8 @@ class RestMesh:
             )
         self.tetrahedra = np.ascontiguousarray(given, dtype=np.int32)
         corners = self.nodes[self.tetrahedra]
-        self._determinants = np.linalg.det(corners[:, 1:] - corners[:, :1])
-        self._rest_index = np.ascontiguousarray(
+        self.determinants = np.linalg.det(corners[:, 1:] - corners[:, :1])
+        self.rest_index = np.ascontiguousarray(
             self.nodes @ patient_to_index[:3, :3].T + patient_to_index[:3, 3]
         )
 
@@ -92,8 +92,8 @@ class RestMesh:
             *_cut(
                 nodes,
                 self.tetrahedra,
-                self._rest_index,
-                self._determinants,
+                self.rest_index,
+                self.determinants,
                 plane.to_pixel,
                 float(np.linalg.det(plane.basis)),
                 plane.columns,
