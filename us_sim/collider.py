@@ -20,7 +20,19 @@ from numpy.typing import NDArray
 from us_sim.errors import ProbeError
 from us_sim.pose import Pose
 
-__all__ = ["Capsule", "Collider", "RoundedBox", "Sphere", "offset_box_distance", "signed_distance"]
+__all__ = [
+    "Capsule",
+    "Collider",
+    "Convex",
+    "RoundedBox",
+    "Sphere",
+    "curved_box_distance",
+    "offset_box_distance",
+    "signed_distance",
+]
+
+# A curved face is refused when it is steeper than this at its ends, rad.
+_STEEPEST = math.radians(75)
 
 
 @dataclass(frozen=True)
@@ -91,7 +103,54 @@ class RoundedBox:
         return np.append(sides / 2 - self.rounding, self.rounding)
 
 
-Collider = Sphere | Capsule | RoundedBox
+@dataclass(frozen=True)
+class Convex:
+    """A curved array: a rounded box whose face is part of a cylinder about a line along y.
+
+    Raises:
+        ProbeError: a dimension is not a positive number, or they do not go together.
+    """
+
+    radius: float  # m, of the face's curvature
+    length: float  # m, along the probe's x, over everything
+    width: float  # m, along the probe's y, over everything
+    height: float  # m, along the probe's z, over everything
+    rounding: float  # m, radius of edges and corners
+
+    def __post_init__(self) -> None:
+        _require_positive_lengths(self)
+        smallest = min(self.length, self.width, 2 * self.radius)
+        if 2 * self.rounding > smallest:
+            raise ProbeError(
+                f"Convex.rounding is {self.rounding:g} m, more than half of the smallest of its "
+                f"length, width and 2 radius ({smallest:g} m): give at most {smallest / 2:g} m"
+            )
+        core = self.radius - self.rounding
+        longest = 2 * (core * math.sin(_STEEPEST) + self.rounding)
+        if self.length > longest:
+            raise ProbeError(
+                f"Convex.length is {self.length:g} m, but a face of radius {self.radius:g} m "
+                f"would be steeper than {math.degrees(_STEEPEST):g} degrees at its ends: give at "
+                f"most {longest:.4g} m"
+            )
+        half = 0.5 * self.length - self.rounding
+        least = 2 * self.rounding + core - math.sqrt(core * core - half * half)
+        if self.height < least:
+            raise ProbeError(
+                f"Convex.height is {self.height:g} m, less than the face is bent: give at least "
+                f"{least:.4g} m"
+            )
+
+    @property
+    def offset_box(self) -> NDArray[np.float64]:
+        """(5,) m: half extents x, y, z of the core box, the rounding around it, and 1/m, the
+        curvature of the core's front."""
+        sides = np.array([self.length, self.width, self.height])
+        core = self.radius - self.rounding
+        return np.append(sides / 2 - self.rounding, [self.rounding, 1 / core])
+
+
+Collider = Sphere | Capsule | RoundedBox | Convex
 
 
 def signed_distance(
@@ -99,9 +158,10 @@ def signed_distance(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distance of points to the collider's surface, and its outward normal there.
 
-    Every shape here is a box (for a sphere a point, for a capsule a segment) grown by a rounding,
-    so one exact formula serves all. Where the nearest surface point is not unique, on the core
-    itself, the normal is the probe's +z if that is one of the nearest directions.
+    Every shape here is a box (for a sphere a point, for a capsule a segment) grown by a rounding;
+    the box of a curved array has a curved front. The formulas are exact. Where the nearest surface
+    point is not unique, on the core itself, the normal is the probe's +z if that is one of the
+    nearest directions.
 
     Args:
         collider: the shape, which lies in frame ``probe``.
@@ -136,6 +196,8 @@ def offset_box_distance(box, x, y, z):
 
     ``box`` is a collider's ``offset_box``; its foremost face is z = 0.
     """
+    if len(box) > 4:
+        return curved_box_distance(box, 0.0, x, y, z)
     z = z + box[2] + box[3]
     dx = abs(x) - box[0]
     dy = abs(y) - box[1]
@@ -153,6 +215,46 @@ def offset_box_distance(box, x, y, z):
         return dz - box[3], 0.0, 0.0, sz
     if dx >= dy:
         return dx - box[3], sx, 0.0, 0.0
+    return dy - box[3], 0.0, sy, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def curved_box_distance(box, grip, x, y, z):
+    """As `offset_box_distance`, of a box with a curved front that goes on behind by ``grip`` m."""
+    radius = 1.0 / box[4]
+    end = math.sqrt(radius * radius - box[0] * box[0])  # of the arc, above its centre
+    ahead = z + box[3]  # of the foremost point of the core
+    above = ahead + radius  # the arc's centre
+    behind = -(ahead + 2 * box[2] + grip)
+    sx = 1.0 if x >= 0 else -1.0
+    sy = 1.0 if y >= 0 else -1.0
+    dx = sx * x - box[0]
+    dy = sy * y - box[1]
+    # The way to the core in the plane of the image: its length, negative inside, and direction.
+    if above > 0.0 and sx * x * end <= box[0] * above:  # the arc is nearer than its ends
+        reach = math.sqrt(x * x + above * above)
+        across, ux, uz = reach - radius, x / reach, above / reach
+        if across <= 0.0:
+            if behind > across:
+                across, ux, uz = behind, 0.0, -1.0
+            if dx > across:
+                across, ux, uz = dx, sx, 0.0
+    elif dx > 0.0 or behind > 0.0:
+        ox = max(dx, 0.0)
+        oz = max(above - end, 0.0) - max(behind, 0.0)
+        across = math.sqrt(ox * ox + oz * oz)
+        ux, uz = sx * ox / across, oz / across
+    elif dx >= behind:
+        across, ux, uz = dx, sx, 0.0
+    else:
+        across, ux, uz = behind, 0.0, -1.0
+    oa = max(across, 0.0)
+    oy = max(dy, 0.0)
+    length = math.sqrt(oa * oa + oy * oy)
+    if length > 0.0:
+        return length - box[3], ux * oa / length, sy * oy / length, uz * oa / length
+    if across >= dy:
+        return across - box[3], ux, 0.0, uz
     return dy - box[3], 0.0, sy, 0.0
 
 

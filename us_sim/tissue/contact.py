@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from us_sim.collider import Collider
+from us_sim.collider import Collider, curved_box_distance
 from us_sim.pose import Pose
 
 __all__ = [
@@ -38,7 +38,7 @@ _GRIP = 0.1
 
 
 def only_forward(collider: Collider, spacing: float) -> bool:
-    """Whether the collider pushes along the probe's +z everywhere, not along its own normal.
+    """Whether the collider pushes with its face alone, not along the normals of its rounding.
 
     Surface nodes that are ``spacing`` (m) apart do not see a rounding of less than twice that: one
     by one they would slide off it sideways and the probe would sink in between them, which a
@@ -61,7 +61,7 @@ def push_out(
     Deeper, the nearest surface point is no guide: the normal may point sideways or back. There a
     point is pushed onto the tangent plane where the probe's +z through it leaves the collider, as
     if the probe had come down on it. With a smaller rounding every point is pushed along +z onto
-    the surface.
+    the surface, or, under a curved face, square to that face.
 
     Args:
         collider: the probe's shape; it is taken to go on for 0.1 m behind.
@@ -116,6 +116,8 @@ def pushing_gap(box, forward, skirt, x, y, z):
     ``box`` is the collider's ``offset_box``, ``forward`` as `only_forward` says, and ``skirt`` (m)
     widens a forward push beyond the rim.
     """
+    if len(box) > 4:
+        return _curved_pushing_gap(box, forward, skirt, x, y, z)
     rounding = box[3]
     sx = 1.0 if x >= 0 else -1.0
     sy = 1.0 if y >= 0 else -1.0
@@ -136,6 +138,43 @@ def pushing_gap(box, forward, skirt, x, y, z):
         return length - rounding, sx * ox / length, sy * oy / length, oz / length
     nz = rise / rounding
     return nz * (ahead - rise), sx * ox / rounding, sy * oy / rounding, nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _curved_pushing_gap(box, forward, skirt, x, y, z):
+    """As `pushing_gap`, of a box with a curved front."""
+    rounding, radius = box[3], 1.0 / box[4]
+    sx = 1.0 if x >= 0 else -1.0
+    sy = 1.0 if y >= 0 else -1.0
+    ox = max(abs(x) - box[0], 0.0)
+    oy = max(abs(y) - box[1], 0.0)
+    beside = ox * ox + oy * oy
+    if forward:
+        behind = -(z + rounding + 2 * box[2] + _GRIP)
+        if beside >= (rounding + skirt) ** 2 or behind >= 0.0:
+            return math.inf, 0.0, 0.0, 1.0
+    else:
+        distance, nx, ny, nz = curved_box_distance(box, _GRIP, x, y, z)
+        if distance >= 0.0 or (distance > -0.5 * rounding and nz >= 0.0):
+            return distance, nx, ny, nz
+    # Where +z through the point leaves the collider: on the bent face, or on the rounding beyond
+    # its ends; (tx, tz) is square to the face there, or at its end.
+    bulge = math.sqrt(max(rounding * rounding - oy * oy, 0.0))
+    tx = x / (radius + bulge)
+    if abs(tx) * radius <= box[0]:
+        tz = math.sqrt(1.0 - tx * tx)
+        surface = (radius + bulge) * tz
+        nx, nz = bulge * tx, bulge * tz
+    else:
+        tx = sx * box[0] / radius
+        tz = math.sqrt(1.0 - tx * tx)
+        rise = math.sqrt(max(rounding * rounding - beside, 0.0))
+        surface = radius * tz + rise
+        nx, nz = sx * ox, rise
+    below = z + rounding + radius - surface
+    if forward:
+        return tz * below, tx, 0.0, tz
+    return nz / rounding * below, nx / rounding, sy * oy / rounding, nz / rounding
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
