@@ -34,8 +34,9 @@ class Elevation:
 
     At every depth the weights are a Gaussian's at the planes, its own width chosen such that
     their variance is exactly the beam's: so few planes, a fixed distance apart, average a volume
-    that is quadratic across the plane as the continuous beam does. Grey values are averaged, as
-    when images of neighbouring planes are compounded.
+    that is quadratic across the plane as the continuous beam does. (An even number has no plane in
+    the middle and cannot be thinner than the innermost two are apart.) Grey values are averaged,
+    as when images of neighbouring planes are compounded.
     """
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
