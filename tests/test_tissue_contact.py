@@ -5,14 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.collider import Capsule, Convex, RoundedBox, Sphere, signed_distance
 from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
 from us_sim.tissue.contact import only_forward, push_out, wrench_on_probe
+from us_sim.tissue.sliding_contact import SlidingContact
 
 FINE, COARSE = 0.004, 0.02  # m, spacings that resolve a sphere of 30 mm, and that do not
 SPHERE = Sphere(0.03)
 BOX = RoundedBox(0.05, 0.015, 0.1, 0.003)
+# A face of 55 mm radius; at the ends of its core, 30 mm aside, its normals are (0.6, 0, 0.8).
+CONVEX = Convex(radius=0.055, length=0.07, width=0.02, height=0.06, rounding=0.005)
+ROUNDER = Convex(radius=0.055, length=0.076, width=0.036, height=0.06, rounding=0.01)
 
 lateral = st.floats(-0.06, 0.06)
 depth = st.floats(-0.05, 0.02)
@@ -42,7 +46,9 @@ def test_outside_and_a_little_inside_the_gap_is_the_signed_distance(x, y, z):
 
 
 @settings(deadline=None, max_examples=80)
-@given(st.sampled_from([SPHERE, Capsule(0.03, 0.04), BOX]), lateral, lateral, depth)
+@given(
+    st.sampled_from([SPHERE, Capsule(0.03, 0.04), BOX, CONVEX, ROUNDER]), lateral, lateral, depth
+)
 def test_what_is_pushed_is_pushed_out_and_never_back(collider, x, y, z):
     spacing = FINE
     gap, normal = gap_at(collider, (x, y, z), spacing)
@@ -78,6 +84,55 @@ def test_an_unresolved_rounding_pushes_forward_onto_the_surface():
     landed = np.array([[0.0, 0.0065, -0.002 - gap]])
     assert signed_distance(BOX, Pose(), landed)[0][0] == pytest.approx(0.0, abs=1e-12)
     assert gap_at(BOX, (0.0, 0.0076, -0.01), FINE)[0] == np.inf
+
+
+@pytest.mark.parametrize("spacing", [0.002, COARSE])  # the rounding is resolved, or not
+def test_a_curved_face_pushes_square_to_itself(spacing):
+    # On the face, 30 degrees aside: 1 mm within it, straight above, the push is along its radius.
+    sine, cosine = 0.5, np.sqrt(0.75)
+    on_face = 0.055 * np.array([sine, 0.0, cosine - 1.0])
+    gap, normal = gap_at(ROUNDER, on_face, spacing)
+    assert gap == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(normal, [sine, 0, cosine], atol=1e-12)
+    # 30 mm straight above it the direction is the same, if the probe came down on the point.
+    gap, normal = gap_at(ROUNDER, on_face - [0, 0, 0.03], spacing)
+    assert gap == pytest.approx(-0.03 * cosine)
+    np.testing.assert_allclose(normal, [sine, 0, cosine], atol=1e-12)
+
+
+def test_beyond_the_ends_of_a_curved_face_an_unresolved_rounding_pushes_as_its_end_does():
+    gap, normal = gap_at(CONVEX, (0.034, 0.0, -0.03), COARSE)  # 4 mm aside of the core
+    np.testing.assert_allclose(normal, [0.6, 0, 0.8])
+    # There the rounding of 5 mm rises 3 mm above the core's end, which is 15 mm back.
+    assert gap == pytest.approx(0.8 * (-0.03 + 0.015 - 0.003))
+    assert gap_at(CONVEX, (0.0351, 0.0, -0.03), COARSE)[0] == np.inf
+    assert gap_at(CONVEX, (0.0, 0.0, -0.17), COARSE)[0] == np.inf
+    assert gap_at(CONVEX, (0.0, 0.0, -0.14), COARSE)[0] == pytest.approx(-0.14)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.sampled_from([SPHERE, Capsule(0.03, 0.04), ROUNDER]), lateral, lateral, depth)
+def test_the_normal_turns_along_the_surface_as_its_curvature_says(collider, x, y, z):
+    pose = Pose(np.array([0.1, -0.2, 0.3]), np.array([0.3, -0.2, 0.5, 0.8]))
+    spacing, step = 0.002, 1e-6
+    where = pose.apply(np.array([[x, y, z]]))
+    gap, normal = push_out(collider, pose, where, spacing)
+    where -= gap[:, None] * normal
+    contact = SlidingContact(collider, spacing)
+    contact.clear(1)
+    contact.touched[:] = True
+    contact.look(pose, 0.0, where)
+    if abs(contact.gap[0]) > 1e-9 or contact.normal[0] @ pose.rotation[:, 2] < 0.05:
+        return  # it landed beside the rounding
+    expected = []
+    for axis in np.eye(3):
+        along = axis - (axis @ contact.normal[0]) * contact.normal[0]
+        ahead = push_out(collider, pose, where + step * along, spacing)[1]
+        back = push_out(collider, pose, where - step * along, spacing)[1]
+        expected.append((ahead - back)[0] / (2 * step))
+        if np.abs(ahead + back - 2 * contact.normal).max() > 1e-8:
+            return  # where two parts of the surface meet, it is bent in two ways
+    np.testing.assert_allclose(contact.curvature(pose, where)[0], expected, atol=1e-2)
 
 
 @settings(deadline=None, max_examples=30)

@@ -138,6 +138,7 @@ def collider_of(scene: Scene) -> Collider:
         "sphere": collider.Sphere,
         "capsule": collider.Capsule,
         "rounded_box": collider.RoundedBox,
+        "convex": collider.Convex,
     }
     given = dataclasses.asdict(section)
     name = given.pop("shape")

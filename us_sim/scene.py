@@ -130,7 +130,7 @@ class SkinSection:
 class ColliderSection:
     """The probe's shape that pushes tissue and skin."""
 
-    shape: str = given(choices=("sphere", "capsule", "rounded_box"))
+    shape: str = given(choices=("sphere", "capsule", "rounded_box", "convex"))
     radius: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
     length: float | None = given(Quantity("length", 1e-4, 0.5), default=None)
     width: float | None = given(Quantity("length", 1e-4, 0.5), default=None)

@@ -118,16 +118,49 @@ class SlidingContact:
         """(K, 3, 3) 1/m, how the surface's normal turns as each touched node moves along it.
 
         Where the collider is round about a point, a line or a plane, the normal turns in three, two
-        or no directions away from it; a push along a fixed direction does not turn.
+        or no directions away from it, and along a curved face as that is bent; a push along a fixed
+        direction does not turn.
         """
         count = int(self.touched.sum())
         if self.forward:
             return np.zeros((count, 3, 3))
         rotation, box = pose.rotation, self._collider.offset_box
         local = (positions[self.touched] - pose.position) @ rotation
-        local[:, 2] += box[2] + box[3]
-        round_about = np.abs(local) >= box[:3]
+        normal = self.normal[self.touched] @ rotation
+        if len(box) > 4:
+            axes, round_about, bend = _on_curved_box(box, local, normal)
+        else:
+            local[:, 2] += box[2] + box[3]
+            axes, round_about = np.eye(3)[None], np.abs(local) >= box[:3]
+            bend = np.zeros(count)
+        axes = rotation @ axes
+        turn = np.einsum("kij,kj,kmj->kim", np.broadcast_to(axes, (count, 3, 3)), round_about, axes)
         normal = self.normal[self.touched]
-        turn = np.einsum("ij,kj,mj->kim", rotation, round_about.astype(float), rotation)
         turn -= normal[:, :, None] * normal[:, None, :]
-        return turn / box[3]
+        along = axes[:, :, 0]
+        return turn / box[3] + bend[:, None, None] * along[:, :, None] * along[:, None, :]
+
+
+def _on_curved_box(
+    box: NDArray[np.float64], local: NDArray[np.float64], normal: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    """At points (K, 3) m in frame ``probe`` and normals there: axes, as the columns of (K, 3, 3),
+    along the curved front, along y and out of the front; about which of these directions' ends the
+    surface is round (K, 3); and how it is bent along the first (K,) 1/m.
+    """
+    radius, rounding = 1 / box[4], box[3]
+    steepest = np.arcsin(box[0] / radius)
+    above = local[:, 2] + rounding + radius
+    beyond = np.abs(local[:, 0]) > box[0]
+    side = beyond & (above < radius * np.cos(steepest))
+    angle = np.arctan2(local[:, 0], above)
+    end = np.abs(angle) >= steepest
+    angle = np.where(side, 0.0, np.clip(angle, -steepest, steepest))
+    axes = np.zeros((len(local), 3, 3))
+    axes[:, 0, 0] = axes[:, 2, 2] = np.cos(angle)
+    axes[:, 0, 2] = np.sin(angle)
+    axes[:, 2, 0] = -np.sin(angle)
+    axes[:, 1, 1] = 1.0
+    round_about = np.column_stack([end, np.abs(local[:, 1]) >= box[1], ~side])
+    out = np.einsum("ki,ki->k", normal, axes[:, :, 2])
+    return axes, round_about, np.where(end, 0.0, out / (radius + rounding * out))
