@@ -29,3 +29,9 @@ def test_units(dimension, text, si):
 def test_what_is_no_length(text):
     with pytest.raises(ValueError, match="is not a length"):
         Quantity("length").parse(text)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, 10**400, -(10**400), "1e999"])
+def test_what_is_not_finite(number):
+    with pytest.raises(ValueError, match="is not finite"):
+        Quantity("length").parse(number)

@@ -63,7 +63,8 @@ class Quantity:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError(f"{value!r} is not a {self.dimension}")
         if not isinstance(value, str):
-            return float(value)
+            # A whole number may be larger than any that a float holds.
+            return float(value) if abs(value) < 1e308 else math.inf
         match = _NUMBER.match(value)
         units = _UNITS[self.dimension]
         if match is None:
