@@ -110,7 +110,8 @@ class PerPixel(Slicer):
         corners = now @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
         first, last = _boxes(corners)
         met = ((last >= 0) & (first <= [plane.columns - 1, plane.rows - 1])).all(axis=1)
-        size, rest_size = (np.linalg.det(x[:, 1:] - x[:, :1]) for x in (now, places))
+        with np.errstate(over="ignore", invalid="ignore"):  # of a solver that has blown up
+            size, rest_size = (np.linalg.det(x[:, 1:] - x[:, :1]) for x in (now, places))
         valid = size * np.sign(rest_size) > _FLAT * np.abs(rest_size)
         kept = met & valid
         first, last = (np.clip(x[kept], -1, 1e6).astype(np.int64) for x in (first, last))
