@@ -80,7 +80,7 @@ def test_the_axial_length_is_as_asked_and_grows_a_tenth_each_centimetre(probe, d
 def test_a_point_loses_the_height_that_its_width_gains():
     imaging = Imaging(lateral_resolution=2e-3)
     picture, _, _ = picture_of_point(LINEAR, 0.5, 0.02, imaging)
-    lost = 20 * np.log10(np.hypot(2e-3, POINT) / POINT)  # dB: the same area under both
+    lost = 10 * np.log10(np.hypot(2e-3, POINT) / POINT)  # dB: the same power in both
     assert picture.max() == pytest.approx(255 - 4.25 * lost, abs=1.5)
 
 

@@ -1,10 +1,11 @@
 """What a point becomes: the width of the beam and the length of the pulse, at every depth.
 
-Echoes are spread in linear amplitude, not in grey values. A probe adds pressures, so a bright
-reflector smears over its dark surroundings as it does on a scanner, and widths are those of
-point targets, 6 dB below the peak, as resolution is stated. Grey values are logarithms: spreading
-them would shrink bright things and blacken what lies beside dark ones. Phases are lost in a
-volume of grey values, so speckle that is finer than the beam is smoothed, not made anew.
+Echoes are spread as power. What lies within a beam sends echoes of random phase, whose expected
+power is the sum of theirs (Wagner, Smith, Sandrik, Lopez 1983): so tissue keeps its brightness, a
+bright reflector smears over its dark surroundings as it does on a scanner, and a point is as wide
+as was asked 6 dB below its peak, where resolution is stated. Grey values are logarithms: spreading
+those would shrink what is bright and blacken what lies beside the dark. A volume of grey values
+holds no phases, so speckle finer than the beam becomes smoother, where a scanner's is coarser.
 
 >>> import numpy as np
 >>> from us_sim.slicing.imaging import Imaging
@@ -15,7 +16,7 @@ volume of grey values, so speckle that is finer than the beam is smoothed, not m
 >>> probe = LinearProbe(aperture=0.041, depth=0.041, columns=41, rows=41)  # 1 mm pixels
 >>> spread = Resolution(probe, Imaging(lateral_resolution=4e-3)).spread(point)
 >>> spread[20, 16:25]  # 2 mm from the middle 6.02 dB less, which are 25.6 grey values
-array([ 99, 144, 176, 195, 202, 195, 176, 144,  99], dtype=uint8)
+array([132, 177, 209, 228, 235, 228, 209, 177, 132], dtype=uint8)
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ from us_sim.slicing.probe import Probe
 
 __all__ = ["Resolution"]
 
-_SIGMA_PER_WIDTH = 1 / (2 * math.sqrt(2 * math.log(2)))
+# The square of a Gaussian, the power of a point, has a standard deviation √2 times less.
+_SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
 _REACH = 3.0  # standard deviations after which the point spread counts as 0
 
 _PULSE_GROWTH = (
     10.0  # 1/m: attenuation takes the high frequencies, so 10 cm deep it is twice as long
 )
 
-_FINEST = 1 << 16  # entries of the table of levels; its step is a 65th of the faintest echo
+_FINEST = 1 << 16  # entries of the table of levels; a step is a 65th of the faintest amplitude
 _COARSEST_LINES = 1.25  # pixels between the lines of a fan that is resampled
 
 
@@ -74,10 +76,10 @@ class Resolution:
     def spread(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (rows, columns) of echo levels as the probe resolves it."""
         beams = image if self._fan is None else self._fan.beams(image)
-        amplitude = np.empty(beams.shape, dtype=np.float32)
-        _spread_across(beams, _AMPLITUDES, *self._across, amplitude)
+        power = np.empty(beams.shape, dtype=np.float32)
+        _spread_across(beams, _POWERS, *self._across, power)
         out = np.empty_like(beams)
-        _spread_along(amplitude, *self._along, _LEVELS, out)
+        _spread_along(power, *self._along, _LEVELS, out)
         return out if self._fan is None else self._fan.pixels(out)
 
 
@@ -164,11 +166,11 @@ def _point_spreads(
     return weights.astype(np.float32), reach
 
 
-def _amplitudes() -> NDArray[np.float32]:
-    """(256,) the amplitude of each grey value, 1 for 255 and nothing for 0."""
-    amplitude = 10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 20.0)
-    amplitude[0] = 0.0
-    return amplitude.astype(np.float32)
+def _powers() -> NDArray[np.float32]:
+    """(256,) the power of each grey value, 1 for 255 and nothing for 0."""
+    power = 10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 10.0)
+    power[0] = 0.0
+    return power.astype(np.float32)
 
 
 def _levels() -> NDArray[np.uint8]:
@@ -178,13 +180,13 @@ def _levels() -> NDArray[np.uint8]:
     return np.clip(np.floor(level + 0.5), 0, 255).astype(np.uint8)
 
 
-_AMPLITUDES = _amplitudes()
+_POWERS = _powers()
 _LEVELS = _levels()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _spread_across(image, amplitudes, weights, reach, out):
-    """Rows of grey values (rows, lines), as amplitudes spread along the row, to ``out``."""
+def _spread_across(image, powers, weights, reach, out):
+    """Rows of grey values (rows, lines), as power spread along the row, to ``out``."""
     rows, lines = image.shape
     padded = np.empty(lines + 2 * weights.shape[1], dtype=np.float32)
     for row in range(rows):
@@ -192,7 +194,7 @@ def _spread_across(image, amplitudes, weights, reach, out):
         inner = padded[r : r + lines]
         echoes = image[row]
         for i in range(lines):
-            inner[i] = amplitudes[echoes[i]]
+            inner[i] = powers[echoes[i]]
         for i in range(r):
             padded[i] = inner[0]
             padded[r + lines + i] = inner[lines - 1]
@@ -209,22 +211,24 @@ def _spread_across(image, amplitudes, weights, reach, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _spread_along(amplitude, weights, reach, levels, out):
-    """Amplitudes (rows, lines) spread across rows, as grey values to ``out``."""
-    rows, lines = amplitude.shape
+def _spread_along(power, weights, reach, levels, out):
+    """Power (rows, lines) spread across rows, as grey values to ``out``."""
+    rows, lines = power.shape
     line = np.empty(lines, dtype=np.float32)
     finest = np.float32(len(levels) - 1)
     for row in range(rows):
         middle = weights[row, 0]
-        own = amplitude[row]
+        own = power[row]
         for i in range(lines):
             line[i] = middle * own[i]
         for k in range(1, reach[row] + 1):
             weight = weights[row, k]
-            above = amplitude[max(row - k, 0)]
-            below = amplitude[min(row + k, rows - 1)]
+            above = power[max(row - k, 0)]
+            below = power[min(row + k, rows - 1)]
             for i in range(lines):
                 line[i] += weight * (above[i] + below[i])
+        for i in range(lines):
+            line[i] = min(np.sqrt(line[i]), np.float32(1.0)) * finest + np.float32(0.5)
         shown = out[row]
         for i in range(lines):
-            shown[i] = levels[np.int32(min(line[i], np.float32(1.0)) * finest + np.float32(0.5))]
+            shown[i] = levels[np.int32(line[i])]
