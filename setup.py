@@ -69,7 +69,7 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
-        "evaluate": ["scikit-fem>=10", "vtk>=9.3"],
+        "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
         "test": [
             "hypothesis>=6.100",
@@ -81,6 +81,7 @@ setup(
             "scikit-fem>=10",
             "types-PyYAML",
             "types-tqdm",
+            "vtk>=9.4",
         ],
     },
     data_files=[

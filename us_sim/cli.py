@@ -113,6 +113,13 @@ def _parser() -> argparse.ArgumentParser:
             help="folder to write to; default: %(default)s",
         )
         measured.set_defaults(command=command)
+        if subject == "slice":
+            measured.add_argument(
+                "--volume", type=Path, metavar="FILE", help="volume compounded from --sweep"
+            )
+            measured.add_argument(
+                "--sweep", type=Path, metavar="FILE", help="tracked sweep to compare images with"
+            )
     return parser
 
 
@@ -210,7 +217,7 @@ def _evaluate_stability(args: argparse.Namespace) -> int:
 def _evaluate_slice(args: argparse.Namespace) -> int:
     from us_sim.evaluation.slice import evaluate_slice
 
-    return evaluate_slice(args.out, args.quick)
+    return evaluate_slice(args.out, args.quick, args.volume, args.sweep)
 
 
 def _parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,56 +17,77 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.slice_cases import MAIN, Case, Frame, cases, speckle
+from us_sim.evaluation.recorded_frames import RecordedComparison, compare_with_recorded
+from us_sim.evaluation.slice_cases import MAIN, Case, Frame, cases, speckle, striped
+from us_sim.evaluation.slice_contenders import Contender, contender, methods
+from us_sim.evaluation.slice_costs import costs
 from us_sim.evaluation.slice_memory import peak_memory
-from us_sim.evaluation.slice_points import COLUMNS, Contender, Point, compare, timed_together
-from us_sim.evaluation.slice_reference import exact_slice
-from us_sim.evaluation.slice_report import table, write_report
-from us_sim.evaluation.slice_vtk import HOW_TO_GET, VtkSlicer, is_installed
+from us_sim.evaluation.slice_pictures import draw_differences
+from us_sim.evaluation.slice_points import COLUMNS, Errors, Point, compare, timed_together
+from us_sim.evaluation.slice_publishing import publishing_ms
+from us_sim.evaluation.slice_reference import ExactSlice, exact_slice, sampled
+from us_sim.evaluation.slice_report import Surroundings, table, write_report
+from us_sim.evaluation.slice_targets import LARGE_VOLUME
+from us_sim.evaluation.slice_vtk import HOW_TO_GET, is_installed
 from us_sim.progress import Progress
-from us_sim.slicing.slicer import METHODS, create_slicer
-from us_sim.volume.volume import Volume
 
 __all__ = ["evaluate_slice"]
 
 # Threads that each method is given.
 _THREADS = {"scan_conversion": (1, 2), "row_subdivision": (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
-_LARGE_VOLUME = 512  # voxels a side, whose memory is asked for
 _FRAMES = 4  # that a case's images go through
-_SECONDS, _SECONDS_OF_MAIN = 4.0, 15.0  # of timing a case
-_QUICK_SECONDS, _QUICK_SECONDS_OF_MAIN = 2.0, 6.0
+# s, of timing the main case and another.
+_SECONDS, _QUICK_SECONDS = (15.0, 4.0), (5.0, 1.0)
 
 
-def evaluate_slice(out: Path, quick: bool) -> int:
+def evaluate_slice(
+    out: Path, quick: bool, volume_file: Path | None = None, sweep_file: Path | None = None
+) -> int:
     """Measure, write slice.csv, the pictures and slice.md, and print the table.
 
     Args:
         out: folder to write to; made if it is not there.
         quick: fewer cases, timed more shortly.
+        volume_file: a volume that was compounded from a tracked sweep, if its recorded frames are
+            to be compared with images of it.
+        sweep_file: that sweep.
 
     Returns:
         0, or 1 when a method failed; its row says how, and the others are there.
 
     Raises:
-        UsSimError: the folder cannot be written.
+        UsSimError: the folder cannot be written, one of the two files is given without the other,
+            or cannot be read.
     """
     begin = time.perf_counter()
     _prepare(out)
-    volume = speckle()
+    recorded = _recorded(volume_file, sweep_file, out, quick)
+    bench = _Bench(quick)
     planned = cases(quick)
     points: list[Point] = []
     with Progress("slices", len(planned), "cases") as progress:
         for done, case in enumerate(planned):
             progress.update(done, case.name)
-            points += _points(volume, case, quick)
+            points += bench.points(case)
         progress.update(len(planned))
     with (out / "slice.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         writer.writerows(point.row for point in points)
-    memory = peak_memory(_LARGE_VOLUME)
+    with Progress("around the slices", 4, "parts") as progress:
+        progress.update(0, "picture of differences")
+        differences = out / "slice_differences.png"
+        draw_differences(bench.volume, _working(points), differences)
+        progress.update(1, "probes and image formation")
+        probes, settings = costs(bench.volume, quick)
+        progress.update(2, "publishing")
+        publishing = publishing_ms(MAIN.size)
+        progress.update(3, "memory")
+        memory = peak_memory(LARGE_VOLUME)
+        progress.update(4)
+    around = Surroundings(probes, settings, publishing, memory, recorded)
     seconds = time.perf_counter() - begin
-    pictures = write_report(out, points, [], memory, quick, seconds)
+    pictures = [*write_report(out, points, around, quick, seconds), differences]
     print(table(points))
     if not is_installed():
         print(HOW_TO_GET)
@@ -74,6 +96,32 @@ def evaluate_slice(out: Path, quick: bool) -> int:
     for point in failed:
         print(f"failed: {point.method} on {point.size} px, {point.nodes} nodes: {point.failure}")
     return 1 if failed else 0
+
+
+def _recorded(
+    volume_file: Path | None, sweep_file: Path | None, out: Path, quick: bool
+) -> RecordedComparison | None:
+    """The comparison with recorded frames, if it is asked for.
+
+    Raises:
+        UsSimError: one of the two files is given without the other, or cannot be read.
+    """
+    if volume_file is None and sweep_file is None:
+        return None
+    if volume_file is None or sweep_file is None:
+        raise UsSimError(
+            "--volume and --sweep belong together: give the tracked sweep and the volume that was "
+            "compounded from it"
+        )
+    with Progress("recorded frames") as progress:
+        progress.update(0, f"{sweep_file.name} against {volume_file.name}")
+        return compare_with_recorded(volume_file, sweep_file, out, quick)
+
+
+def _working(points: Sequence[Point]) -> list[str]:
+    """The methods that did not fail."""
+    failed = {point.method for point in points if point.failure}
+    return [method for method in methods() if method not in failed]
 
 
 def _prepare(out: Path) -> None:
@@ -91,18 +139,24 @@ def _prepare(out: Path) -> None:
         ) from error
 
 
-def _points(volume: Volume, case: Case, quick: bool) -> list[Point]:
-    """A row for every method."""
-    mesh, frames = case.mesh(), case.frames(_FRAMES)
-    frame = frames[0]
-    exact = exact_slice(volume, mesh.nodes, mesh.tetrahedra, frame.nodes, frame.plane)
-    contenders: list[Contender] = []
-    errors = {}
-    points = {}
-    for method in (*METHODS, *(["vtk"] if is_installed() else [])):
-        for threads in _THREADS[method]:
-            key = (method, threads)
-            points[key] = Point(
+class _Bench:
+    """Cuts cases with every method; keeps what they share."""
+
+    def __init__(self, quick: bool) -> None:
+        self.volume = speckle()
+        self._stripes = [striped(axis) for axis in range(3)]
+        self._seconds = _QUICK_SECONDS if quick else _SECONDS
+
+    def points(self, case: Case) -> list[Point]:
+        """A row for every method."""
+        mesh, frames = case.mesh(), case.frames(_FRAMES)
+        first = frames[0]
+        exact = exact_slice(self.volume, mesh.nodes, mesh.tetrahedra, first.nodes, first.plane)
+        shown = [sampled(volume, exact.rest) for volume in self._stripes]
+        contenders: list[Contender] = []
+        points: dict[tuple[str, int], Point] = {}
+        for method, threads in ((m, n) for m in methods() for n in _THREADS[m]):
+            point = Point(
                 method,
                 case.size,
                 len(mesh.nodes),
@@ -112,53 +166,42 @@ def _points(volume: Volume, case: Case, quick: bool) -> list[Point]:
                 plane=case.plane,
             )
             try:
-                contender = _contender(volume, case, method, threads)
-                image, rest = contender.image(frame), contender.rest_coordinates(frame)
+                ready = contender(self.volume, case, method, threads)
+                errors = self._errors(case, ready, first, exact, shown)
             # Whatever breaks in one method must not take the others' results along.
             except Exception as error:
                 words = f"{type(error).__name__}: {error}".replace("\n", " ")
-                points[key] = replace(points[key], failure=words)
+                points[method, threads] = replace(point, failure=words)
                 continue
-            errors[key] = compare(volume, frame, exact, image, rest, tissue_only=method == "vtk")
-            contenders.append(contender)
-    main = case == MAIN
-    if quick:
-        seconds = _QUICK_SECONDS_OF_MAIN if main else _QUICK_SECONDS
-    else:
-        seconds = _SECONDS_OF_MAIN if main else _SECONDS
-    for contender, (timing, parts) in zip(
-        contenders, timed_together(contenders, frames, seconds), strict=True
-    ):
-        key = (contender.method, contender.threads)
-        points[key] = replace(
-            points[key],
-            **errors[key]._asdict(),
-            ms_median=timing.median,
-            ms_p99=timing.p99,
-            filter_ms=parts[0],
-            sampling_ms=parts[1],
-            images=len(timing.milliseconds),
+            points[method, threads] = replace(point, **errors._asdict())
+            contenders.append(ready)
+        times = timed_together(contenders, frames, self._seconds[case != MAIN])
+        for ready, (timing, parts) in zip(contenders, times, strict=True):
+            key = (ready.method, ready.threads)
+            points[key] = replace(
+                points[key],
+                ms_median=timing.median,
+                ms_p99=timing.p99,
+                filter_ms=parts[0],
+                sampling_ms=parts[1],
+                images=len(timing.milliseconds),
+            )
+        return list(points.values())
+
+    def _errors(
+        self,
+        case: Case,
+        ready: Contender,
+        frame: Frame,
+        exact: ExactSlice,
+        shown: Sequence[NDArray[np.float64]],
+    ) -> Errors:
+        """What is wrong in one method's image; ``shown`` is what it must show of the stripes."""
+        image, rest = ready.image(frame), ready.rest_coordinates(frame)
+        seen = [
+            (grey, contender(volume, case, ready.method, ready.threads).image(frame))
+            for grey, volume in zip(shown, self._stripes, strict=True)
+        ]
+        return compare(
+            self.volume, frame, exact, image, rest, seen, tissue_only=ready.method == "vtk"
         )
-    return list(points.values())
-
-
-def _contender(volume: Volume, case: Case, method: str, threads: int) -> Contender:
-    mesh = case.mesh()
-    if method == "vtk":
-        vtk = VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
-        return Contender(
-            method,
-            threads,
-            lambda frame: vtk.image(frame.nodes, frame.plane),
-            lambda frame: vtk.rest_coordinates(frame.nodes, frame.plane),
-            lambda: (vtk.filter_ms, vtk.sampling_ms),
-        )
-    slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
-
-    def image(frame: Frame) -> NDArray[np.uint8]:
-        return slicer.image(frame.nodes, frame.plane)
-
-    def rest(frame: Frame) -> NDArray[np.float64]:
-        return slicer.rest_coordinates(frame.nodes, frame.plane)
-
-    return Contender(method, threads, image, rest)

@@ -28,7 +28,18 @@ from us_sim.slicing.probe import LinearProbe
 from us_sim.tissue.mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-__all__ = ["DEPTHS", "MAIN", "PLANES", "SIZES", "Case", "Frame", "cases", "dented", "speckle"]
+__all__ = [
+    "DEPTHS",
+    "MAIN",
+    "PLANES",
+    "SIZES",
+    "Case",
+    "Frame",
+    "cases",
+    "dented",
+    "speckle",
+    "striped",
+]
 
 #: Columns, and rows, of an image.
 SIZES = (256, 512, 1024)
@@ -41,6 +52,7 @@ _VOXEL = 0.4e-3  # m
 _WIDTH = 0.022  # m, of the dent: its standard deviation
 _BULGE = 0.25  # of the dent's depth, by which tissue under it is pushed aside
 _APERTURE, _DEPTH = 0.06, 0.08  # m, of the image
+_LAYERS = (0.008, 0.02, 0.035, 0.05, 0.07, 0.09)  # m below the skin
 _TREMOR = 0.2e-3  # m, of the probe from one image to the next
 
 
@@ -156,30 +168,49 @@ def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
 
 
 def speckle(seed: int = 1) -> Volume:
-    """The block's volume, and a little around it: speckle with darker and brighter balls."""
-    low, high = (np.array(side) for side in zip(*_EXTENT, strict=True))
-    low, high = low - _BEYOND, high + _BEYOND
-    shape = tuple(np.ceil((high - low) / _VOXEL).astype(int))
+    """The block's volume, and a little around it: speckle with balls and bright layers."""
+    axes = _voxel_axes()
     generator = np.random.default_rng(seed)
-    echo = generator.standard_normal(shape, dtype=np.float32)
+    echo = generator.standard_normal([len(axis) for axis in axes], dtype=np.float32)
     for axis in range(3):
         echo = ndimage.correlate1d(echo, np.array([0.25, 0.5, 0.25], np.float32), axis)
     echo *= np.float32(60.0 / echo.std())
     grey = np.abs(echo, out=echo)
-    axes = [start + _VOXEL * (np.arange(n) + 0.5) for start, n in zip(low, shape, strict=True)]
     for _ in range(40):
-        centre, radius = generator.uniform(low, high), generator.uniform(3e-3, 9e-3)
+        centre = [generator.uniform(axis[0], axis[-1]) for axis in axes]
+        radius = generator.uniform(3e-3, 9e-3)
         part = tuple(
             slice(*np.searchsorted(axis, [c - radius, c + radius]))
             for axis, c in zip(axes, centre, strict=True)
         )
-        x, y, z = np.ix_(
-            *((axis[s] - c) ** 2 for axis, s, c in zip(axes, part, centre, strict=True))
-        )
+        inside = [(axis[p] - c) ** 2 for axis, p, c in zip(axes, part, centre, strict=True)]
+        x, y, z = np.ix_(*inside)
         grey[part][x + y + z < radius**2] *= np.float32(generator.choice([0.2, 2.0]))
-    voxels = np.minimum(grey, 255.0, out=grey).astype(np.uint8)
+    for depth in _LAYERS:
+        grey[:, :, np.abs(axes[2] - depth) < 0.6e-3] *= np.float32(2.5)
+    return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
+
+
+def striped(axis: int) -> Volume:
+    """Of the same shape and place: black and white in turn along an axis, voxel by voxel."""
+    shape = [len(places) for places in _voxel_axes()]
+    voxels = np.zeros(shape, dtype=np.uint8)
+    np.moveaxis(voxels, axis, 0)[1::2] = 255
+    return _placed(voxels)
+
+
+def _voxel_axes() -> list[NDArray[np.float64]]:
+    """m, the centres of the voxels along x, y and z."""
+    counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in _EXTENT)
+    return [
+        np.asarray(low - _BEYOND + _VOXEL * (np.arange(count) + 0.5))
+        for (low, _), count in zip(_EXTENT, counts, strict=True)
+    ]
+
+
+def _placed(voxels: NDArray[np.uint8]) -> Volume:
     placed = np.diag([_VOXEL, _VOXEL, _VOXEL, 1.0])
-    placed[:3, 3] = low + _VOXEL / 2
+    placed[:3, 3] = [axis[0] for axis in _voxel_axes()]
     return Volume(voxels, placed)
 
 

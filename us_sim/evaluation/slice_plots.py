@@ -23,16 +23,14 @@ STYLES = {
     "vtk": ("#CC79A7", "^"),
 }
 _FRAME = 1000.0 / 60.0  # ms, at 60 images a second
+_TENTH = 0.1  # voxels
 _SMALLEST = 1e-14  # voxels, drawn where a method is exact to the last bit
 
 
 def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
-    """A panel each: the worst pixel's distance from its true place against ms an image.
-
-    Full marks are one thread, hollow ones two.
-    """
-    figure = _figure((4.2 * len(panels) + 0.5, 4.4))
-    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    """A panel each: the worst pixel's distance from its true place against ms an image."""
+    figure = _figure((3.9 * len(panels) + 1.8, 4.4))
+    axes = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     for panel, (title, points) in zip(axes, panels.items(), strict=True):
         for method, (colour, mark) in STYLES.items():
             mine = sorted((p for p in points if p.method == method), key=lambda p: p.threads)
@@ -45,24 +43,20 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
             for at, error, point in zip(x, y, mine, strict=True):
                 fill = colour if point.threads == 1 else "white"
                 panel.plot(at, error, mark, mfc=fill, mec=colour, ms=8)
-            panel.annotate(
-                method,
-                (x[0], y[0]),
-                xytext=(0, 9),
-                textcoords="offset points",
-                color=colour,
-                fontsize=9,
-                ha="center",
-            )
         panel.set_title(title, fontsize=11, loc="left")
         panel.set_xlabel("ms an image (median)")
         panel.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
         panel.set_xscale("log")
         panel.set_yscale("log")
-        panel.margins(0.22, 0.14)
+        panel.margins(0.08, 0.14)
+        panel.axhline(_TENTH, color="0.75", lw=1, ls="--", zorder=0)
         _plain(panel)
+    _keys(axes[-1], {p.method for points in panels.values() for p in points})
     axes[0].set_ylabel("worst pixel's error at rest, voxels")
-    _title(figure, "Error against run time; hollow: two threads; dotted: 60 images a second")
+    _title(
+        figure,
+        "Error against run time (dotted: 60 images a second; dashed: a tenth of a voxel)",
+    )
     figure.savefig(file, dpi=figure.dpi)
 
 
@@ -117,7 +111,11 @@ def _times(panel, points, across) -> None:  # type: ignore[no-untyped-def]
     panel.set_ylabel("ms an image (median)")
     _plain(panel)
     panel.xaxis.set_minor_formatter(NullFormatter())
-    known = {p.method for p in points}
+    _keys(panel, {p.method for p in points})
+
+
+def _keys(panel, known) -> None:  # type: ignore[no-untyped-def]
+    """What colours and marks mean, beside a panel."""
     keys = [
         Line2D([], [], color=colour, marker=mark, label=method)
         for method, (colour, mark) in STYLES.items()
@@ -125,7 +123,7 @@ def _times(panel, points, across) -> None:  # type: ignore[no-untyped-def]
     ]
     keys.append(Line2D([], [], color="0.4", ls=":", marker="o", mfc="white", label="two threads"))
     panel.legend(
-        handles=keys, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
+        handles=keys, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5)
     )
 
 

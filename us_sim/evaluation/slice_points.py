@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
@@ -18,16 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.slice_cases import Frame
+from us_sim.evaluation.slice_contenders import Contender
 from us_sim.evaluation.slice_reference import ExactSlice, voxel_distance
 from us_sim.volume.volume import Volume
 
-__all__ = ["COLUMNS", "Contender", "Errors", "Point", "Timing", "compare", "timed_together"]
+__all__ = ["COLUMNS", "Errors", "Point", "Timing", "compare", "timed_together", "wrong_pixels"]
 
 _AGAIN = 5  # images in a turn of a method that takes less than _SHORT
 _SHORT = 8.0  # ms
 _FEWEST = 3  # turns of each method
 # Voxels by which tissue must have moved before taking it for the rigid volume can be told.
 _MOVED = 0.01
+_ROUNDED = 0.5 + 1e-6  # grey levels
 
 
 class Errors(NamedTuple):
@@ -89,17 +91,6 @@ class Timing:
         return float(np.percentile(self.milliseconds, 99))
 
 
-@dataclass(frozen=True)
-class Contender:
-    """A method ready to cut a case's images."""
-
-    method: str
-    threads: int
-    image: Callable[[Frame], NDArray[np.uint8]]
-    rest_coordinates: Callable[[Frame], NDArray[np.float64]]
-    parts: Callable[[], tuple[float, float]] | None = None  # ms of the latest image, where known
-
-
 def timed_together(
     contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
 ) -> list[tuple[Timing, tuple[float, float]]]:
@@ -144,6 +135,7 @@ def compare(
     exact: ExactSlice,
     image: NDArray[np.uint8],
     rest: NDArray[np.float64],
+    stripes: Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]] = (),
     tissue_only: bool = False,
 ) -> Errors:
     """How wrong an image (rows, columns), and where it took it from (rows, columns, 3) m, are.
@@ -154,8 +146,40 @@ def compare(
         exact: what it must show.
         image: grey values.
         rest: NaN where the method found nothing.
+        stripes: what images of volumes of black and white in turn must show, and the method's
+            images of them: where those come from shows there to half a grey level, 0.002 voxels,
+            whatever it says in ``rest``.
         tissue_only: the method knows nothing of the rigid volume outside the mesh: grey values
             and places are compared where both find tissue.
+    """
+    right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
+    greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
+    grey = np.abs(image - np.rint(exact.grey))[greys]
+    distance = voxel_distance(volume, rest, expected)[right].max(initial=0.0)
+    for shown, seen in stripes:
+        off = np.abs(seen - shown)[right].max(initial=0.0)
+        # A value is rounded to a whole one, and black to white is a voxel.
+        distance = max(distance, (off - _ROUNDED) / 255.0)
+    return Errors(
+        int(wrong.sum()),
+        float(grey.max(initial=0.0)),
+        float(grey.mean()) if grey.size else 0.0,
+        float(distance),
+    )
+
+
+def wrong_pixels(
+    volume: Volume,
+    frame: Frame,
+    exact: ExactSlice,
+    rest: NDArray[np.float64],
+    tissue_only: bool,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+    """Which pixels' coverage is right and which wrong; arguments as for `compare`.
+
+    Returns:
+        (rows, columns): where both show the same kind of thing and something; where they do not
+        show the same; and (rows, columns, 3) m, where each pixel is from.
     """
     expected = np.where(exact.tissue[..., None], exact.rest, np.nan) if tissue_only else exact.rest
     known, seen = np.isfinite(expected[..., 0]), np.isfinite(rest[..., 0])
@@ -164,15 +188,7 @@ def compare(
     seen_moved = voxel_distance(volume, rest, pixels) > _MOVED / 2
     # Tissue that hardly moved is where the rigid volume is, and shows the same.
     right = known & seen & ~(moved & ~seen_moved) & (exact.tissue | ~seen_moved)
-    greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
-    grey = np.abs(image - np.rint(exact.grey))[greys]
-    distance = voxel_distance(volume, rest, expected)[right]
-    return Errors(
-        int(((known | seen) & ~right).sum()),
-        float(grey.max(initial=0.0)),
-        float(grey.mean()) if grey.size else 0.0,
-        float(distance.max(initial=0.0)),
-    )
+    return right, (known | seen) & ~right, expected
 
 
 def _cell(value: object) -> str:

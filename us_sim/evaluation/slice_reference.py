@@ -58,8 +58,9 @@ def exact_slice(
     rest = _located(rest_nodes, tetrahedra, nodes, plane)
     tissue = ~np.isnan(rest[..., 0])
     rest[~tissue] = pixels[~tissue]
-    moved_away = ~np.isnan(_located(rest_nodes, tetrahedra, rest_nodes, plane)[..., 0]) & ~tissue
-    rest[moved_away] = np.nan
+    if not tissue.all():
+        was = ~np.isnan(_located(rest_nodes, tetrahedra, rest_nodes, plane)[..., 0])
+        rest[was & ~tissue] = np.nan
     return ExactSlice(rest, tissue, sampled(volume, rest))
 
 

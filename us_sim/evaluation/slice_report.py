@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from os import cpu_count
 from pathlib import Path
 
 import numpy as np
 
+from us_sim.evaluation.recorded_frames import RecordedComparison
 from us_sim.evaluation.slice_cases import DEPTHS, MAIN, PLANES
+from us_sim.evaluation.slice_costs import Cost
 from us_sim.evaluation.slice_plots import plot_errors, plot_meshes, plot_pixels
 from us_sim.evaluation.slice_points import Point
 from us_sim.evaluation.slice_targets import (
-    Target,
     exponent,
     main_points,
     mesh_points,
@@ -23,7 +25,18 @@ from us_sim.evaluation.slice_targets import (
 )
 from us_sim.evaluation.slice_vtk import HOW_TO_GET
 
-__all__ = ["table", "write_report"]
+__all__ = ["Surroundings", "table", "write_report"]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is measured around the slices themselves."""
+
+    probes: Sequence[Cost]
+    settings: Sequence[Cost]
+    publishing: float | None  # ms, where known
+    peak_memory: int | None  # bytes held with a volume of 512³ voxels, where known
+    recorded: RecordedComparison | None  # where it was asked for
 
 
 def table(points: Sequence[Point]) -> str:
@@ -34,8 +47,7 @@ def table(points: Sequence[Point]) -> str:
 def write_report(
     out: Path,
     points: Sequence[Point],
-    sections: Sequence[str],
-    peak_memory: int | None,
+    around: Surroundings,
     quick: bool,
     seconds: float,
 ) -> list[Path]:
@@ -44,8 +56,7 @@ def write_report(
     Args:
         out: folder.
         points: all rows.
-        sections: that other parts of the evaluation add, in Markdown.
-        peak_memory: bytes that a process held with a volume of 512³ voxels, where known.
+        around: what was measured besides.
         quick: whether it was the short run.
         seconds: that the run took.
     """
@@ -59,21 +70,21 @@ def write_report(
     if points and panels:
         plot_errors(panels, files[0])
         plot_meshes(on_meshes, f"{MAIN.size} × {MAIN.size}, pressed by 12 mm", files[1])
-        plot_pixels(in_sizes, f"{int(np.prod(MAIN.counts)):,} nodes, pressed by 12 mm", files[2])
+        plot_pixels(in_sizes, f"{_nodes()} nodes, pressed by 12 mm", files[2])
     else:
         files = []
-    text = _text(points, targets(points, peak_memory), sections, quick, seconds)
+    text = _text(points, around, quick, seconds)
     (out / "slice.md").write_text(text, encoding="utf-8")
     return files
 
 
 def _text(
     points: Sequence[Point],
-    asked: Sequence[Target],
-    sections: Sequence[str],
+    around: Surroundings,
     quick: bool,
     seconds: float,
 ) -> str:
+    asked = targets(points, around.peak_memory, around.publishing)
     without_vtk = not any(p.method == "vtk" for p in points)
     views = "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items())
     parts = [
@@ -92,10 +103,13 @@ def _text(
         "## Error against run time",
         "![Error against run time](slice_error.png)",
         _table(*_summary(points)),
-        f"Times are of {MAIN.size} × {MAIN.size} pixels on 8,192 nodes pressed by 12 mm, the "
+        f"Times are of {MAIN.size} × {MAIN.size} pixels on {_nodes()} nodes pressed by 12 mm, the "
         "errors the worst of all cases. VTK knows nothing of the rigid volume around the block: "
-        "its errors count where tissue is. Voxels are those by which `rest_coordinates` misses.",
-        *sections,
+        "its errors count where tissue is. A voxel error is the distance "
+        "between where a pixel's tissue lies at rest and where it was taken from, by the method's "
+        "own account and by its images of volumes striped black and white (which tell 0.002 "
+        "voxels).",
+        "![What is cut, and where pixels are taken from](slice_differences.png)",
         "## Images' sizes",
         "![Time against pixels](slice_pixels.png)",
         _across(size_points(points), "size", lambda p: p.size**2, lambda p: f"{p.size}²"),
@@ -107,6 +121,16 @@ def _text(
         "(tissue, rigid volume or nothing) is not the reference's.",
         _cases_table(points),
         *_vtk_apart(points),
+        "## Probes and image formation",
+        f"Whole images of {MAIN.size} × {MAIN.size} pixels by `scan_conversion` on one thread, on "
+        f"{_nodes()} nodes pressed by 12 mm, in turns; contact includes finding where the "
+        "face touches the skin.",
+        _table(
+            ("probe", "ms", "pixels in the image"),
+            [(c.what, f"{c.ms:.2f}", f"{100 * c.shown:.0f} %") for c in around.probes],
+        ),
+        _settings_table(around.settings),
+        *_recorded(around.recorded),
         "## How it was measured",
         "Wall clock of one call that returns the image, for the methods here and for VTK from the "
         "deformed nodes as an array to the image as an array. A turn has five images in a row of "
@@ -115,7 +139,8 @@ def _text(
         "and rest coordinates are of one image a case. A pixel is at fault where the method finds "
         "nothing and the reference something, or the reverse, or where it takes tissue that moved "
         "by more than a hundredth of a voxel for the rigid volume, or the reverse. The memory is "
-        "the peak of a process of its own.",
+        "the peak of a process of its own; the message of an image goes to a subscriber in "
+        "another process.",
     ]
     failures = [p for p in points if p.failure]
     if failures:
@@ -211,6 +236,23 @@ def _vtk_apart(points: Sequence[Point]) -> list[str]:
         "direction. VTK's wheels use one thread unless told otherwise.",
         _table(("size", "threads", "filter ms", "sampling ms"), rows),
     ]
+
+
+def _nodes() -> str:
+    return f"{np.prod(MAIN.counts):,}"
+
+
+def _settings_table(settings: Sequence[Cost]) -> str:
+    plain = settings[0].ms if settings else 0.0
+    rows = [(c.what, f"{c.ms:.2f}", f"{c.ms - plain:+.2f}") for c in settings]
+    return _table(("imaging", "ms", "more than at the defaults"), rows)
+
+
+def _recorded(comparison: RecordedComparison | None) -> list[str]:
+    if comparison is None:
+        return []
+    pictures = [f"![Recorded and cut]({f.name})" for f in comparison.files if f.suffix == ".png"]
+    return ["## Recorded frames", comparison.markdown(), *pictures]
 
 
 def _machine() -> str:

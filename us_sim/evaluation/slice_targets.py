@@ -15,11 +15,19 @@ import numpy as np
 from us_sim.evaluation.slice_cases import MAIN
 from us_sim.evaluation.slice_points import Point
 
-__all__ = ["Target", "exponent", "main_points", "mesh_points", "size_points", "targets"]
+__all__ = [
+    "LARGE_VOLUME",
+    "Target",
+    "exponent",
+    "main_points",
+    "mesh_points",
+    "size_points",
+    "targets",
+]
 
 _METHOD = "scan_conversion"
-_MESH_NODES = int(np.prod(MAIN.counts))
-_LARGE = 512  # voxels a side, of the volume whose memory is asked for
+#: Voxels a side, of the volume whose memory is asked for.
+LARGE_VOLUME = 512
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,7 @@ class Target:
 
 def main_points(points: Sequence[Point]) -> list[Point]:
     """Those of the case by which methods are compared."""
-    return [p for p in mesh_points(points) if p.nodes == _MESH_NODES]
+    return [p for p in mesh_points(points) if p.nodes == np.prod(MAIN.counts)]
 
 
 def mesh_points(points: Sequence[Point]) -> list[Point]:
@@ -49,7 +57,7 @@ def mesh_points(points: Sequence[Point]) -> list[Point]:
 
 def size_points(points: Sequence[Point]) -> list[Point]:
     """The same image in every size."""
-    return [p for p in _of_main_image(points) if p.nodes == _MESH_NODES]
+    return [p for p in _of_main_image(points) if p.nodes == np.prod(MAIN.counts)]
 
 
 def exponent(points: Sequence[Point], across: Callable[[Point], float]) -> float:
@@ -60,14 +68,22 @@ def exponent(points: Sequence[Point], across: Callable[[Point], float]) -> float
     return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
 
 
-def targets(points: Sequence[Point], peak_memory: int | None) -> list[Target]:
-    """Every measure that is asked for; ``peak_memory`` in bytes, for a volume of 512³ voxels."""
+def targets(
+    points: Sequence[Point], peak_memory: int | None, publishing: float | None
+) -> list[Target]:
+    """Every measure that is asked for.
+
+    Args:
+        points: all rows.
+        peak_memory: bytes that a process held with a volume of 512³ voxels, where known.
+        publishing: ms of sending an image, where known.
+    """
     main = {(p.method, p.threads): p.ms_median for p in main_points(points)}
     one = main.get((_METHOD, 1), float("nan"))
     own = [p for p in points if p.method == _METHOD and not p.failure]
     meshes = [p for p in mesh_points(points) if p.method == _METHOD and p.threads == 1]
     sizes = [p for p in size_points(points) if p.method == _METHOD and p.threads == 1]
-    image = f"{MAIN.size} × {MAIN.size} on 34,875 tetrahedra pressed 12 mm"
+    image = f"{MAIN.size} × {MAIN.size} on {_tetrahedra(points)} tetrahedra pressed 12 mm"
     return [
         _at_most(f"{image}, one core", 2.0, one, "ms"),
         _at_most(f"{image}, two cores", 1.2, main.get((_METHOD, 2), float("nan")), "ms"),
@@ -86,7 +102,17 @@ def targets(points: Sequence[Point], peak_memory: int | None) -> list[Target]:
         _growth(meshes),
         _linear(sizes),
         _memory(peak_memory),
+        _at_most(
+            f"making and publishing the message of an image, {MAIN.size} × {MAIN.size} at 60 Hz",
+            1.0,
+            float("nan") if publishing is None else publishing,
+            "ms",
+        ),
     ]
+
+
+def _tetrahedra(points: Sequence[Point]) -> str:
+    return "".join(f"{tets:,}" for tets in {p.tets for p in main_points(points)})
 
 
 def _of_main_image(points: Sequence[Point]) -> list[Point]:
@@ -134,8 +160,8 @@ def _linear(sizes: Sequence[Point]) -> Target:
 
 
 def _memory(peak: int | None) -> Target:
-    what = f"memory beyond the volume's own, {_LARGE}³ voxels, Python and libraries included"
+    what = f"memory beyond the volume's own, {LARGE_VOLUME}³ voxels, Python and libraries included"
     if peak is None:
         return Target(what, "at most 300 MB", "not measured", None)
-    beyond = (peak - _LARGE**3) / 1e6
+    beyond = (peak - LARGE_VOLUME**3) / 1e6
     return Target(what, "at most 300 MB", f"{beyond:.0f} MB", beyond <= 300)
