@@ -2,15 +2,19 @@
 
 import copy
 
+import numpy as np
 import pytest
 import yaml
 
 from us_sim.assembly import collider_of, probe_of
 from us_sim.errors import SceneError
+from us_sim.evaluation.recorded_fan import LIVER_SWEEP
+from us_sim.pose import Pose
 from us_sim.scene_file import find_scene, load_scene, parse_scene
 from us_sim.share import shared_path
 from us_sim.slicing.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe import LinearProbe
+from us_sim.volume.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(
     """
@@ -189,6 +193,14 @@ def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read():
 def test_a_collider_needs_its_own_dimensions_and_no_others():
     with pytest.raises(SceneError, match=r"probe.collider.length: is missing; a capsule needs"):
         collider_of(parse_scene(changed("probe.collider.shape", "capsule")))
+    with pytest.raises(
+        SceneError, match=r"probe.collider.width: is missing; a convex needs radius, le"
+    ):
+        collider_of(
+            parse_scene(
+                changed("probe.collider", {"shape": "convex", "radius": 0.05, "length": 0.05})
+            )
+        )
     with pytest.raises(SceneError, match=r"probe.collider.width: a sphere has no width"):
         collider_of(parse_scene(changed("probe.collider.width", 0.01)))
 
@@ -230,3 +242,17 @@ def test_what_a_scene_does_not_name_is_not_needed():
     assert needed == {"probe_tracker", "tissue_deformer", "slice_interpolator"}
     reasons = {part.node: part.reason for part in parse_scene(changed("tissue", None)).parts()}
     assert reasons["tissue_deformer"] == "the scene has no `tissue`: the volume is sliced rigidly"
+
+
+def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(shared_data):
+    folder = shared_data / "imfusion-liver-sweep"
+    scene = load_scene("liver_sweep", volume=folder / "liver_sweep_compounded_1mm.mha")
+    recorded = LIVER_SWEEP.probe(0.314818e-3)
+    probe = probe_of(scene)
+    assert probe.radius == pytest.approx(recorded.radius, abs=1e-5)
+    assert probe.depth == pytest.approx(recorded.depth, abs=1e-5)
+    assert probe.opening_angle == pytest.approx(recorded.opening_angle, abs=1e-5)
+    sweep = read_sweep(folder / "liver_sweep.igs.mha")
+    middle = LIVER_SWEEP.pose(sweep.image_to_reference[len(sweep.numbers) // 2])
+    place = Pose(scene.volume.pose.position, scene.volume.pose.orientation) @ middle
+    np.testing.assert_allclose(place.matrix, np.eye(4), atol=2e-6)

@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 from us_sim.collider import Capsule, Convex, RoundedBox, Sphere, signed_distance
 from us_sim.pose import Pose
 from us_sim.tissue.active_set import ActiveSet
+from us_sim.tissue.box import face_nodes
 from us_sim.tissue.contact import only_forward, push_out, wrench_on_probe
+from us_sim.tissue.materials import Material, uniform_material
+from us_sim.tissue.mesh import box_mesh, uniform_planes
+from us_sim.tissue.model import TissueModel
 from us_sim.tissue.sliding_contact import SlidingContact
+from us_sim.tissue.solver import create_solver
 
 FINE, COARSE = 0.004, 0.02  # m, spacings that resolve a sphere of 30 mm, and that do not
 SPHERE = Sphere(0.03)
@@ -108,6 +113,27 @@ def test_beyond_the_ends_of_a_curved_face_an_unresolved_rounding_pushes_as_its_e
     assert gap_at(CONVEX, (0.0351, 0.0, -0.03), COARSE)[0] == np.inf
     assert gap_at(CONVEX, (0.0, 0.0, -0.17), COARSE)[0] == np.inf
     assert gap_at(CONVEX, (0.0, 0.0, -0.14), COARSE)[0] == pytest.approx(-0.14)
+
+
+@pytest.mark.parametrize("method", ["fem", "fem_nonlinear"])
+def test_tissue_takes_the_shape_of_a_curved_face(method):
+    mesh = box_mesh(
+        *(uniform_planes(-0.05, 0.05, 13) for _ in range(2)), uniform_planes(0, 0.05, 6)
+    )
+    fixed = mesh.nodes[:, 2] == 0.05
+    material = uniform_material(mesh, Material(1e4, 0.45))
+    model = TissueModel(mesh, material, fixed, CONVEX, face_nodes(mesh, "top"))
+    solver = create_solver(method, model)
+    for depth in (0.003, 0.006, 0.009, 0.009, 0.009):
+        pressed = Pose(position=[0.0, 0.0, depth])
+        deformation = solver.deform(pressed)
+    touching = deformation.nodes[deformation.contact_nodes]
+    assert np.ptp(touching[:, 0]) > 0.03
+    assert np.ptp(touching[:, 2]) > 0.002  # it is bent
+    np.testing.assert_allclose(signed_distance(CONVEX, pressed, touching)[0], 0.0, atol=1e-5)
+    free = np.setdiff1d(np.arange(len(mesh.nodes)), deformation.contact_nodes)
+    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
+    assert abs(deformation.force[0]) < 1e-3 * -deformation.force[2]
 
 
 @settings(deadline=None, max_examples=60)
