@@ -263,6 +263,45 @@ def test_an_image_seen_from_the_other_side_is_mirrored(method, seed):
         assert np.abs(other.astype(int) - image).max() <= 1
 
 
+# --- the surface belongs to the tissue ------------------------------------------------------------
+
+
+@every_method
+@pytest.mark.parametrize(
+    ("corners", "count"),
+    [
+        ([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], 15),  # a face: 5 + 4 + 3 + 2 + 1 pixels
+        ([[0, 0, 0], [0, -4, 0], [4, 0, 0], [0, 0, 4]], 15),  # the same from the other side
+        ([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 4, 4]], 5),  # an edge along the first row
+        ([[0, 0, 4], [4, 0, 0], [0, -4, 0], [-4, -4, 0]], 5),  # an edge across the pixels
+        ([[0, 0, 0], [4, 4, 0], [0, 4, 0], [0, 4, 4]], 1),  # a corner
+        ([[7, 0, 7], [4, -4, 0], [0, -4, 4], [0, -4, 0]], 1),  # one in the image's last pixel
+        ([[0, 4, 0], [0, -4, 0], [4, 0, 0], [0, 0, 4]], 15),  # cut through two of its edges
+    ],
+)
+def test_what_just_touches_the_plane_is_shown(method, corners, count):
+    """Pixels lie exactly on corners and edges, in the plane and in rows and columns."""
+    nodes = 1e-3 * np.array(corners, dtype=float)
+    rest = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]]) + [0.0, 1.0, 0.0]
+    if np.linalg.det(nodes[1:] - nodes[0]) < 0:
+        nodes[2:] = nodes[:1:-1]
+    slicer = create_slicer(method, around_the_box(), rest, np.array([[0, 1, 2, 3]]))
+    steps = np.array([1e-3, 0, 0]), np.array([0, 0, 1e-3])
+    for turn in (Pose(), Pose([0.013, -0.007, 0.021], [0.3, -0.2, 0.5, 0.8])):
+        plane = SlicePlane(
+            turn.position, *(turn.rotation @ step for step in steps), columns=8, rows=8
+        )
+        found = slicer.rest_coordinates(turn.apply(nodes), plane)
+        assert (found[..., 1] > 0.5).sum() == count
+        off = turn.rotation @ [0.0, 1e-8, 0.0]
+        beside = SlicePlane(
+            turn.position + off, *(turn.rotation @ step for step in steps), columns=8, rows=8
+        )
+        below = slicer.rest_coordinates(turn.apply(nodes), beside)[..., 1] > 0.5
+        if (nodes[:, 1] <= 0).all():
+            assert not below.any()
+
+
 # --- what cannot be shown -------------------------------------------------------------------------
 
 
