@@ -19,7 +19,7 @@ def shown(**settings):
 
 
 def test_six_decibels_are_a_tenth_of_sixty():
-    np.testing.assert_array_equal(shown(gain=6.0)[0, 1:230], np.arange(1, 230) + 26)  # 25.5, up
+    np.testing.assert_array_equal(shown(gain=6.0)[0, 17:230], np.arange(17, 230) + 26)  # 25.5
     np.testing.assert_array_equal(shown(gain=-12.0)[0, 51:], np.arange(51, 256) - 51)
     assert (shown(gain=6.0)[:, 230:] == 255).all()
     assert (shown(gain=-12.0)[:, :51] == 0).all()
@@ -33,8 +33,15 @@ def test_half_the_range_doubles_the_steps_below_the_strongest():
 def test_twice_the_range_lifts_the_faintest_echo_half_way():
     wide = shown(dynamic_range=120.0)[0]
     assert wide[255] == 255
-    assert wide[1] == 128
+    assert wide[17] == 136  # 127.5 + 17 / 2
     assert wide[0] == 0
+
+
+def test_the_faintest_echoes_fade_where_gain_lifts_them():
+    # 10 dB would show the faintest of all at 42.5; its fade is linear over 17 grey values.
+    faint = np.arange(18)
+    expected = np.floor(faint + 42.5 - 42.5 * (1 - faint / 17) + 0.5)
+    np.testing.assert_array_equal(shown(gain=10.0)[0, :18], expected)
 
 
 def test_grey_maps_at_half_level():

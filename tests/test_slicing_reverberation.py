@@ -54,12 +54,19 @@ def test_the_first_band_is_as_strong_as_was_set():
     np.testing.assert_allclose(difference[:20], 85, atol=1)
 
 
-def test_lines_beyond_the_edge_of_contact_are_in_air_and_those_before_it_are_not():
-    half = (np.arange(100) < 50).astype(np.float32)
-    shown = AIR.shown(TISSUE, half)
-    # The elements around a line form it: 2.5 mm on either side of the edge are mixed.
-    np.testing.assert_array_equal(shown[:, :86], TISSUE[:, :86])
-    np.testing.assert_array_equal(shown[:, 114:], AIR.shown(TISSUE, coupling(0.0))[:, 114:])
+@pytest.mark.parametrize(("row", "aperture"), [(10, 1.5e-3), (100, 5e-3), (380, 0.04 / 3)])
+def test_a_shadow_is_as_soft_as_the_aperture_is_wide(row, aperture):
+    half = (np.arange(100) < 50).astype(np.float32)  # the face's middle is the edge
+    strong = np.full_like(TISSUE, 200)
+    shown = QUIET.shown(strong, half)[row].astype(int)
+    x = (np.arange(200) - 99.5) * 0.2e-3  # m from the edge
+    margin = 0.5 * aperture + 0.6e-3  # a step of depth, and a line
+    assert (shown[x < -margin] == 200).all()
+    assert (shown[x > margin] == 0).all()
+    # Half of the aperture hears half the amplitude both ways; what it is in between is linear.
+    partly = np.abs(x) < 0.5 * aperture - 0.6e-3
+    share = 0.5 - x[partly] / aperture
+    np.testing.assert_allclose(10 ** ((shown[partly] - 200) / 4.25 / 40), share, atol=0.06)
 
 
 def test_a_fan_stays_black_beside_its_beams_and_its_bands_follow_the_face():

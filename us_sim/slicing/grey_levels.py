@@ -1,7 +1,8 @@
 """From the level of an echo to a grey value: gain, time gain, dynamic range and grey map.
 
 A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
-and 0 is no echo, which no gain makes visible.
+and 0 is no echo, which no gain makes visible. So that nothing has no hard edge where gain lifts
+the faintest echoes, these fade to black over the last 4 dB above it.
 
 >>> import numpy as np
 >>> from us_sim.slicing.grey_levels import GreyLevels
@@ -26,7 +27,8 @@ __all__ = ["GREYS_PER_DECIBEL", "GreyLevels"]
 
 GREYS_PER_DECIBEL = 255.0 / ECHO_RANGE
 
-_SOFT = 0.7  # exponent; 0.6 to 0.8 is what consoles' soft maps come near
+_SOFT = 0.7  # exponent of the soft map
+_FADE = 17.0  # grey values over which the faintest echoes fade
 
 
 class GreyLevels:
@@ -47,15 +49,16 @@ class GreyLevels:
             self._steps = depth_steps(probe)
             at = np.linspace(0.0, probe.depth, len(imaging.time_gain))
             gain = imaging.gain + np.interp(step_depths(probe), at, imaging.time_gain)
-        level = np.arange(256) / GREYS_PER_DECIBEL - ECHO_RANGE
-        share = np.clip(1.0 + (level + gain[:, None]) / imaging.dynamic_range, 0.0, 1.0)
+        grey = np.arange(256)
+        level = grey / GREYS_PER_DECIBEL - ECHO_RANGE + gain[:, None]  # dB
+        share = np.clip(1.0 + level / imaging.dynamic_range, 0.0, 1.0)
         if imaging.grey_map == "soft":
             share = share**_SOFT
         elif imaging.grey_map == "contrast":
             share = share * share * (3.0 - 2.0 * share)
+        share -= share[:, :1] * np.maximum(1.0 - grey / _FADE, 0.0)
         # Half way is up, also where the sum of decibels is a rounding error below it.
         self._tables = np.floor(255.0 * share + (0.5 + 1e-9)).astype(np.uint8)
-        self._tables[:, 0] = 0
 
     def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The grey values (rows, columns) of echo levels (rows, columns)."""

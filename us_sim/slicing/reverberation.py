@@ -1,9 +1,12 @@
 """What lines show that are not, or badly, coupled to the skin: the face's own echoes.
 
 Air reflects everything, so the pulse runs to and fro in the lens of the transducer: bright bands
-a lens apart, each weaker than the one before, and a haze below them. A line that is partly
-coupled is weaker by so many decibels all the way down, and shows the bands the fainter. Of two
-echoes at one place the stronger is shown: their sum is 3 dB more at most.
+a lens apart, each weaker than the one before, and a haze below them.
+
+Of the tissue a line sees what the elements that form it are coupled to. They are the more the
+deeper it looks, so the shadow of a part of the face without contact reaches all depths, with an
+edge that is the softer the deeper. A line that is partly coupled is weaker by so many decibels.
+Of two echoes at one place the stronger is shown: their sum is 3 dB more at most.
 
 >>> import numpy as np
 >>> from us_sim.slicing.imaging import Imaging
@@ -37,8 +40,11 @@ _BAND_LENGTH = 0.2e-3  # m, standard deviation of the first band
 _BAND_GROWTH = 0.12  # of the length, with each passage
 _HAZE = -26.0  # dB, of the haze at the face from the first band
 _HAZE_LOSS = 1.0e3  # dB/m
-_APERTURE = 1.0e-3  # m, standard deviation of the part of the face that forms a line
-_FINE = 8  # places between lines at which their coupling is tabulated
+_PLACES = 1024  # along the face, at which coupling is tabulated
+_STEPS = 32  # of depth, likewise
+_F_NUMBER = 2.0  # depth over the length of face that looks there
+_APERTURE = (1.5e-3, 1 / 3)  # m, and part of the face: the least and the most that forms a line
+_FINEST = 4096  # entries of the table of losses
 _GREYS_PER_DECIBEL = 255.0 / ECHO_RANGE
 _SILENT = 255  # grey values of loss that leave nothing
 
@@ -47,34 +53,47 @@ class Reverberation:
     """Weakens lines by their coupling, and shows the face's echoes in those with air."""
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
+        line, depth = np.nan_to_num(probe.pixel_beams)
+        place = np.clip((line + 0.5) * (_PLACES / probe.lines), 0, _PLACES - 1)
+        step = np.clip(depth * (_STEPS / probe.depth), 0, _STEPS - 1)
+        self._place = place.astype(np.uint16) + step.astype(np.uint16) * np.uint16(_PLACES)
         self._air = _air_echoes(probe, imaging.reverberation)
-        place = np.nan_to_num((probe.pixel_beams[0] + np.float32(0.5)) * np.float32(_FINE))
-        last = _FINE * probe.lines - 1
-        self._place = np.clip(place, 0, last).astype(np.uint16)  # (rows, columns)
-        self._at = (np.arange(last + 1) + 0.5) / _FINE - 0.5
-        self._aperture = _aperture(probe)
+        self._line = (np.arange(_PLACES) + 0.5) * (probe.lines / _PLACES) - 0.5
+        self._reach = _apertures(probe) // 2
+        # With the kernels loaded the first line that loses contact is not late.
+        self.shown(np.zeros(self._place.shape, np.uint8), np.zeros(probe.lines, np.float32))
 
     def shown(self, image: NDArray[np.uint8], coupling: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Echo levels (rows, columns) as lines of this coupling (lines,) show them.
-
-        Each line is formed by the elements around it, so by the coupling of all of them.
-        """
+        """Echo levels (rows, columns) as lines of this coupling (lines,) show them."""
         if coupling.min() >= 1.0:
             return image
-        half = len(self._aperture) // 2
-        formed = np.convolve(np.pad(coupling, half, mode="edge"), self._aperture, mode="valid")
-        formed = np.interp(self._at, np.arange(len(coupling)), formed)
-        losses = _losses(formed) | _losses((1.0 - formed) ** 4) << 8
+        coupled = np.interp(self._line, np.arange(len(coupling)), coupling)
+        losses = np.empty((_STEPS, _PLACES), dtype=np.uint32)
+        _lose(np.sqrt(coupled), self._reach, _LOSSES, losses)
         out = np.empty_like(image)
         air, place = self._air.reshape(-1), self._place.reshape(-1)
-        _brighter(image.reshape(-1), air, place, losses, out.reshape(-1))
+        _brighter(image.reshape(-1), air, place, losses.reshape(-1), out.reshape(-1))
         return out
 
 
-def _losses(amplitude: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """The grey values by which echoes of these amplitudes (n,) are fainter."""
-    decibels = -20.0 * np.log10(np.maximum(amplitude, 1e-6))
-    return np.minimum(np.round(decibels * _GREYS_PER_DECIBEL), _SILENT).astype(np.uint32)
+def _losses() -> NDArray[np.uint32]:
+    """(`_FINEST` + 1,) grey values lost, there and back, by an evenly spaced share of amplitude."""
+    share = np.maximum(np.arange(_FINEST + 1), 0.1) / _FINEST
+    lost = np.round(-40.0 * np.log10(share) * _GREYS_PER_DECIBEL)
+    return np.minimum(lost, _SILENT).astype(np.uint32)
+
+
+_LOSSES = _losses()
+
+
+def _apertures(probe: Probe) -> NDArray[np.int64]:
+    """(`_STEPS`,) how much of the face, in places, forms a line at each step of depth."""
+    length = np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum()
+    length = max(length * probe.lines / max(probe.lines - 1, 1), 1e-6)
+    depth = (np.arange(_STEPS) + 0.5) * (probe.depth / _STEPS)
+    least, most = _APERTURE
+    part = np.maximum(np.minimum(depth / _F_NUMBER, most * length), least) / length
+    return np.asarray(np.minimum(part, 1.0) * _PLACES).astype(np.int64)
 
 
 def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
@@ -97,13 +116,30 @@ def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
     return np.clip(level + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
-def _aperture(probe: Probe) -> NDArray[np.float64]:
-    """(odd,) weights, which sum to 1, of the lines around one whose elements form it too."""
-    length = np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum()
-    sigma = _APERTURE / max(length / max(probe.lines - 1, 1), 1e-9)
-    half = int(min(np.ceil(2.5 * sigma), probe.lines))
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
-    return np.asarray(weights / weights.sum())
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lose(coupled, reach, losses, out):
+    """What tissue, and the face's own echo, lose at each step of depth and place along the face.
+
+    Args:
+        coupled: (places,) share of the amplitude that gets through, one way.
+        reach: (steps,) places on either side whose elements form a line.
+        losses: the table of losses.
+        out: (steps, places), set: the tissue's loss, and that of the face's echo times 256.
+    """
+    places = len(coupled)
+    finest = len(losses) - 1
+    own = np.empty(places, dtype=np.uint32)
+    total = np.zeros(places + 1)
+    for i in range(places):
+        total[i + 1] = total[i] + coupled[i]
+    for step in range(len(reach)):
+        for i in range(places):
+            first, end = max(i - reach[step], 0), min(i + reach[step] + 1, places)
+            share = min((total[end] - total[first]) / (end - first), 1.0)
+            if step == 0:
+                # Of the nearest elements; squared, since little contact already quiets the lens.
+                own[i] = losses[np.int64((1.0 - share * share) ** 2 * finest + 0.5)] << 8
+            out[step, i] = own[i] | losses[np.int64(share * finest + 0.5)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
