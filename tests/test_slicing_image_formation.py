@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ProbeError
 from us_sim.pose import Pose
-from us_sim.slicing.fan_probe import ConvexProbe
+from us_sim.slicing.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.image_formation import ImageFormation
 from us_sim.slicing.imaging import GREY_MAPS, Imaging
 from us_sim.slicing.probe import LinearProbe
@@ -20,6 +20,8 @@ PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=48, rows=64, lines=24, sa
 FAN = ConvexProbe(
     radius=0.04, opening_angle=1.0, depth=0.05, columns=60, rows=50, lines=24, samples=64
 )
+PHASED = SectorProbe(aperture=0.02, opening_angle=1.2, depth=0.05, columns=40, rows=50)
+PIXEL = LinearProbe(aperture=0.04, depth=0.04, columns=1, rows=1, lines=1, samples=1)
 SPECKLE = np.random.Generator(np.random.PCG64(2)).integers(0, 256, (64, 48), dtype=np.uint8)
 
 
@@ -79,7 +81,7 @@ def test_gain_comes_after_air():
         contact=st.booleans(),
         reverberation=st.floats(-60, 0),
     ),
-    probe=st.sampled_from([PROBE, FAN]),
+    probe=st.sampled_from([PROBE, FAN, dataclasses.replace(FAN, lines=1), PHASED, PIXEL]),
     seed=st.integers(0, 9),
 )
 def test_any_settings_give_a_picture_the_same_one_every_time(imaging, probe, seed):
@@ -93,6 +95,8 @@ def test_any_settings_give_a_picture_the_same_one_every_time(imaging, probe, see
     picture = formation.form(images, coupling)
     assert picture.shape == (probe.rows, probe.columns)
     assert picture.dtype == np.uint8
+    if imaging.lateral_resolution or imaging.axial_resolution:  # else slices are black there
+        assert not picture[np.isnan(probe.pixel_beams[0])].any()
     np.testing.assert_array_equal(ImageFormation(probe, imaging).form(images, coupling), picture)
     np.testing.assert_array_equal(images, before)  # slices are not drawn on
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.beams import beam_width, focus_of
 from us_sim.slicing.imaging import ECHO_RANGE, Imaging
-from us_sim.slicing.probe import Probe
+from us_sim.slicing.probe import LinearProbe, Probe
 
 __all__ = ["Resolution"]
 
@@ -58,8 +58,7 @@ class Resolution:
     """
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
-        parallel = bool((probe.beam_directions == probe.beam_directions[0]).all())
-        self._fan = None if parallel else _Fan(probe)
+        self._fan = None if isinstance(probe, LinearProbe) else _Fan(probe)
         if self._fan is None:
             lines, samples = probe.columns, probe.rows
             line_spacing: Any = probe.pixel_spacing[0]
@@ -104,9 +103,8 @@ class _Fan:
         )
         depths = (np.arange(self.samples) + 0.5) * (probe.depth / self.samples)
         x, z = (starts[:, i] + depths[:, None] * directions[:, i] for i in range(2))
-        self.line_spacing = np.maximum(
-            np.hypot(np.diff(x, axis=1), np.diff(z, axis=1)).mean(axis=1), 1e-9
-        )
+        apart = np.hypot(np.diff(x, axis=1), np.diff(z, axis=1)).sum(axis=1)
+        self.line_spacing = np.maximum(apart / max(self.lines - 1, 1), 1e-9)
         lateral, axial = probe.pixel_spacing
         left, top = probe.image_to_probe[[0, 2], 3]
         self._to_beams = cv2.convertMaps(
