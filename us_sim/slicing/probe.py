@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -37,6 +38,8 @@ BEAM_SAMPLES = Quantity("number", 1, 16384)
 
 # A pixel centre that lies on the outline, up to rounding, is in it: part of a beam or of the lines.
 _ROUNDING = 1e-9
+
+_BAND = 64  # rows
 
 
 class Probe(ABC):
@@ -133,20 +136,11 @@ class Probe(ABC):
 
         The line coordinate is fractional between lines. NaN where no beam reaches.
         """
-        lateral, axial = self.pixel_spacing
-        half_width, top, _ = self._outline
-        x = (np.arange(self.columns) + 0.5) * lateral - half_width
-        z = (np.arange(self.rows) + 0.5) * axial + top
-        part, way = self._beam(x[None, :], z[:, None])
-        reached = (
-            (part >= -_ROUNDING)
-            & (part <= 1 + _ROUNDING)
-            & (way >= -_ROUNDING * self.depth)
-            & (way <= (1 + _ROUNDING) * self.depth)
-        )
         beams = np.full((2, self.rows, self.columns), np.nan, dtype=np.float32)
-        np.copyto(beams[0], part * self.lines - 0.5, where=reached, casting="same_kind")
-        np.copyto(beams[1], way, where=reached, casting="same_kind")
+        for band, part, way, reached in self._bands():
+            line = part * self.lines - 0.5
+            np.copyto(beams[0, band], line, where=reached, casting="same_kind")
+            np.copyto(beams[1, band], way, where=reached, casting="same_kind")
         return _kept(beams)
 
     @cached_property
@@ -180,7 +174,24 @@ class Probe(ABC):
 
     @cached_property
     def _reached_runs(self) -> NDArray[np.int32]:
-        return _kept(_runs(np.isfinite(self.pixel_beams[0])))
+        return _kept(np.concatenate([_runs(reached) for *_, reached in self._bands()]))
+
+    def _bands(
+        self,
+    ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
+        """Rows, what `_beam` says of their pixels, and which of these are reached; a few at a time
+        lest large images need many times their own memory.
+        """
+        lateral, axial = self.pixel_spacing
+        half_width, top, _ = self._outline
+        x = (np.arange(self.columns) + 0.5) * lateral - half_width
+        for first in range(0, self.rows, _BAND):
+            band = slice(first, min(first + _BAND, self.rows))
+            z = (np.arange(band.start, band.stop) + 0.5) * axial + top
+            part, way = self._beam(x[None, :], z[:, None])
+            reached = (part >= -_ROUNDING) & (part <= 1 + _ROUNDING)
+            reached &= (way >= -_ROUNDING * self.depth) & (way <= (1 + _ROUNDING) * self.depth)
+            yield band, part, way, reached
 
     @property
     def _line_parts(self) -> NDArray[np.float64]:
