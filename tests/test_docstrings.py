@@ -36,6 +36,7 @@ def test_examples(name):
         "us_sim.volume.label_surface",
         "us_sim.structures",
         "us_sim.skin.membrane",
+        "us_sim.slicing.image_formation",
         "us_sim.slicing.row_subdivision",
         "us_sim.volume.phantom",
         "us_sim.volume.readers",

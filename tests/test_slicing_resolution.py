@@ -1,5 +1,7 @@
 """Point targets become as wide and as long as was asked, at every depth and in every geometry."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -103,3 +105,12 @@ def test_one_kind_of_loss_leaves_the_other_direction_alone():
     np.testing.assert_array_equal(
         Resolution(probe, Imaging(axial_resolution=5e-3)).spread(columns), columns
     )
+
+
+def test_how_many_lines_a_fan_has_changes_neither_picture_nor_cost():
+    grain = np.random.Generator(np.random.PCG64(3)).integers(60, 200, (50, 60), dtype=np.uint8)
+    fan = dataclasses.replace(CONVEX, columns=60, rows=50)
+    imaging = Imaging(lateral_resolution=5e-3, axial_resolution=2e-3)
+    few = Resolution(fan, imaging).spread(grain).astype(int)
+    many = dataclasses.replace(fan, lines=4096, samples=16384)  # would be 67 million echoes
+    np.testing.assert_allclose(Resolution(many, imaging).spread(grain), few, atol=2)

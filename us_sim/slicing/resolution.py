@@ -43,7 +43,7 @@ _PULSE_GROWTH = (
 )
 
 _FINEST = 1 << 16  # entries of the table of levels; a step is a 65th of the faintest amplitude
-_COARSEST_LINES = 1.25  # pixels between the lines of a fan that is resampled
+_LINE_STEP = 1.0  # pixels between the lines of a fan that is resampled, where they are widest
 
 
 class Resolution:
@@ -54,7 +54,7 @@ class Resolution:
     of that each centimetre.
 
     Where beams are parallel, an image's columns and rows serve as lines and samples. A fan is
-    resampled to lines so close that no pixel falls between them, and back.
+    resampled to lines and samples so close that no pixel falls between them, and back.
     """
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
@@ -88,23 +88,23 @@ class _Fan:
     def __init__(self, probe: Probe) -> None:
         import cv2
 
+        # As fine as the pixels, however many lines and samples the probe has.
+        pixel = math.sqrt(probe.pixel_spacing.prod())
         ends = probe.beam_starts + probe.depth * probe.beam_directions
-        pixel = float(probe.pixel_spacing.min())
-        widest = max(_distance(probe.beam_starts), _distance(ends))
-        finer = max(1, math.ceil(widest / (_COARSEST_LINES * pixel)))
-        self.lines = probe.lines * finer
-        self.samples = max(probe.samples, round(probe.depth / pixel))
-        # Where the lines lie among the probe's, whose outermost are half a line from the edge.
-        line = np.clip((np.arange(self.lines) + 0.5) / finer - 0.5, 0.0, probe.lines - 1)
+        widest = max(_length(probe.beam_starts), _length(ends))
+        self.lines = max(2, math.ceil(widest / (_LINE_STEP * pixel)))
+        self.samples = max(2, round(probe.depth / pixel))
+        # Where they lie among the probe's, whose outermost are half a line from the edge.
         number = np.arange(probe.lines)
+        line = (np.arange(self.lines) + 0.5) * (probe.lines / self.lines) - 0.5
         starts, directions = (
             np.column_stack([np.interp(line, number, column) for column in array.T])
             for array in (probe.beam_starts, probe.beam_directions)
         )
         depths = (np.arange(self.samples) + 0.5) * (probe.depth / self.samples)
         x, z = (starts[:, i] + depths[:, None] * directions[:, i] for i in range(2))
-        apart = np.hypot(np.diff(x, axis=1), np.diff(z, axis=1)).sum(axis=1)
-        self.line_spacing = np.maximum(apart / max(self.lines - 1, 1), 1e-9)
+        between = np.hypot(np.diff(x, axis=1), np.diff(z, axis=1))
+        self.line_spacing = np.maximum(np.median(between, axis=1), 1e-9)
         lateral, axial = probe.pixel_spacing
         left, top = probe.image_to_probe[[0, 2], 3]
         self._to_beams = cv2.convertMaps(
@@ -114,7 +114,8 @@ class _Fan:
         )
         line_of, way = probe.pixel_beams
         shown = np.isfinite(way)
-        line_of = np.clip((line_of + 0.5) * finer - 0.5, 0, self.lines - 1)
+        line_of = (line_of + 0.5) * (self.lines / probe.lines) - 0.5
+        line_of = np.clip(line_of, 0, self.lines - 1)
         sample = np.clip(way * (self.samples / probe.depth) - 0.5, 0, self.samples - 1)
         self._to_pixels = cv2.convertMaps(
             np.where(shown, line_of, -9).astype(np.float32),
@@ -140,10 +141,11 @@ def _remapped(image: NDArray[np.uint8], maps: Any, *, replicate: bool) -> NDArra
     return np.asarray(remapped)
 
 
-def _distance(points: NDArray[np.float64]) -> float:
-    """The largest between consecutive points (n, 2), m."""
+def _length(points: NDArray[np.float64]) -> float:
+    """Of the line through points (n, 2), m, with half a step beyond its ends."""
+    count = len(points)
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return float(steps.max(initial=0.0))
+    return float(steps.sum()) * count / max(count - 1, 1)
 
 
 def _point_spreads(

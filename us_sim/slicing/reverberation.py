@@ -40,6 +40,7 @@ _BAND_LENGTH = 0.2e-3  # m, standard deviation of the first band
 _BAND_GROWTH = 0.12  # of the length, with each passage
 _HAZE = -26.0  # dB, of the haze at the face from the first band
 _HAZE_LOSS = 1.0e3  # dB/m
+_GRAIN = (512, 192)  # the haze's, along and across the beams
 _PLACES = 1024  # along the face, at which coupling is tabulated
 _STEPS = 32  # of depth, likewise
 _F_NUMBER = 2.0  # depth over the length of face that looks there
@@ -101,10 +102,12 @@ def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
     line, depth = np.nan_to_num(probe.pixel_beams)
     # Elements differ a little; what differs is the same in every frame.
     random = np.random.Generator(np.random.PCG64(7))
-    grain = random.random((probe.samples, probe.lines), dtype=np.float32)
+    samples, lines = _GRAIN
+    grain = random.random(_GRAIN, dtype=np.float32)
     grain += np.roll(grain, 1, axis=1)
-    sample = np.clip(depth * (probe.samples / probe.depth), 0, probe.samples - 1).astype(np.intp)
-    texture = grain[sample, np.clip(line + 0.5, 0, probe.lines - 1).astype(np.intp)]
+    sample = np.clip(depth * (samples / probe.depth), 0, samples - 1).astype(np.intp)
+    element = np.clip((line + 0.5) * (lines / probe.lines), 0, lines - 1).astype(np.intp)
+    texture = grain[sample, element]
     amplitude = 0.5 * texture * 10.0 ** ((_HAZE - _HAZE_LOSS * depth) / 20.0)
     for passage in range(1, 1 + int(ECHO_RANGE / _BAND_LOSS)):
         length = _BAND_LENGTH * (1.0 + _BAND_GROWTH * passage)
