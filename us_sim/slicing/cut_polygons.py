@@ -35,6 +35,8 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 
 # Share of its rest volume below which a tetrahedron is flat: it has no interior to show.
 _FLAT = 1e-6
+# Voxels a pixel beyond which a map is so steep that rounding may lead it out of the volume.
+_STEEP = 1e3
 # Pixels by which a cut may lie outside the image and still be looked at.
 _MARGIN = 1e-6
 
@@ -48,7 +50,7 @@ class Cuts(NamedTuple):
     maps: NDArray[np.float64]  # (cuts, 3, 3) from (1, column, row) to rest, voxel indices
     corners: NDArray[np.float64]  # (cuts, 4, 2) column and row, in turn around the polygon
     sides: NDArray[np.int8]  # (cuts,) 3 or 4, or 0 without a polygon
-    inside: NDArray[np.bool_]  # (cuts,) the tetrahedron lies among the voxels' centres at rest
+    inside: NDArray[np.bool_]  # (cuts,) the map leads to among the voxels' centres
     outlines: NDArray[np.float64]  # (outlines, 3, 2) column and row
     points: NDArray[np.int8]  # (outlines,) how many of the three there are
     owner: NDArray[np.int32]  # (outlines,) which cut it closes
@@ -80,7 +82,7 @@ def cut_tetrahedra(
             height. pixel_volume: m³ of a unit of those.
         neighbours: (M, 4) the tetrahedron beyond each face, -1 where the mesh ends.
         determinants: (M,) m³, six times the volumes at rest. rest_index: (N, 3) voxels.
-        within: (M,) bool, which tetrahedra lie among the voxels' centres at rest.
+        within: (M,) bool, which tetrahedra lie well among the voxels' centres at rest.
     """
     place = np.empty((4, 3))
     polygon = np.empty((4, 2))
@@ -99,7 +101,7 @@ def cut_tetrahedra(
             skipped += 1
             pieces, count = _close_around(
                 e, place, nodes, to_pixel, pixel_volume, columns, rows, tetrahedra, neighbours,
-                determinants, rest_index, within, cuts, pieces, count,
+                determinants, rest_index, cuts, pieces, count,
             )  # fmt: skip
             continue
         before = pieces
@@ -112,7 +114,7 @@ def cut_tetrahedra(
             cuts.corners[count, k, 0] = polygon[k, 0]
             cuts.corners[count, k, 1] = polygon[k, 1]
         cuts.sides[count] = sides
-        cuts.inside[count] = within[e]
+        cuts.inside[count] = within[e] and np.abs(cuts.maps[count, :, 1:]).max() < _STEEP
         count += 1
     return count, pieces, skipped
 
@@ -273,7 +275,7 @@ def _close_face(place, f, columns, rows, cuts, pieces, count):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_around(
     skipped, place, nodes, to_pixel, pixel_volume, columns, rows, tetrahedra, neighbours,
-    determinants, rest_index, within, cuts, pieces, count,
+    determinants, rest_index, cuts, pieces, count,
 ):  # fmt: skip
     """The neighbours of a skipped tetrahedron end at it: adds the outlines of their faces."""
     for e in neighbours[skipped]:
@@ -291,7 +293,7 @@ def _close_around(
                 if after > pieces:
                     pieces = after
                     cuts.sides[count] = 0
-                    cuts.inside[count] = within[e]
+                    cuts.inside[count] = False
                     count += 1
                     break
     return pieces, count

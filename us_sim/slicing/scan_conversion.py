@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.errors import VolumeError
 from us_sim.slicing.clusters import Clusters
 from us_sim.slicing.cut_polygons import cut_tetrahedra, room_for_cuts
 from us_sim.slicing.location import BLACK
@@ -37,7 +38,13 @@ from us_sim.slicing.rest_outline import RestSurface
 from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
-from us_sim.slicing.span_sampling import fill_elements, sample_spans
+from us_sim.slicing.span_sampling import (
+    INNER_MARGIN,
+    MOST_VOXELS,
+    MOST_VOXELS_A_SIDE,
+    fill_elements,
+    sample_spans,
+)
 from us_sim.slicing.spans import convert_cuts
 from us_sim.tissue.mesh_check import face_order
 
@@ -66,7 +73,7 @@ class ScanConversion(Slicer):
         self._surface = RestSurface(
             mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
         )
-        self._pairs, self._shape = _pairs_of_voxels(volume.intensities)
+        self._voxels, self._shape = _with_a_next_one(volume.intensities)
         self._moved = np.empty(mesh.nodes.shape)
         self._cuts = room_for_cuts(256)
         self._spans = np.empty((0, 0), dtype=np.int64)
@@ -82,7 +89,7 @@ class ScanConversion(Slicer):
         def draw(first_row: int, end_row: int) -> None:
             spans = self._convert(count, pieces, runs, first_row, end_row)
             sample_spans(
-                self._pairs, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
+                self._voxels, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
                 self._used, runs, *outline, first_row, end_row, image,
             )  # fmt: skip
 
@@ -178,8 +185,9 @@ class ScanConversion(Slicer):
 def _among_centres(
     rest_index: NDArray[np.float64], tetrahedra: NDArray[np.int32], shape: tuple[int, int, int]
 ) -> NDArray[np.bool_]:
-    """(M,) which tetrahedra lie among the centres of the volume's voxels."""
-    among = (rest_index >= 0) & (rest_index <= np.array(shape) - 1)
+    """(M,) which tetrahedra lie well among the centres of the volume's voxels."""
+    last = np.array(shape) - 1 - INNER_MARGIN
+    among = (rest_index >= INNER_MARGIN) & (rest_index <= last)
     return np.asarray(among[tetrahedra].all(axis=(1, 2)))
 
 
@@ -193,14 +201,20 @@ def _neighbours(tetrahedra: NDArray[np.int32]) -> NDArray[np.int32]:
     return neighbours.reshape(-1, 4)
 
 
-def _pairs_of_voxels(
+def _with_a_next_one(
     intensities: NDArray[np.uint8],
-) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
-    """Each voxel with the next one along the last axis, as one number, and the shape (3,)."""
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """A volume's voxels as `sample_spans` takes them, and their shape (3,).
+
+    Raises:
+        VolumeError: there are too many.
+    """
+    if max(intensities.shape) > MOST_VOXELS_A_SIDE or intensities.size > MOST_VOXELS:
+        raise VolumeError(
+            f"the volume has {intensities.shape} voxels: cut or coarsen it to at most "
+            f"{MOST_VOXELS_A_SIDE} a side and {MOST_VOXELS} in all"
+        )
     if intensities.shape[2] == 1:
-        # Nothing follows the last voxel; a volume so thin is small.
-        intensities = np.repeat(intensities, 2, axis=2)
-    flat, shape = voxels_of(np.ascontiguousarray(intensities))
-    pairs = np.ndarray((len(flat) - 1,), dtype="<u2", buffer=flat, strides=(1,))
-    pairs.flags.writeable = False
-    return pairs, shape
+        # Nothing follows the last voxel of a row; a volume so thin is small.
+        return voxels_of(np.repeat(intensities, 2, axis=2))[0], voxels_of(intensities)[1]
+    return voxels_of(intensities)

@@ -18,10 +18,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["inside_volume", "sample_linear"]
+__all__ = ["SLACK", "inside_volume", "sample_linear"]
 
-# Voxels by which a point may miss the volume's outer faces: rounding of the map, no more.
-_SLACK = 1e-6
+SLACK = 1e-6
+"""Voxels by which a point may miss the volume's outer faces: rounding of the map, no more."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -163,7 +163,7 @@ def _linear_at_edge(voxels, shape, x, y, z):
 @njit(inline="always", error_model="numpy")
 def inside_volume(index, count):
     """Whether an index lies between the outer faces of the outermost voxels."""
-    return index >= -0.5 - _SLACK and index <= count - 0.5 + _SLACK
+    return index >= -0.5 - SLACK and index <= count - 0.5 + SLACK
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
