@@ -10,10 +10,8 @@ import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
 from us_sim.evaluation.recorded_fan import LIVER_SWEEP, RecordedFan
-from us_sim.evaluation.recorded_frames import (
-    compare_with_recorded,
-    normalised_cross_correlation,
-)
+from us_sim.evaluation.recorded_frames import compare_with_recorded
+from us_sim.evaluation.recorded_pairs import normalised_cross_correlation
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.resampling import sample_plane
 from us_sim.volume.readers import read_volume

@@ -3,36 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from us_sim.pose import Pose
 from us_sim.slicing.probe import Probe
 
 if TYPE_CHECKING:
-    from us_sim.evaluation.recorded_frames import RecordedFrame
+    from us_sim.evaluation.recorded_pairs import RecordedFrame, RecordedPair
 
-__all__ = ["RecordedPair", "draw_recorded"]
+__all__ = ["draw_recorded"]
 
 _BRIGHTEST = 99.2  # percentile that is shown white, since few pixels of a recording are bright
 _DIFFERENCE = 40.0  # grey levels, at the ends of the colour scale
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedPair:
-    """A recorded frame and its simulated image, on the same pixels."""
-
-    frame: int
-    pose: Pose  # of the probe, in the sweep's frame
-    recorded: NDArray[np.uint8]  # (rows, columns)
-    simulated: NDArray[np.uint8]  # (rows, columns)
-    compared: NDArray[np.bool_]  # (rows, columns), where both hold the tissue
 
 
 def draw_recorded(
