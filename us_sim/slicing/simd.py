@@ -23,39 +23,35 @@ from numba.extending import intrinsic
 __all__ = ["LANES", "load_pair", "write_ramp"]
 
 LANES = 16
-"""Numbers that `write_ramp` writes at once; beyond its last one an array has room for these."""
+"""Numbers that `write_ramp` touches at once: an array has room for these beyond its last one."""
+
+_NUMBER = ir.IntType(32)
+_VECTOR = ir.VectorType(_NUMBER, LANES)
 
 
-@intrinsic
-def write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
-    """Writes start, start + step, … from ``array[index]`` on: ``count`` int32, at most `LANES`.
-
-    A loop with so few rounds is not vectorised, or with a longer tail than body.
-    """
+def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
+    """A ramp's signature and the instructions that write it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number = ir.IntType(32)
-        vector = ir.VectorType(number, LANES)
-        array, index, start, step, count = arguments
+        array, index, *numbers = arguments
         data = context.make_array(signature.args[0])(context, builder, array).data
-        lane = ir.Constant(vector, list(range(LANES)))
-        ramp = builder.add(
-            _broadcast(builder, start, vector),
-            builder.mul(_broadcast(builder, step, vector), lane),
-        )
-        place = builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+        start, step, count = (_broadcast(builder, number) for number in numbers)
+        lane = ir.Constant(_VECTOR, list(range(LANES)))
+        ramp = builder.add(start, builder.mul(step, lane))
+        place = builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
         before = builder.load(place)
         before.align = 1
-        within = builder.icmp_signed("<", lane, _broadcast(builder, count, vector))
+        within = builder.icmp_signed("<", lane, count)
         builder.store(builder.select(within, ramp, before), place).align = 1
         return context.get_dummy_value()
 
-    return types.void(array, index, types.int32, types.int32, types.int32), generate
+    # Whatever the types of these, they are converted.
+    numbers = [types.int32 for _ in (start, step, count)]
+    return types.void(array, index, *numbers), generate
 
 
-@intrinsic
-def load_pair(_: Any, array: Any, index: Any) -> Any:
-    """``array[index] | array[index + 1] << 8`` of a uint8 array, as one unaligned load."""
+def _load_pair(_: Any, array: Any, index: Any) -> Any:
+    """A pair's signature and the instructions that load it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array, index = arguments
@@ -68,9 +64,22 @@ def load_pair(_: Any, array: Any, index: Any) -> Any:
     return types.uint16(array, index), generate
 
 
-def _broadcast(builder: Any, value: Any, vector: Any) -> Any:
+def _broadcast(builder: Any, number: Any) -> Any:
     """A vector of one and the same number."""
-    empty = ir.Constant(vector, ir.Undefined)
-    one = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
-    first = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return builder.shuffle_vector(one, empty, first)
+    empty = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(empty, number, ir.Constant(_NUMBER, 0))
+    return builder.shuffle_vector(one, empty, ir.Constant(_VECTOR, [0] * LANES))
+
+
+write_ramp: Any = intrinsic(_write_ramp)
+"""``write_ramp(array, index, start, step, count)`` writes start, start + step, … to an int32 array.
+
+It writes ``count`` numbers from ``array[index]`` on, at most `LANES` of them, without a loop: one
+of so few rounds is not vectorised, or does most of them in its tail.
+"""
+
+load_pair: Any = intrinsic(_load_pair)
+"""``load_pair(array, index)`` of a uint8 array: its number there, and the next one times 256.
+
+One load, aligned or not.
+"""

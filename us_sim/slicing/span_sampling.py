@@ -69,7 +69,7 @@ def sample_spans(
             q = np.uint64(span >> CUT_SHIFT)
             first = span & _COLUMN
             end = span >> END_SHIFT & _COLUMN
-            if inside[q]:
+            if inside[q] or _is_inner(maps[q], shape, row, first, end):
                 _write_span(maps[q], row, first, end, x, y, z)
             else:
                 _write_clipped(maps[q], shape, row, first, end, x, y, z)
@@ -135,6 +135,19 @@ def _write_span(m, row, first, end, x, y, z):
         write_ramp(y, at, np.int32(y0 + gy * column), np.int32(gy), left)
         write_ramp(z, at, np.int32(z0 + gz * column), np.int32(gz), left)
         column += LANES
+
+
+@njit(inline="always", error_model="numpy")
+def _is_inner(m, shape, row, first, end):
+    """Whether both ends of a span lie well among the voxels' centres, and so all of it."""
+    inner = True
+    for a in range(3):
+        start = m[a, 0] + m[a, 2] * row
+        at_first = start + m[a, 1] * first
+        at_last = start + m[a, 1] * (end - 1)
+        inner &= min(at_first, at_last) >= INNER_MARGIN
+        inner &= max(at_first, at_last) <= shape[a] - 1 - INNER_MARGIN
+    return inner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -233,7 +246,7 @@ def _least(x):
     return least
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _sample(voxels, shape, x, y, z, room, line):
     """Trilinear values of the pixels of a row; any value for those that lie nowhere.
 
