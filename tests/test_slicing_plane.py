@@ -65,3 +65,17 @@ def test_a_plane_that_cannot_be_is_refused(change, words):
     good = {"origin": [0, 0, 0], "column_step": [1e-3, 0, 0], "row_step": [0, 0, 1e-3]}
     with pytest.raises(ProbeError, match=words):
         SlicePlane(**{**good, **change}, columns=3, rows=3)
+
+
+@pytest.mark.parametrize(
+    "spans",
+    [np.zeros((3, 2, 2)), np.full((4, 2, 2), 6), np.full((4, 2, 2), -1), np.zeros((0, 2, 2))],
+)
+def test_spans_beyond_the_image_are_refused(spans):
+    steps = {"origin": np.zeros(3), "column_step": np.eye(3)[0], "row_step": np.eye(3)[2]}
+    with pytest.raises(ProbeError, match="two runs of columns, 0 to 5, of each of the 4 rows"):
+        SlicePlane(**steps, columns=5, rows=4, spans=spans)
+    runs = np.zeros((4, 2, 2), dtype=np.int64)
+    runs[:, 0] = [1, 4]
+    shown = SlicePlane(**steps, columns=5, rows=4, spans=runs).is_shown()
+    np.testing.assert_array_equal(shown, np.tile([False, True, True, True, False], (4, 1)))

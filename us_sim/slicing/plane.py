@@ -36,8 +36,8 @@ class SlicePlane:
             columns of each row that show something; the rest is black.
 
     Raises:
-        ProbeError: a number is not finite, the two steps are parallel or zero, or the grid has
-            no pixel or more than 4096 a side.
+        ProbeError: a number is not finite, the two steps are parallel or zero, the grid has no
+            pixel or more than 4096 a side, or spans that are not within it.
     """
 
     origin: NDArray[np.float64]  # (3,) m, centre of the pixel in row 0 and column 0
@@ -55,6 +55,8 @@ class SlicePlane:
             vector.flags.writeable = False
             object.__setattr__(self, name, vector)
         require_pixel_counts(self.columns, self.rows)
+        if self.spans is not None:
+            object.__setattr__(self, "spans", _runs_within(self.spans, self.rows, self.columns))
         area = np.linalg.norm(np.cross(self.column_step, self.row_step))
         scale = np.linalg.norm(self.column_step) * np.linalg.norm(self.row_step)
         if not area > 1e-6 * scale:
@@ -90,6 +92,18 @@ class SlicePlane:
         column = np.arange(self.columns)[None, :, None]
         row = np.arange(self.rows)[:, None, None]
         return self.origin + column * self.column_step + row * self.row_step
+
+
+def _runs_within(spans: NDArray[np.int32], rows: int, columns: int) -> NDArray[np.int32]:
+    """The spans as kernels take them, which do not look whether they stay within the image."""
+    runs = np.ascontiguousarray(spans, dtype=np.int32)
+    if runs.shape != (rows, 2, 2) or runs.min() < 0 or runs.max() > columns:
+        raise ProbeError(
+            f"the plane's spans have shape {runs.shape} and run from {runs.min(initial=0)} to "
+            f"{runs.max(initial=0)}: give two runs of columns, 0 to {columns}, of each of the "
+            f"{rows} rows"
+        )
+    return runs
 
 
 def require_pixel_counts(columns: int, rows: int) -> None:
