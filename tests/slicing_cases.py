@@ -37,9 +37,17 @@ def noise_volume(shape, steps, corner, turn=None, seed=0):
     return Volume(voxels, to_patient, voxels // 64, {1: "a", 2: "b", 3: "c"})
 
 
+def checkers(volume):
+    """The steepest grey values there are, in the place of a volume."""
+    grey = np.indices(volume.shape).sum(axis=0) % 2 * 255
+    return Volume(grey.astype(np.uint8), volume.index_to_patient, volume.labels)
+
+
 # Around the box meshes; ending within them, with its faces on pixels; oblique; one voxel thick.
+_AROUND = noise_volume((40, 30, 36), (2e-3, 2e-3, 2e-3), (-0.04, -0.03, -0.01))
 VOLUMES = (
-    noise_volume((40, 30, 36), (2e-3, 2e-3, 2e-3), (-0.04, -0.03, -0.01)),
+    _AROUND,
+    checkers(_AROUND),
     noise_volume((20, 16, 18), (2e-3, 2e-3, 2e-3), (-0.02, -0.016, 0.004)),
     noise_volume((50, 40, 30), (1.7e-3, 2.1e-3, 2.9e-3), (-0.04, -0.045, -0.015),
                  Pose([2e-3, 1e-3, 0.0], [0.1, -0.15, 0.2, 1.0])),
@@ -105,8 +113,9 @@ def _deformed(rng, nodes, strength):
 
 
 def _counts(rng):
-    return [(64, 48), (41, 57), (90, 40), (1, 64), (64, 1)][rng.choice(5, p=[0.4, 0.3, 0.2, 0.05,
-                                                                             0.05])]  # fmt: skip
+    """Columns and rows: as images have them, a few wide rows, and single rows and columns."""
+    counts = (64, 48), (41, 57), (90, 40), (900, 4), (1, 64), (64, 1)
+    return counts[rng.choice(6, p=[0.3, 0.3, 0.2, 0.1, 0.05, 0.05])]
 
 
 def _oblique_plane(rng, nodes, coarse=False):

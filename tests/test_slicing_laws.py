@@ -89,7 +89,7 @@ def test_an_affine_deformation_gives_the_affinely_resampled_image(method, seed):
 
 @every_method
 def test_a_linear_volume_stays_linear(method):
-    """Its values along any line are those of the affine map, to the rounding of grey values."""
+    """To the rounding of grey values, and a hundredth of a voxel at 6 grey values a voxel."""
     ramp = np.add.outer(np.add.outer(2 * np.arange(44), np.arange(34)), 3 * np.arange(40))
     volume = Volume(ramp.astype(np.uint8), around_the_box().index_to_patient)
     assert ramp.max() < 256
@@ -103,7 +103,7 @@ def test_a_linear_volume_stays_linear(method):
     is_tissue = ((rest >= LOW) & (rest <= HIGH)).all(axis=-1)
     error = slicer.image(mesh.nodes @ matrix.T + shift, plane) - index @ [2.0, 1.0, 3.0]
     assert is_tissue.sum() > 1000
-    assert np.abs(error)[is_tissue].max() <= 0.5 + 1e-3
+    assert np.abs(error)[is_tissue].max() <= 0.5 + 0.06
 
 
 @every_method
