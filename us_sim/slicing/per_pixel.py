@@ -34,6 +34,7 @@ from us_sim.slicing.resampling import label_voxels
 from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import INSIDE, RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
+from us_sim.slicing.trilinear import SLACK
 
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
@@ -43,8 +44,6 @@ __all__ = ["PerPixel"]
 # As for a section: pixels off the plane that count as on it, and a flat share of the rest volume.
 _ON_PLANE = 1e-9
 _FLAT = 1e-6
-# Voxels by which a point may miss the volume's outer faces, as for `trilinear`.
-_SLACK = 1e-6
 
 
 class PerPixel(Slicer):
@@ -99,7 +98,7 @@ class PerPixel(Slicer):
         """
         to_index, shape = self._volume.patient_to_index, np.array(self._volume.shape)
         index = self.rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
-        inside = ((index >= -0.5 - _SLACK) & (index <= shape - 0.5 + _SLACK)).all(axis=-1)
+        inside = ((index >= -0.5 - SLACK) & (index <= shape - 0.5 + SLACK)).all(axis=-1)
         return np.asarray(inside), np.clip(index[inside], 0, shape - 1)
 
     def _place(
