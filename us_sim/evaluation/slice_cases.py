@@ -35,10 +35,10 @@ __all__ = [
     "SIZES",
     "Case",
     "Frame",
+    "black_and_white",
     "cases",
     "dented",
     "speckle",
-    "striped",
 ]
 
 #: Columns, and rows, of an image.
@@ -191,12 +191,11 @@ def speckle(seed: int = 1) -> Volume:
     return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
 
 
-def striped(axis: int) -> Volume:
-    """Of the same shape and place: black and white in turn along an axis, voxel by voxel."""
+def black_and_white(seed: int = 1) -> Volume:
+    """Of the same shape and place: every voxel black or white, so that a shift is seen at once."""
     shape = [len(places) for places in _voxel_axes()]
-    voxels = np.zeros(shape, dtype=np.uint8)
-    np.moveaxis(voxels, axis, 0)[1::2] = 255
-    return _placed(voxels)
+    bits = np.random.default_rng(seed).integers(0, 2, shape, dtype=np.uint8)
+    return _placed(np.multiply(bits, 255, out=bits))
 
 
 def _voxel_axes() -> list[NDArray[np.float64]]:

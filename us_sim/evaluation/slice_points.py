@@ -26,7 +26,8 @@ __all__ = ["COLUMNS", "Errors", "Point", "Timing", "compare", "timed_together", 
 
 _AGAIN = 5  # images in a turn of a method that takes less than _SHORT
 _SHORT = 8.0  # ms
-_FEWEST = 3  # turns of each method
+_FEWEST = 3  # turns of each method that takes less than _SLOW
+_SLOW = 150.0  # ms
 # Voxels by which tissue must have moved before taking it for the rigid volume can be told.
 _MOVED = 0.01
 _ROUNDED = 0.5 + 1e-6  # grey levels
@@ -96,22 +97,23 @@ def timed_together(
 ) -> list[tuple[Timing, tuple[float, float]]]:
     """Times of all contenders, taken in turns, so that a noisy machine is as noisy for all.
 
-    Each is called once before, so that nothing is compiled while it is timed. The probe moves on
-    from image to image. Where a method says what parts its images took, their medians come too.
+    The probe moves on from image to image. Where a method says what parts its images took, their
+    medians come too.
 
     Args:
-        contenders: to be timed.
+        contenders: to be timed; each has cut an image before, so that nothing is compiled now.
         frames: what they cut, over and over.
-        seconds: after which no further turn begins, if each has had a few.
+        seconds: after which no further turn begins, if each has had a few; slow methods sit those
+            few out.
     """
-    for contender in contenders:
-        contender.image(frames[0])
     found: list[list[float]] = [[] for _ in contenders]
     parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
     begin = time.perf_counter()
     turn = 0
     while turn < _FEWEST or time.perf_counter() - begin < seconds:
         for number, contender in enumerate(contenders):
+            if turn and min(found[number]) > _SLOW and time.perf_counter() - begin > seconds:
+                continue
             again = _AGAIN if not found[number] or min(found[number]) < _SHORT else 1
             for image in range(again):
                 frame = frames[(turn + image) % len(frames)]
@@ -135,7 +137,7 @@ def compare(
     exact: ExactSlice,
     image: NDArray[np.uint8],
     rest: NDArray[np.float64],
-    stripes: Sequence[tuple[NDArray[np.float64], NDArray[np.uint8]]] = (),
+    contrast: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
     tissue_only: bool = False,
 ) -> Errors:
     """How wrong an image (rows, columns), and where it took it from (rows, columns, 3) m, are.
@@ -146,9 +148,9 @@ def compare(
         exact: what it must show.
         image: grey values.
         rest: NaN where the method found nothing.
-        stripes: what images of volumes of black and white in turn must show, and the method's
-            images of them: where those come from shows there to half a grey level, 0.002 voxels,
-            whatever it says in ``rest``.
+        contrast: what the image of a volume of black and white voxels must show, and the method's
+            image of it: whatever the method says in ``rest``, there a pixel shows where it comes
+            from, to half a grey level or 0.002 voxels.
         tissue_only: the method knows nothing of the rigid volume outside the mesh: grey values
             and places are compared where both find tissue.
     """
@@ -156,9 +158,10 @@ def compare(
     greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
     grey = np.abs(image - np.rint(exact.grey))[greys]
     distance = voxel_distance(volume, rest, expected)[right].max(initial=0.0)
-    for shown, seen in stripes:
+    if contrast is not None:
+        shown, seen = contrast
         off = np.abs(seen - shown)[right].max(initial=0.0)
-        # A value is rounded to a whole one, and black to white is a voxel.
+        # A value is rounded to a whole one, and from black to white is a voxel.
         distance = max(distance, (off - _ROUNDED) / 255.0)
     return Errors(
         int(wrong.sum()),

@@ -105,10 +105,9 @@ def _text(
         _table(*_summary(points)),
         f"Times are of {MAIN.size} × {MAIN.size} pixels on {_nodes()} nodes pressed by 12 mm, the "
         "errors the worst of all cases. VTK knows nothing of the rigid volume around the block: "
-        "its errors count where tissue is. A voxel error is the distance "
-        "between where a pixel's tissue lies at rest and where it was taken from, by the method's "
-        "own account and by its images of volumes striped black and white (which tell 0.002 "
-        "voxels).",
+        "its errors count where tissue is. A voxel error is the distance between where a pixel's "
+        "tissue lies at rest and where it was taken from, by the method's own account, and by its "
+        "image (on one thread) of a volume of black and white voxels, which tells 0.002 voxels.",
         "![What is cut, and where pixels are taken from](slice_differences.png)",
         "## Images' sizes",
         "![Time against pixels](slice_pixels.png)",
@@ -135,7 +134,8 @@ def _text(
         "Wall clock of one call that returns the image, for the methods here and for VTK from the "
         "deformed nodes as an array to the image as an array. A turn has five images in a row of "
         "methods that take less than 8 ms, one of the others; medians and 99th percentiles are "
-        "over all turns, the first image (which may compile) not counted. Coverage, grey values "
+        "over all turns; images cut before them, which may compile, are not counted. Methods that "
+        "take more than 150 ms sit turns out when the case's time is over. Coverage, grey values "
         "and rest coordinates are of one image a case. A pixel is at fault where the method finds "
         "nothing and the reference something, or the reverse, or where it takes tissue that moved "
         "by more than a hundredth of a voxel for the rigid volume, or the reverse. The memory is "

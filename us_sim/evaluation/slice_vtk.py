@@ -80,9 +80,9 @@ class VtkSlicer:
         self._mesh = vtkUnstructuredGrid()
         self._mesh.SetPoints(self._points)
         self._mesh.SetCells(VTK_TETRA, cells)
-        at_rest = numpy_to_vtk(
-            rest_nodes @ self._to_index[:3, :3].T + self._to_index[:3, 3], deep=True
-        )
+        # VTK's first index runs fastest, so its x is the volume's last axis.
+        index = rest_nodes @ self._to_index[:3, :3].T + self._to_index[:3, 3]
+        at_rest = numpy_to_vtk(np.ascontiguousarray(index[:, ::-1]), deep=True)
         at_rest.SetName("rest")
         self._mesh.GetPointData().AddArray(at_rest)
         self._pixels = vtkImageData()
@@ -91,9 +91,8 @@ class VtkSlicer:
         self._finder.SetSourceData(self._mesh)
 
         self._voxels = vtkImageData()
-        self._voxels.SetDimensions(*volume.shape)
-        # VTK's first index runs fastest.
-        grey = numpy_to_vtk(volume.intensities.ravel(order="F"), deep=True)
+        self._voxels.SetDimensions(*volume.shape[::-1])
+        grey = numpy_to_vtk(volume.intensities.reshape(-1))
         grey.SetName("grey")
         self._voxels.GetPointData().SetScalars(grey)
         self._places = vtkPolyData()
@@ -131,7 +130,7 @@ class VtkSlicer:
         self._find(nodes, plane)
         index = vtk_to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))
         to_patient = np.linalg.inv(self._to_index)
-        rest = index @ to_patient[:3, :3].T + to_patient[:3, 3]
+        rest = index[:, ::-1] @ to_patient[:3, :3].T + to_patient[:3, 3]
         rest = rest.reshape(plane.rows, plane.columns, 3)
         rest[~self._valid(plane)] = np.nan
         return np.asarray(rest)
