@@ -2,12 +2,14 @@
 
 __all__ = [
     "BagError",
+    "CalibrationError",
     "MaterialError",
     "MeshError",
     "PoseError",
     "ProbeError",
     "SceneError",
     "SolverError",
+    "TrackingError",
     "UsSimError",
     "VolumeError",
 ]
@@ -47,3 +49,11 @@ class ProbeError(UsSimError):
 
 class BagError(UsSimError):
     """A bag cannot be read, or cannot be written where it was asked to."""
+
+
+class TrackingError(UsSimError):
+    """A tracker's data, or what describes its bodies, cannot be used."""
+
+
+class CalibrationError(UsSimError):
+    """Calibration data are wrong, or cannot determine the answer."""

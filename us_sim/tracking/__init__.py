@@ -1,0 +1,1 @@
+"""Where the probe is: sources of poses, filters, calibration."""
