@@ -11,11 +11,10 @@ us_sim.errors.ProbeError: imaging.grey_map: 'purple' is not one of linear, soft,
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 from us_sim.errors import ProbeError
-from us_sim.quantity import Quantity, given
+from us_sim.quantity import Quantity, given, require_given
 
 __all__ = ["ECHO_RANGE", "GREY_MAPS", "Imaging"]
 
@@ -88,37 +87,10 @@ class Imaging:
     )
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
+        require_given(self, "imaging", ProbeError)
 
     @property
     def changes_grey_levels(self) -> bool:
         """Whether an echo is shown otherwise than by its own grey value in the volume."""
         plain = (0.0, ECHO_RANGE, "linear")
         return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)
-
-
-def _checked(field: dataclasses.Field[object], value: object) -> object:
-    """The value of a field as its type says, within its range or choices."""
-    quantity, choices = field.metadata["quantity"], field.metadata["choices"]
-    try:
-        if field.name == "time_gain":
-            if isinstance(value, str) or not hasattr(value, "__iter__"):
-                raise ValueError(f"{value!r} is not a list of numbers")
-            return tuple(quantity.parse(item) for item in value)
-        if choices:
-            if value not in choices:
-                raise ValueError(f"{value!r} is not one of {', '.join(choices)}")
-            return value
-        if quantity is None:
-            if not isinstance(value, bool):
-                raise ValueError(f"{value!r} is not true or false")
-            return value
-        number = quantity.parse(value)
-        if field.type == "int":
-            if number != int(number):
-                raise ValueError(f"{value!r} is not a whole number")
-            return int(number)
-        return number
-    except ValueError as error:
-        raise ProbeError(f"imaging.{field.name}: {error}") from error
