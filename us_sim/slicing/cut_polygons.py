@@ -86,13 +86,14 @@ def cut_tetrahedra(
     """
     place = np.empty((4, 3))
     polygon = np.empty((4, 2))
+    order = np.empty(4, dtype=np.uint64)
     count = 0
     pieces = 0
     skipped = 0
     for e in near:
         for k in range(4):
             place_node(nodes, tetrahedra[e, k], to_pixel, place, k)
-        sides = _cross(place, polygon)
+        sides = _cross(place, order, polygon)
         if not _is_on_image(place, polygon, sides, columns, rows):
             continue
         if not _map_to_rest(
@@ -114,7 +115,7 @@ def cut_tetrahedra(
             cuts.corners[count, k, 0] = polygon[k, 0]
             cuts.corners[count, k, 1] = polygon[k, 1]
         cuts.sides[count] = sides
-        cuts.inside[count] = within[e] and np.abs(cuts.maps[count, :, 1:]).max() < _STEEP
+        cuts.inside[count] = within[e] and _is_gentle(cuts.maps[count])
         count += 1
     return count, pieces, skipped
 
@@ -140,33 +141,33 @@ def cross_edge(place, a, b, corner):
 
 
 @njit(inline="always", error_model="numpy")
-def _cross(place, polygon):
+def _cross(place, order, polygon):
     """Fills the corners of the polygon, in turn; returns how many there are."""
-    above = np.empty(4, dtype=np.int64)
-    below = np.empty(4, dtype=np.int64)
-    up = 0
-    down = 0
+    # Nodes above the plane come first, then those below it.
+    up = np.uint64(0)
     for k in range(4):
         if place[k, 2] >= 0.0:
-            above[up] = k
-            up += 1
-        else:
-            below[down] = k
-            down += 1
-    if up == 0 or down == 0:
+            order[up] = k
+            up += np.uint64(1)
+    down = np.uint64(3)
+    for k in range(4):
+        if not place[k, 2] >= 0.0:
+            order[down] = k
+            down -= np.uint64(1)
+    if up == 0 or up == 4:
         return 0
     if up == 1:
         for k in range(3):
-            cross_edge(place, above[0], below[k], polygon[k])
+            cross_edge(place, order[0], order[k + 1], polygon[k])
         return 3
-    if down == 1:
+    if up == 3:
         for k in range(3):
-            cross_edge(place, above[k], below[0], polygon[k])
+            cross_edge(place, order[k], order[3], polygon[k])
         return 3
-    cross_edge(place, above[0], below[0], polygon[0])
-    cross_edge(place, above[0], below[1], polygon[1])
-    cross_edge(place, above[1], below[1], polygon[2])
-    cross_edge(place, above[1], below[0], polygon[3])
+    cross_edge(place, order[0], order[2], polygon[0])
+    cross_edge(place, order[0], order[3], polygon[1])
+    cross_edge(place, order[1], order[3], polygon[2])
+    cross_edge(place, order[1], order[2], polygon[3])
     return 4
 
 
@@ -239,6 +240,15 @@ def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, for
         form[a, 1] = r * (ux * to_b + vx * to_c + wx * to_d)
         form[a, 2] = r * (uy * to_b + vy * to_c + wy * to_d)
     return True
+
+
+@njit(inline="always", error_model="numpy")
+def _is_gentle(form):
+    """Whether rounding of a pixel's place cannot lead out of the tetrahedron's surroundings."""
+    steepest = 0.0
+    for a in range(3):
+        steepest = max(steepest, max(abs(form[a, 1]), abs(form[a, 2])))
+    return steepest < _STEEP
 
 
 @njit(inline="always", error_model="numpy")

@@ -69,7 +69,7 @@ class ScanConversion(Slicer):
         self._determinants = mesh.determinants[self._clusters.order]
         self._rest_index = mesh.rest_index
         self._within = _among_centres(mesh.rest_index, self._clusters.tetrahedra, volume.shape)
-        self._neighbours = _neighbours(self._clusters.tetrahedra)
+        self._neighbours = _neighbours(self._clusters.tetrahedra, self._determinants)
         self._surface = RestSurface(
             mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
         )
@@ -191,14 +191,22 @@ def _among_centres(
     return np.asarray(among[tetrahedra].all(axis=(1, 2)))
 
 
-def _neighbours(tetrahedra: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none."""
-    order, starts, counts = face_order(tetrahedra)
-    neighbours = np.full(4 * len(tetrahedra), -1, dtype=np.int32)
+def _neighbours(
+    tetrahedra: NDArray[np.int32], determinants: NDArray[np.float64]
+) -> NDArray[np.int32]:
+    """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none.
+
+    What is flat at rest is nobody's neighbour.
+    """
+    solid = np.flatnonzero(determinants).astype(np.int32)
+    order, starts, counts = face_order(tetrahedra[solid])
     first = starts[counts == 2]
     one, other = order[first], order[first + 1]
-    neighbours[one], neighbours[other] = other // 4, one // 4
-    return neighbours.reshape(-1, 4)
+    of_solid = np.full(4 * len(solid), -1, dtype=np.int32)
+    of_solid[one], of_solid[other] = solid[other // 4], solid[one // 4]
+    neighbours = np.full(tetrahedra.shape, -1, dtype=np.int32)
+    neighbours[solid] = of_solid.reshape(-1, 4)
+    return neighbours
 
 
 def _with_a_next_one(
