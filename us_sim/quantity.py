@@ -25,6 +25,9 @@ _UNITS: dict[str, dict[str, float]] = {
     "stiffness": {"N/m": 1.0, "N/mm": 1e3},
     "mass per area": {"kg/m2": 1.0, "kg/m^2": 1.0},
     "level": {"dB": 1.0},
+    "frequency": {"Hz": 1.0, "kHz": 1e3},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3},
+    "angular speed": {"rad/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180},
     "number": {},
 }
 _NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
