@@ -114,14 +114,15 @@ def timed_together(
         for number, contender in enumerate(contenders):
             if turn and min(found[number]) > _SLOW and time.perf_counter() - begin > seconds:
                 continue
-            again = _AGAIN if not found[number] or min(found[number]) < _SHORT else 1
-            for image in range(again):
+            for image in range(_AGAIN):
                 frame = frames[(turn + image) % len(frames)]
                 before = time.perf_counter()
                 contender.image(frame)
                 found[number].append((time.perf_counter() - before) * 1e3)
                 if contender.parts is not None:
                     parts[number].append(contender.parts())
+                if min(found[number]) > _SHORT:
+                    break
         turn += 1
     missing = [(float("nan"), float("nan"))]
     medians = [np.median(known or missing, axis=0) for known in parts]
