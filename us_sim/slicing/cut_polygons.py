@@ -77,6 +77,9 @@ def cut_tetrahedra(
 ):  # fmt: skip
     """Fills ``cuts``; returns the numbers of cuts, of outlines and of tetrahedra skipped.
 
+    The fourth number says whether the cuts are sure to cover the image: no outline is on it, but
+    a corner of a polygon is.
+
     Args:
         near: (K,) tetrahedra to cut. nodes: (N, 3) m. to_pixel: (3, 4) from m to column, row and
             height. pixel_volume: m³ of a unit of those.
@@ -90,9 +93,11 @@ def cut_tetrahedra(
     count = 0
     pieces = 0
     skipped = 0
+    corner_on_image = False
     for e in near:
+        e = np.uint32(e)
         for k in range(4):
-            place_node(nodes, tetrahedra[e, k], to_pixel, place, k)
+            place_node(nodes, np.uint32(tetrahedra[e, k]), to_pixel, place, k)
         sides = _cross(place, order, polygon)
         if not _is_on_image(place, polygon, sides, columns, rows):
             continue
@@ -114,10 +119,13 @@ def cut_tetrahedra(
         for k in range(sides):
             cuts.corners[count, k, 0] = polygon[k, 0]
             cuts.corners[count, k, 1] = polygon[k, 1]
+            corner_on_image |= (
+                0.0 <= polygon[k, 0] <= columns - 1 and 0.0 <= polygon[k, 1] <= rows - 1
+            )
         cuts.sides[count] = sides
         cuts.inside[count] = within[e] and _is_gentle(cuts.maps[count])
         count += 1
-    return count, pieces, skipped
+    return count, pieces, skipped, corner_on_image and pieces == 0
 
 
 @njit(inline="always", error_model="numpy")
@@ -232,10 +240,10 @@ def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, for
     c0 = -r * (vx * x0 + vy * y0 + vz * z0)
     d0 = -r * (wx * x0 + wy * y0 + wz * z0)
     for a in range(3):
-        at = rest_index[corners[0], a]
-        to_b = rest_index[corners[1], a] - at
-        to_c = rest_index[corners[2], a] - at
-        to_d = rest_index[corners[3], a] - at
+        at = rest_index[np.uint32(corners[0]), a]
+        to_b = rest_index[np.uint32(corners[1]), a] - at
+        to_c = rest_index[np.uint32(corners[2]), a] - at
+        to_d = rest_index[np.uint32(corners[3]), a] - at
         form[a, 0] = at + b0 * to_b + c0 * to_c + d0 * to_d
         form[a, 1] = r * (ux * to_b + vx * to_c + wx * to_d)
         form[a, 2] = r * (uy * to_b + vy * to_c + wy * to_d)

@@ -16,7 +16,7 @@ from us_sim.slicing.cut_polygons import FACES, cross_edge, face_cut, place_node
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.spans import closed_columns, up_to
 
-__all__ = ["Outline", "RestSurface", "mark_covered"]
+__all__ = ["NO_OUTLINE", "Outline", "RestSurface", "mark_covered"]
 
 
 class Outline(NamedTuple):
@@ -26,6 +26,10 @@ class Outline(NamedTuple):
     points: NDArray[np.int8]  # (cuts,) how many of the three there are
     turns: NDArray[np.int8]  # (cuts,) by how much a crossing from the left winds further
     number: int
+
+
+NO_OUTLINE = Outline(np.empty((0, 3, 2)), np.empty(0, dtype=np.int8), np.empty(0, dtype=np.int8), 0)
+"""Of a mesh that is not there, or that need not be asked for."""
 
 
 class RestSurface:

@@ -34,7 +34,7 @@ from us_sim.slicing.cut_polygons import cut_tetrahedra, room_for_cuts
 from us_sim.slicing.location import BLACK
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.resampling import label_voxels, pixel_to_index, sample_nearest, voxels_of
-from us_sim.slicing.rest_outline import RestSurface
+from us_sim.slicing.rest_outline import NO_OUTLINE, Outline, RestSurface
 from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
@@ -81,8 +81,7 @@ class ScanConversion(Slicer):
         self._full = np.empty((0, 2, 2), dtype=np.int32)
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        count, pieces = self._cut(nodes, plane)
-        outline = self._surface.cut(plane)
+        count, pieces, outline = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
 
@@ -120,27 +119,29 @@ class ScanConversion(Slicer):
         self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
-        count, pieces = self._cut(nodes, plane)
-        outline = self._surface.cut(plane)
+        count, pieces, outline = self._cut(nodes, plane)
         runs = self._shown(plane)
         spans = self._convert(count, pieces, runs, 0, plane.rows)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
         return elements, self._cuts.maps[: count + 1]
 
-    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int]:
-        """Fills the cuts; how many there are, and how many outlines. The rigid map is the next."""
+    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline]:
+        """Fills the cuts: how many there are and how many outlines, and the mesh at rest.
+
+        The map that follows those of the cuts is the rigid one.
+        """
         moved = self._as_kernels_take(nodes)
         near = self._clusters.near(moved, plane)
         if 4 * len(near) >= len(self._cuts.sides):
             self._cuts = room_for_cuts(2 * len(near))
-        count, pieces, self.skipped = cut_tetrahedra(
+        count, pieces, self.skipped, is_covered = cut_tetrahedra(
             near, moved, plane.to_pixel, float(np.linalg.det(plane.basis)), plane.columns,
             plane.rows, self._clusters.tetrahedra, self._neighbours, self._determinants,
             self._rest_index, self._within, self._cuts,
         )  # fmt: skip
         self._cuts.maps[count] = pixel_to_index(self._volume, plane)
-        return count, pieces
+        return count, pieces, NO_OUTLINE if is_covered else self._surface.cut(plane)
 
     def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
         """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""

@@ -37,9 +37,12 @@ def convert_cuts(
     low = np.empty(end_row - first_row, dtype=np.int64)
     high = np.empty(end_row - first_row, dtype=np.int64)
     columns = np.int64(0)
+    kinds = np.uint64(1)
     for row in range(first_row, end_row):
         used[row] = 0
         columns = max(columns, max(np.int64(runs[row, 0, 1]), np.int64(runs[row, 1, 1])))
+        if runs[row, 1, 1] > runs[row, 1, 0]:
+            kinds = np.uint64(2)
     for q in range(pieces):
         top = np.inf
         bottom = -np.inf
@@ -49,7 +52,7 @@ def convert_cuts(
         for row in range(up_to(top - _CLOSE, first_row, end_row),
                          min(up_to(bottom + _CLOSE, first_row, end_row) + 1, end_row)):  # fmt: skip
             first, end = closed_columns(outlines[q], points[q], row, columns)
-            _add(owner[q], first, end, row, runs, spans, used)
+            _add(owner[q], first, end, row, runs, kinds, spans, used)
     for q in range(count):
         if sides[q] == 0:
             continue
@@ -61,8 +64,8 @@ def convert_cuts(
         above = up_to(top, first_row, end_row)
         below = up_to(bottom, first_row, end_row)
         for row in range(above, below):
-            low[row - first_row] = columns
-            high[row - first_row] = 0
+            low[np.uint64(row - first_row)] = columns
+            high[np.uint64(row - first_row)] = 0
         for k in range(sides[q]):
             other = k + 1 if k + 1 < sides[q] else 0
             a, b = (k, other) if corners[q, k, 1] < corners[q, other, 1] else (other, k)
@@ -73,10 +76,12 @@ def convert_cuts(
                 up_to(start, first_row, end_row), up_to(corners[q, b, 1], first_row, end_row)
             ):
                 at = up_to(column + (row - start) * slope, 0, columns)
-                low[row - first_row] = min(low[row - first_row], at)
-                high[row - first_row] = max(high[row - first_row], at)
+                line = np.uint64(row - first_row)
+                low[line] = min(low[line], at)
+                high[line] = max(high[line], at)
         for row in range(above, below):
-            _add(q, low[row - first_row], high[row - first_row], row, runs, spans, used)
+            line = np.uint64(row - first_row)
+            _add(q, low[line], high[line], row, runs, kinds, spans, used)
     most = 0
     for row in range(first_row, end_row):
         most = max(most, used[row])
@@ -85,24 +90,24 @@ def convert_cuts(
 
 @njit(inline="always", error_model="numpy")
 def up_to(value, least, most):
-    """The least whole number not below a value, held between two others."""
-    if not value > least:
-        return np.int64(least)
-    if value > most:
-        return np.int64(most)
-    return np.int64(np.ceil(value))
+    """The least whole number not below a value, held between two others; the first if not one."""
+    held = value if value > least else np.float64(least)
+    held = held if held < most else np.float64(most)
+    return np.int64(np.ceil(held))
 
 
 @njit(inline="always", error_model="numpy")
-def _add(q, first, end, row, runs, spans, used):
+def _add(q, first, end, row, runs, kinds, spans, used):
     """Adds a span of cut ``q``, as far as the row shows something."""
-    for k in range(2):
-        a = max(first, np.int64(runs[row, k, 0]))
-        b = min(end, np.int64(runs[row, k, 1]))
-        if a < b:
-            if used[row] < spans.shape[1]:
-                spans[row, used[row]] = np.int64(q) << CUT_SHIFT | b << END_SHIFT | a
-            used[row] += 1
+    line = np.uint64(row)
+    for k in range(kinds):
+        a = max(first, np.int64(runs[line, k, 0]))
+        b = min(end, np.int64(runs[line, k, 1]))
+        # An empty span is written too, and overwritten: faster than to ask.
+        place = np.uint64(used[line])
+        if place < np.uint64(spans.shape[1]):
+            spans[line, place] = np.int64(q) << CUT_SHIFT | b << END_SHIFT | a
+        used[line] += a < b
 
 
 @njit(inline="always", error_model="numpy")
