@@ -1,0 +1,194 @@
+"""A constant-velocity Kalman filter on SE(3): no lag behind a uniform motion.
+
+>>> from us_sim.pose import Pose
+>>> from us_sim.tracking.filter_settings import FilterSettings
+>>> from us_sim.tracking.kalman import ConstantVelocityKalman
+>>> from us_sim.tracking.measurement import Measurement
+>>> kalman = ConstantVelocityKalman(FilterSettings("kalman"))
+>>> for k in range(100):  # 0.1 m/s
+...     filtered = kalman.update(Measurement(k * 10_000_000, Pose([0.001 * k, 0.0, 0.0])))
+>>> round(1e6 * (filtered.pose.position[0] - 0.099).item())  # µm behind
+0
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, pi, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import TrackingError
+from us_sim.pose import Pose
+from us_sim.tracking.filter_settings import FilterSettings
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.pose_filter import PoseFilter
+from us_sim.tracking.se3 import left_jacobian, product, rotation_between, rotation_exp
+
+__all__ = ["ConstantVelocityKalman"]
+
+# What is not known of the first pose: how fast it moves, one standard deviation.
+_INITIAL_SPEED = 0.5  # m/s
+_INITIAL_ANGULAR_SPEED = 5.0  # rad/s
+
+_POSE, _VELOCITY = slice(0, 6), slice(6, 12)
+
+
+class ConstantVelocityKalman(PoseFilter):
+    """An error-state Kalman filter of pose, velocity and angular velocity (Solà 2017, chapter 6).
+
+    The error (12,) is that of position (m), rotation (rad, exp(error) times the estimate, so about
+    the parent's axes), velocity and angular velocity, both along the parent's axes. That is the
+    convention of a measurement's covariance, which therefore is used as it is. White accelerations
+    of the settings' spectral density drive it; steps may vary.
+
+    A filtered measurement carries the estimate's covariance.
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        self._settings = settings
+        variances = [settings.position_deviation**2] * 3 + [settings.rotation_deviation**2] * 3
+        self._usual_noise = np.diag(variances)
+        self._densities = np.array(
+            [settings.acceleration**2] * 3 + [settings.angular_acceleration**2] * 3
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next measurement is the first."""
+        self._stamp: int | None = None
+        self._pose = Pose()
+        self._velocity = np.zeros(6)  # m/s, then rad/s
+        self._covariance: NDArray[np.float64] = np.zeros((12, 12))
+        self._step = 0.0  # s, the newest
+        self._gain = np.zeros((12, 6))  # the newest
+        self._predicted: tuple[int, Pose, NDArray[np.float64]] | None = None
+
+    def update(self, measurement: Measurement) -> Measurement:
+        """The measurement with its pose filtered, and the covariance of that."""
+        noise = self._noise(measurement)
+        if self._stamp is None:
+            self._start(measurement, noise)
+        else:
+            self._correct(measurement, noise)
+        self._stamp = measurement.stamp
+        return Measurement(
+            measurement.stamp, self._pose, self._covariance[_POSE, _POSE], measurement.error
+        )
+
+    def expected(
+        self, measurement: Measurement
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """The innovation (6,) m, rad, of a measurement, and its covariance (6, 6)."""
+        if self._stamp is None:
+            return None
+        pose, covariance = self._prediction(measurement.stamp)
+        return (
+            _difference(pose, measurement.pose),
+            covariance[_POSE, _POSE] + self._noise(measurement),
+        )
+
+    def _noise(self, measurement: Measurement) -> NDArray[np.float64]:
+        return self._usual_noise if measurement.covariance is None else measurement.covariance
+
+    def _start(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
+        self._pose = measurement.pose
+        self._covariance[_POSE, _POSE] = noise
+        speeds = [_INITIAL_SPEED**2] * 3 + [_INITIAL_ANGULAR_SPEED**2] * 3
+        self._covariance[_VELOCITY, _VELOCITY] = np.diag(speeds)
+
+    def _prediction(self, stamp: int) -> tuple[Pose, NDArray[np.float64]]:
+        """The pose and the error's covariance (12, 12) at a stamp, as the newest velocity goes on.
+
+        The same stamp is asked for by the gate and then by the update.
+        """
+        if self._predicted is not None and self._predicted[0] == stamp:
+            return self._predicted[1:]
+        assert self._stamp is not None
+        step = 1e-9 * (stamp - self._stamp)
+        turn = step * self._velocity[3:]
+        turn_quaternion = rotation_exp(turn)
+        pose = Pose(
+            self._pose.position + step * self._velocity[:3],
+            product(turn_quaternion, self._pose.orientation),
+        )
+        transition = np.eye(12)
+        transition[0:3, 6:9] = step * np.eye(3)
+        transition[3:6, 3:6] = Pose(orientation=turn_quaternion).rotation
+        transition[3:6, 9:12] = step * left_jacobian(turn)
+        covariance = transition @ self._covariance @ transition.T
+        # White acceleration over a step (Bar-Shalom, Li, Kirubarajan 2001, eq. 6.2.2-4).
+        index = np.arange(6)
+        covariance[index, index] += self._densities * (step**3 / 3.0)
+        covariance[index, index + 6] += self._densities * (step**2 / 2.0)
+        covariance[index + 6, index] += self._densities * (step**2 / 2.0)
+        covariance[index + 6, index + 6] += self._densities * step
+        self._predicted = (stamp, pose, covariance)
+        return pose, covariance
+
+    def _correct(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
+        assert self._stamp is not None
+        pose, covariance = self._prediction(measurement.stamp)
+        try:
+            gain = np.linalg.solve(covariance[_POSE, _POSE] + noise, covariance[_POSE]).T
+        except np.linalg.LinAlgError as error:
+            raise TrackingError(
+                "a pose's covariance is of no distribution: it is singular where it must not be"
+            ) from error
+        correction = gain @ _difference(pose, measurement.pose)
+        self._pose = Pose(
+            pose.position + correction[:3],
+            product(rotation_exp(correction[3:6]), pose.orientation),
+        )
+        self._velocity = self._velocity + correction[_VELOCITY]
+        # Joseph's form stays symmetric and positive however sure a measurement is of itself.
+        kept = np.eye(12)
+        kept[:, _POSE] -= gain
+        covariance = kept @ covariance @ kept.T + gain @ noise @ gain.T
+        self._covariance = 0.5 * (covariance + covariance.T)
+        self._step, self._gain = 1e-9 * (measurement.stamp - self._stamp), gain
+        self._predicted = None
+
+    @property
+    def lag(self) -> float:
+        """s, none: once it knows the velocity the filter is not behind a uniform motion.
+
+        It settles as an alpha-beta tracker, whose error for a ramp is zero (Kalata 1984); see
+        `lag_at` for motions that change.
+        """
+        return 0.0
+
+    @property
+    def rotation_lag(self) -> float:
+        """s, none: see `lag`."""
+        return 0.0
+
+    def lag_at(self, frequency: float) -> float:
+        """s, the phase delay of the alpha-beta tracker that the filter is with its newest gain.
+
+        With z = exp(2 pi i f T) and gains a of the position and b / T of the velocity it is that
+        of (a + (b - a) / z) / (1 - (2 - a - b) / z + (1 - a) / z²). It may be negative: a filter
+        that extrapolates is ahead of slow sways by a little.
+        """
+        if not self._step:
+            return 0.0
+        step = self._step
+        a = float(np.trace(self._gain[0:3, 0:3])) / 3.0
+        b = step * float(np.trace(self._gain[6:9, 0:3])) / 3.0
+        angle = 2.0 * pi * frequency * step
+        above = atan2((a - b) * sin(angle), a + (b - a) * cos(angle))
+        below = atan2(
+            (2.0 - a - b) * sin(angle) - (1.0 - a) * sin(2.0 * angle),
+            1.0 - (2.0 - a - b) * cos(angle) + (1.0 - a) * cos(2.0 * angle),
+        )
+        return (above + below) / (2.0 * pi * frequency)
+
+
+def _difference(expected: Pose, measured: Pose) -> NDArray[np.float64]:
+    """(6,) m, rad, from one pose to another, as a measurement's covariance has them."""
+    return np.concatenate(
+        [
+            measured.position - expected.position,
+            rotation_between(expected.orientation, measured.orientation),
+        ]
+    )

@@ -1,0 +1,147 @@
+"""Which poses are not believed: those that no probe could have come to, or to so soon.
+
+>>> from us_sim.pose import Pose
+>>> from us_sim.tracking.filter_settings import GateSettings
+>>> from us_sim.tracking.measurement import Measurement
+>>> from us_sim.tracking.outlier_gate import OutlierGate
+>>> gate = OutlierGate(GateSettings(maximum_speed="1 m/s", jump="5 mm", accept_after=3))
+>>> [gate.judge(Measurement(k * 10_000_000, Pose([x, 0, 0]))).value
+...  for k, x in enumerate([0.0, 0.5, 0.01, 0.2, 0.2, 0.2])]
+['believed', 'refused', 'believed', 'refused', 'refused', 'new place']
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from us_sim.tracking.filter_settings import GateSettings
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.se3 import rotation_between
+
+__all__ = ["OutlierGate", "Verdict"]
+
+
+class Verdict(Enum):
+    """What the gate says of a measurement."""
+
+    BELIEVED = "believed"
+    REFUSED = "refused"
+    NEW_PLACE = "new place"  # believed, but not as a motion from where the probe was
+
+
+class OutlierGate:
+    """Compares each measurement with the newest believed one.
+
+    Where both have a covariance, or the filter knows what to expect, by Mahalanobis' distance
+    (chi-square with six degrees of freedom); the fastest motion alone is at the limit. Else by the
+    limits on speed, to which the settings' jumps are added: they are for a pose's noise.
+
+    Refused measurements in a row of which each is within the speed limits of the one before are
+    the new place after so many of them: the probe did move fast, or was registered anew.
+    """
+
+    def __init__(self, settings: GateSettings) -> None:
+        self._settings = settings
+        self._limit = float(chdtri(6, 1.0 - settings.confidence))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next measurement is believed."""
+        self._believed: Measurement | None = None
+        self._refused: Measurement | None = None  # the newest of a row
+        self._row = 0
+        self.reason = ""
+
+    def judge(
+        self,
+        measurement: Measurement,
+        expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    ) -> Verdict:
+        """Whether a measurement is believed; if not, why is in `reason`.
+
+        Args:
+            measurement: newer than any before.
+            expected: how far (6,) m, rad, the pose is from what a filter expects, and the
+                covariance (6, 6) of that.
+        """
+        self.reason = self._doubt(measurement, expected)
+        verdict = Verdict.BELIEVED
+        if self.reason:
+            agrees = self._refused is not None and not self._too_fast(self._refused, measurement)
+            self._refused, self._row = measurement, self._row + 1 if agrees else 1
+            if self._row < self._settings.accept_after:
+                return Verdict.REFUSED
+            verdict = Verdict.NEW_PLACE
+        self._believed, self._refused, self._row = measurement, None, 0
+        return verdict
+
+    def _doubt(
+        self,
+        measurement: Measurement,
+        expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    ) -> str:
+        """Why a measurement is not believed, or nothing."""
+        before = self._believed
+        if before is None:
+            return ""
+        if measurement.covariance is None:
+            return self._too_fast(before, measurement)
+        if expected is None:
+            if before.covariance is None:
+                return self._too_fast(before, measurement)
+            expected = self._at_rest(before, measurement)
+        difference, covariance = expected
+        distance = float(difference @ np.linalg.solve(covariance, difference))
+        if 0.0 <= distance <= self._limit:
+            return ""
+        return (
+            f"the pose is {1e3 * _norm(difference[:3]):.1f} mm and "
+            f"{np.degrees(_norm(difference[3:])):.1f}° from where it is expected: "
+            f"Mahalanobis distance {sqrt(max(distance, 0.0)):.1f}, the limit is "
+            f"{sqrt(self._limit):.1f}"
+        )
+
+    def _at_rest(
+        self, before: Measurement, measurement: Measurement
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The difference of two measurements with covariances, and its covariance."""
+        settings, step = self._settings, 1e-9 * (measurement.stamp - before.stamp)
+        difference = np.concatenate(
+            [
+                measurement.pose.position - before.pose.position,
+                rotation_between(before.pose.orientation, measurement.pose.orientation),
+            ]
+        )
+        assert before.covariance is not None
+        assert measurement.covariance is not None
+        covariance = before.covariance + measurement.covariance
+        index = np.arange(6)
+        speeds = [settings.maximum_speed**2] * 3 + [settings.maximum_angular_speed**2] * 3
+        covariance[index, index] += np.array(speeds) * (step * step / self._limit)
+        return difference, covariance
+
+    def _too_fast(self, before: Measurement, measurement: Measurement) -> str:
+        """Why a probe cannot have come from one pose to another, or nothing."""
+        settings, step = self._settings, 1e-9 * (measurement.stamp - before.stamp)
+        way = _norm(measurement.pose.position - before.pose.position)
+        if way > settings.jump + settings.maximum_speed * step:
+            return (
+                f"the pose is {1e3 * way:.1f} mm from the one {1e3 * step:.1f} ms before: "
+                f"faster than {settings.maximum_speed:g} m/s"
+            )
+        turn = _norm(rotation_between(before.pose.orientation, measurement.pose.orientation))
+        if turn > settings.rotation_jump + settings.maximum_angular_speed * step:
+            return (
+                f"the pose is turned {np.degrees(turn):.1f}° from the one {1e3 * step:.1f} ms "
+                f"before: faster than {settings.maximum_angular_speed:g} rad/s"
+            )
+        return ""
+
+
+def _norm(vector: NDArray[np.float64]) -> float:
+    return sqrt(float(vector @ vector))

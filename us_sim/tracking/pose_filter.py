@@ -1,0 +1,90 @@
+"""Filters of poses: what each of them does, and the one that a scene asks for.
+
+>>> from us_sim.tracking.filter_settings import FilterSettings
+>>> from us_sim.tracking.pose_filter import make_filter
+>>> round(1e3 * make_filter(FilterSettings("one_euro", minimum_cutoff=2.0)).lag)  # ms, at rest
+80
+>>> make_filter(FilterSettings("kalman")).lag
+0.0
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.tracking.filter_settings import FilterSettings
+from us_sim.tracking.measurement import Measurement
+
+__all__ = ["PoseFilter", "Unfiltered", "make_filter"]
+
+
+class PoseFilter(ABC):
+    """Takes measurements one by one, each newer than the one before, and returns better ones.
+
+    A filtered measurement keeps its stamp: it is the filter's answer for that very moment.
+    """
+
+    @abstractmethod
+    def update(self, measurement: Measurement) -> Measurement:
+        """The measurement with its pose filtered."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget everything: the next measurement is the first."""
+
+    @property
+    @abstractmethod
+    def lag(self) -> float:
+        """s by which, as the filter is set now, its position is behind a uniform motion."""
+
+    @property
+    @abstractmethod
+    def rotation_lag(self) -> float:
+        """s by which, as the filter is set now, its rotation is behind a uniform turn."""
+
+    @abstractmethod
+    def lag_at(self, frequency: float) -> float:
+        """s by which, as the filter is set now, its position is behind a sway at ``frequency``."""
+
+    def expected(
+        self, _measurement: Measurement
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """How far (6,) the pose is from what the filter expects, and that difference's covariance.
+
+        None of a filter that does not know; m and rad as in a measurement's covariance.
+        """
+        return None
+
+
+class Unfiltered(PoseFilter):
+    """Poses as they were measured."""
+
+    lag = 0.0
+    rotation_lag = 0.0
+
+    def update(self, measurement: Measurement) -> Measurement:
+        """The measurement itself."""
+        return measurement
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+    def lag_at(self, frequency: float) -> float:  # noqa: ARG002
+        """None."""
+        return 0.0
+
+
+def make_filter(settings: FilterSettings) -> PoseFilter:
+    """The filter that the settings name; what is not named is not imported."""
+    if settings.method == "one_euro":
+        from us_sim.tracking.one_euro import OneEuro
+
+        return OneEuro(settings)
+    if settings.method == "kalman":
+        from us_sim.tracking.kalman import ConstantVelocityKalman
+
+        return ConstantVelocityKalman(settings)
+    return Unfiltered()

@@ -1,0 +1,180 @@
+"""From what a device measured to where the probe is: registered, checked, filtered.
+
+>>> import numpy as np
+>>> from us_sim.pose import Pose
+>>> from us_sim.tracking.filter_settings import FilterSettings, GateSettings
+>>> from us_sim.tracking.measurement import Measurement
+>>> from us_sim.tracking.outlier_gate import OutlierGate
+>>> from us_sim.tracking.pose_filter import make_filter
+>>> from us_sim.tracking.probe_tracking import ProbeTracking
+>>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
+>>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
+>>> tracking = ProbeTracking(
+...     camera_above,
+...     marker_on_grip,
+...     make_filter(FilterSettings()),
+...     OutlierGate(GateSettings()),
+...     time_offset=-0.02,
+... )
+>>> probe = tracking.take(Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29])), 5_010_000_000)
+>>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.state(5_010_000_000).value
+(4980000000, [0.0, 0.0, 0.01], 'tracked')
+>>> tracking.take(Measurement(5_010_000_000, Pose([0.0, 0.0, 0.9])), 5_020_000_000)
+>>> tracking.last_problem
+'the pose is 610.0 mm from the one 10.0 ms before: faster than 2 m/s'
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+
+import numpy as np
+
+from us_sim.errors import TrackingError
+from us_sim.pose import Pose
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.outlier_gate import OutlierGate, Verdict
+from us_sim.tracking.pose_filter import PoseFilter
+from us_sim.tracking.se3 import adjoint
+from us_sim.tracking.tracking_state import TrackingClock, TrackingState
+
+__all__ = ["ProbeTracking"]
+
+RESTART_NS = 1_000_000_000
+"""A stamp that jumps back by more is a restarted source, not a late measurement."""
+
+
+class ProbeTracking:
+    """Takes a device's measurements and gives the probe's, each once and with its own stamp.
+
+    Args:
+        registration: the device's frame in ``patient``.
+        calibration: the probe in the tracked body's frame.
+        filter: what smooths the probe's poses in ``patient``.
+        gate: what refuses some of them; None believes all.
+        time_offset: s that are added to the device's stamps.
+        coast_for: s without a pose after which the state is *coasting*.
+        lost_after: s without a pose after which it is *lost*, and the next one starts anew.
+
+    Raises:
+        TrackingError: the times make no sense.
+    """
+
+    def __init__(
+        self,
+        registration: Pose,
+        calibration: Pose,
+        filter: PoseFilter,
+        gate: OutlierGate | None = None,
+        *,
+        time_offset: float = 0.0,
+        coast_for: float = 0.3,
+        lost_after: float = 1.0,
+    ) -> None:
+        if not np.isfinite(time_offset):
+            raise TrackingError(f"the time offset of a tracker is {time_offset} s: not finite")
+        self._registration, self._calibration = registration, calibration
+        self.filter, self._gate = filter, gate
+        self._time_offset = round(1e9 * time_offset)
+        self._clock = TrackingClock(coast_for=coast_for, lost_after=lost_after)
+        self._longest_gap = round(1e9 * lost_after)
+        self._newest: int | None = None  # ns, stamp of the newest measurement in order
+        self._believed: int | None = None  # ns, stamp of the newest that was believed
+        self.refused: Counter[str] = Counter()
+        self.restarts: Counter[str] = Counter()
+        self.last_problem = ""
+
+    def reset(self) -> None:
+        """Forget all poses: the next one is the first. What was counted stays."""
+        self._newest = self._believed = None
+        self._clock.reset()
+        self._start_anew()
+
+    def state(self, now_ns: int) -> TrackingState:
+        """Whether the probe is tracked at a time of the clock that `take` is told."""
+        return self._clock.state(now_ns)
+
+    def refuse(self, kind: str, sentence: str) -> None:
+        """Count a measurement that cannot be used, be it one that never became a pose."""
+        self.refused[kind] += 1
+        self.last_problem = sentence
+
+    def take(self, measurement: Measurement, now_ns: int) -> Measurement | None:
+        """The probe in ``patient``, or None where the measurement is refused.
+
+        Why is then in `last_problem`, and counted in `refused` as "order" (not newer than one
+        before), "covariance" (of no distribution) or "gate".
+
+        Args:
+            measurement: the tracked body in the device's frame.
+            now_ns: when it arrived.
+        """
+        if not self._in_order(measurement.stamp):
+            self.refuse("order", "the pose is not newer than the one before it")
+            return None
+        covariance = measurement.covariance
+        if covariance is not None and not _is_of_a_distribution(covariance):
+            self.refuse("covariance", "the pose's covariance has a negative variance")
+            return None
+        probe = self._of_probe(measurement)
+        if self._believed is not None and probe.stamp - self._believed > self._longest_gap:
+            self.restarts["gap"] += 1
+            self._start_anew()
+        if self._gate is not None:
+            verdict = self._gate.judge(probe, self.filter.expected(probe))
+            if verdict is Verdict.REFUSED:
+                self.refuse("gate", self._gate.reason)
+                return None
+            if verdict is Verdict.NEW_PLACE:
+                self.restarts["place"] += 1
+                self.filter.reset()
+        self._believed = probe.stamp
+        self._clock.seen(now_ns)
+        return self.filter.update(probe)
+
+    def _in_order(self, stamp: int) -> bool:
+        """Whether a stamp is newer, or so much older that the source was started again."""
+        if self._newest is not None:
+            step = stamp - self._newest
+            if -RESTART_NS < step <= 0:
+                return False
+            if step <= 0:
+                self.restarts["stamp"] += 1
+                self._believed = None
+                self._start_anew()
+        self._newest = stamp
+        return True
+
+    def _start_anew(self) -> None:
+        self.filter.reset()
+        if self._gate is not None:
+            self._gate.reset()
+
+    def _of_probe(self, measurement: Measurement) -> Measurement:
+        """The probe in ``patient`` as measured, with the covariance there."""
+        body = measurement.pose
+        pose = self._registration @ body @ self._calibration
+        covariance = measurement.covariance
+        if covariance is not None and not covariance.any():
+            covariance = None  # ROS's way to say that nothing is known
+        if covariance is not None:
+            # From the body's origin to the probe's, and from the device's axes to the patient's.
+            lever = body.rotation @ self._calibration.position
+            moved = adjoint(
+                Pose(-(self._registration.rotation @ lever), self._registration.orientation)
+            )
+            covariance = moved @ covariance @ moved.T
+            covariance = 0.5 * (covariance + covariance.T)
+        return dataclasses.replace(
+            measurement,
+            stamp=measurement.stamp + self._time_offset,
+            pose=pose,
+            covariance=covariance,
+        )
+
+
+def _is_of_a_distribution(covariance: np.ndarray) -> bool:
+    """Whether a symmetric matrix has no negative eigenvalue but for rounding."""
+    variances = np.linalg.eigvalsh(covariance)
+    return bool(variances[0] >= -1e-9 * abs(variances[-1]))
