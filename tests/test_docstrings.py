@@ -38,6 +38,7 @@ def test_examples(name):
         "us_sim.skin.membrane",
         "us_sim.slicing.image_formation",
         "us_sim.slicing.row_subdivision",
+        "us_sim.slicing.scan_conversion",
         "us_sim.volume.phantom",
         "us_sim.volume.readers",
         "us_sim.recording.writer",
