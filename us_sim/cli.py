@@ -104,7 +104,9 @@ def _parser() -> argparse.ArgumentParser:
     ):
         measured = subjects.add_parser(subject, help=text)
         measured.add_argument(
-            "--quick", action="store_true", help="a part of it, in less than three minutes"
+            "--quick",
+            action="store_true",
+            help=f"a part of it, in less than {'two' if subject == 'slice' else 'three'} minutes",
         )
         measured.add_argument(
             "--out",

@@ -113,9 +113,11 @@ def _recorded(
             "--volume and --sweep belong together: give the tracked sweep and the volume that was "
             "compounded from it"
         )
-    with Progress("recorded frames") as progress:
-        progress.update(0, f"{sweep_file.name} against {volume_file.name}")
-        return compare_with_recorded(volume_file, sweep_file, out, quick)
+    with Progress("recorded frames", 1, "sweep") as progress:
+        progress.update(0, sweep_file.name)
+        found = compare_with_recorded(volume_file, sweep_file, out, quick)
+        progress.update(1)
+    return found
 
 
 def _working(points: Sequence[Point]) -> list[str]:

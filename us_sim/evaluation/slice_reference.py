@@ -1,6 +1,6 @@
 """What an image must show, by brute force in float64 with NumPy and SciPy alone.
 
-It shares nothing with the slicers: every pixel is tried in every tetrahedron whose bounding box
+It shares no arithmetic with the slicers: every pixel is tried in every tetrahedron whose bounding box
 it lies in, and SciPy samples the volume.
 
 >>> import numpy as np

@@ -95,7 +95,7 @@ def _text(
         "block, which stays rigid) is dented by a smooth field, down and aside, by up to 30 mm. "
         "Every method cuts the same images of 60 × 80 mm in one run, in turns, while the probe "
         "trembles and the dent changes, so that no image repeats another. Each is held against "
-        "brute force in float64 by NumPy and SciPy, which shares no code with any of them.",
+        "brute force in float64 by NumPy and SciPy, which shares no arithmetic with any of them.",
         HOW_TO_GET + "." if without_vtk else "",
         "## What is asked",
         _table(("", "asked", "seen", "met"), [target.cells for target in asked]),
