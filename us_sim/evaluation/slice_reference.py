@@ -1,7 +1,7 @@
 """What an image must show, by brute force in float64 with NumPy and SciPy alone.
 
-It shares no arithmetic with the slicers: every pixel is tried in every tetrahedron whose bounding box
-it lies in, and SciPy samples the volume.
+It shares no arithmetic with the slicers: every pixel is tried in every tetrahedron whose bounding
+box it lies in, and SciPy samples the volume.
 
 >>> import numpy as np
 >>> from us_sim.evaluation.slice_reference import exact_slice

@@ -92,7 +92,8 @@ class VtkSlicer:
 
         self._voxels = vtkImageData()
         self._voxels.SetDimensions(*volume.shape[::-1])
-        grey = numpy_to_vtk(volume.intensities.reshape(-1))
+        self._grey = volume.intensities.reshape(-1)  # VTK does not keep it
+        grey = numpy_to_vtk(self._grey)
         grey.SetName("grey")
         self._voxels.GetPointData().SetScalars(grey)
         self._places = vtkPolyData()
