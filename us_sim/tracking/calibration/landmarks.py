@@ -1,0 +1,175 @@
+"""Point registration: the rigid transform between two lists of the same points.
+
+Horn (1987), Closed-form solution of absolute orientation, by singular values as Arun (1987) and
+Umeyama (1991) do, without scale. FRE is the fiducial, TRE the target registration error
+(Fitzpatrick 1998); the latter is measured by leaving each landmark out once.
+
+>>> import numpy as np
+>>> from us_sim.tracking.calibration.landmarks import register_landmarks
+>>> phantom = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
+>>> found = register_landmarks(phantom, phantom[:, [1, 2, 0]] + 0.5)
+>>> found.pose.position
+array([0.5, 0.5, 0.5])
+>>> found.fre < 1e-12
+True
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.pose import Pose
+
+__all__ = ["LandmarkRegistration", "register_landmarks"]
+
+_FLATTEST = 0.02  # width of the landmarks' spread over its length, below which they are in line
+_WORST_FIT = 0.1  # FRE over the landmarks' spread, above which they are not the same points
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkRegistration:
+    """A transform from measured to known landmarks, and how well they fit."""
+
+    pose: Pose  # of the measured points' frame in that of the known ones
+    names: tuple[str, ...]
+    residuals: NDArray[np.float64]  # (N,) m, distance of each after the transform
+    fre: float  # m, root mean square of these
+    left_out: NDArray[np.float64]  # (N,) m, of each when the others make the transform; nan of 3
+    deviations: NDArray[np.float64]  # (6,) m and rad, of position and rotation, to's axes
+
+    @property
+    def tre(self) -> float:
+        """m, root mean square error at a landmark that took no part; nan of three."""
+        return math.sqrt(float((self.left_out**2).mean()))
+
+
+def register_landmarks(
+    measured: NDArray[np.float64], known: NDArray[np.float64], names: Sequence[str] = ()
+) -> LandmarkRegistration:
+    """The rigid transform that lays the measured points on the known ones.
+
+    Args:
+        measured: (N, 3) m, in the device's frame.
+        known: (N, 3) m, the same points in the same order.
+        names: of the points, for messages; numbers without them.
+
+    Raises:
+        CalibrationError: there are fewer than 3, a coordinate is not finite, they lie on a line,
+            or are not the same points (another order, unit or a mirrored frame).
+    """
+    measured, known = np.asarray(measured, np.float64), np.asarray(known, np.float64)
+    names = tuple(names) or tuple(str(k + 1) for k in range(len(known)))
+    _check(measured, known, names)
+    pose = _fit(measured, known)
+    residuals = np.linalg.norm(pose.apply(measured) - known, axis=1)
+    fre = math.sqrt(float((residuals**2).mean()))
+    _check_fit(measured, known, residuals, names)
+    return LandmarkRegistration(
+        pose,
+        names,
+        residuals,
+        fre,
+        _leave_one_out(measured, known),
+        _deviations(known, pose.position, residuals),
+    )
+
+
+def _check(measured: NDArray[np.float64], known: NDArray[np.float64], names: Sequence[str]) -> None:
+    if measured.shape != known.shape or known.ndim != 2 or known.shape[1] != 3:
+        raise CalibrationError(
+            f"a registration needs as many measured as known landmarks of 3 coordinates, not "
+            f"{len(measured)} and {len(known)}"
+        )
+    if len(known) < 3:
+        raise CalibrationError(f"a registration needs at least 3 landmarks, not {len(known)}")
+    for points, what in ((measured, "measured"), (known, "known")):
+        if not np.isfinite(points).all():
+            bad = names[int(np.argmin(np.isfinite(points).all(axis=1)))]
+            raise CalibrationError(f"landmark {bad}: its {what} coordinates are not finite")
+        length, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if width <= _FLATTEST * length or length == 0.0:
+            raise CalibrationError(
+                f"the {what} landmarks lie on a line, about which the registration may turn: add "
+                f"one at least {_advised(length, len(points)):.0f} mm beside it"
+            )
+
+
+def _advised(length: float, count: int) -> float:
+    """mm, a tenth of the landmarks' extent; 10 where they have none."""
+    return max(1e2 * 2.0 * length / math.sqrt(count), 10.0)
+
+
+def _check_fit(
+    measured: NDArray[np.float64],
+    known: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    names: Sequence[str],
+) -> None:
+    spread, theirs = (
+        math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        for points in (known, measured)
+    )
+    if not 0.5 < theirs / spread < 2.0:
+        raise CalibrationError(
+            f"the measured landmarks are {theirs / spread:.3g} times as far apart as the known "
+            f"ones: give both in metres"
+        )
+    fre = math.sqrt(float((residuals**2).mean()))
+    if fre > _WORST_FIT * spread:
+        raise CalibrationError(
+            f"the landmarks do not fit (FRE {1e3 * fre:.1f} mm, worst at landmark "
+            f"{names[int(residuals.argmax())]}): check their order, and that neither frame is "
+            f"mirrored"
+        )
+
+
+def _fit(measured: NDArray[np.float64], known: NDArray[np.float64]) -> Pose:
+    from_middle, to_middle = measured.mean(axis=0), known.mean(axis=0)
+    left, _, right = np.linalg.svd((known - to_middle).T @ (measured - from_middle))
+    proper = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    matrix = np.eye(4)
+    matrix[:3, :3] = left @ proper @ right
+    matrix[:3, 3] = to_middle - matrix[:3, :3] @ from_middle
+    return Pose.from_matrix(matrix)
+
+
+def _leave_one_out(
+    measured: NDArray[np.float64], known: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    errors = np.full(len(known), np.nan)
+    if len(known) > 3:
+        for k in range(len(known)):
+            others = np.arange(len(known)) != k
+            pose = _fit(measured[others], known[others])
+            errors[k] = np.linalg.norm(pose.apply(measured[k : k + 1]) - known[k : k + 1])
+    return errors
+
+
+def _deviations(
+    known: NDArray[np.float64], origin: NDArray[np.float64], residuals: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(6,) standard deviations of the transform, for equal errors of all coordinates.
+
+    Of the position of the measured frame's origin, and of the rotation about the axes.
+    """
+    count = len(known)
+    # A rotation w about the landmarks' middle moves a landmark by w × (landmark - middle).
+    middle = known.mean(axis=0)
+    inertia = sum(_cross(point).T @ _cross(point) for point in known - middle)
+    variance = float((residuals**2).sum()) / (3 * count - 6)
+    rotation = variance * np.linalg.inv(np.asarray(inertia))
+    lever = _cross(origin - middle)
+    position = variance / count * np.eye(3) + lever @ rotation @ lever.T
+    return np.sqrt(np.concatenate([np.diag(position), np.diag(rotation)]))
+
+
+def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) matrix whose product is the cross product with a vector."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

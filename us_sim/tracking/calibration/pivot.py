@@ -1,0 +1,156 @@
+"""Pivot calibration: where a stylus' tip is, from poses while the tip stays in one place.
+
+A pose (R, p) of the body puts the tip t at R t + p, which is the same point c for all of them:
+[R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
+
+>>> import numpy as np
+>>> from us_sim.pose import Pose
+>>> from us_sim.tracking.calibration.pivot import calibrate_pivot
+>>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
+>>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
+>>> poses = [Pose(hole - turn.apply(tip), turn.orientation) for turn in turns]
+>>> calibrate_pivot(poses).tip.round(6)
+array([-0.  , -0.  ,  0.15])
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.pose import Pose
+
+__all__ = ["PivotCalibration", "calibrate_pivot"]
+
+_FEWEST = 10  # poses
+_SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square
+_TRIALS = 300
+_SAMPLE = 4  # poses a trial: two leave the tip free along their common axis
+_MEDIAN_SQUARE = 2.366  # median of chi-square with three degrees of freedom
+_LARGEST_SQUARE = 16.27  # its 99.9th percentile
+
+
+@dataclass(frozen=True, eq=False)
+class PivotCalibration:
+    """A tip and how well the poses determine it."""
+
+    tip: NDArray[np.float64]  # (3,) m, in the body's frame
+    pivot: NDArray[np.float64]  # (3,) m, the fixed point in the device's frame
+    rms: float  # m, root mean square distance of the poses' tips from the fixed point
+    deviations: NDArray[np.float64]  # (3,) m, standard deviations of the tip's coordinates
+    swing: float  # rad, how far the direction turns that turns least, root mean square
+    inliers: NDArray[np.bool_]  # (K,) poses that were used
+
+    @property
+    def rejected(self) -> int:
+        """How many poses lie too far from the others' fixed point."""
+        return int((~self.inliers).sum())
+
+
+def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
+    """The tip that stays in one place.
+
+    Up to about 40 % of the poses may be wrong (the tip slipped, the tracker saw a reflection):
+    a least median of squares start (Rousseeuw 1984) leaves them out.
+
+    Args:
+        poses: of the body in the device's frame, while the tip stands still.
+
+    Raises:
+        CalibrationError: there are too few poses, or they turn about one axis only.
+    """
+    if len(poses) < _FEWEST:
+        raise CalibrationError(
+            f"a pivot calibration needs at least {_FEWEST} poses, not {len(poses)}: tilt the "
+            f"stylus in all directions for ten seconds with its tip in a dimple"
+        )
+    rotations = np.array([pose.rotation for pose in poses])
+    positions = np.array([pose.position for pose in poses])
+    _check_swing(rotations)
+    inliers = _consistent(rotations, positions)
+    swing = _check_swing(rotations[inliers])
+    solution, covariance, rms = _least_squares(rotations[inliers], positions[inliers])
+    return PivotCalibration(
+        solution[:3], solution[3:], rms, np.sqrt(np.diag(covariance)[:3]), swing, inliers
+    )
+
+
+def _check_swing(rotations: NDArray[np.float64]) -> float:
+    """How far the direction turns that turns least, rad.
+
+    Raises:
+        CalibrationError: so little that the tip's place along it cannot be told.
+    """
+    # The least-squares matrix is [I, -mean(R)ᵀ; -mean(R), I]: it is singular exactly when some
+    # direction of the body is the same in all poses, for which the mean shortens nothing.
+    longest = min(float(np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[0]), 1.0)
+    swing = math.sqrt(2.0 * (1.0 - longest))
+    if swing < _SMALLEST_SWING:
+        raise CalibrationError(
+            f"the poses turn about one axis only (another direction moves by "
+            f"{math.degrees(swing):.1f}°, and {math.degrees(_SMALLEST_SWING):.0f}° is the least): "
+            f"tilt the stylus forwards and sideways by 20° or more with its tip in the dimple"
+        )
+    return swing
+
+
+def _least_squares(
+    rotations: NDArray[np.float64], positions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Tip and fixed point (6,), their covariance (6, 6), and the root mean square distance."""
+    count = len(rotations)
+    rows = np.empty((count, 3, 6))
+    rows[:, :, :3] = rotations
+    rows[:, :, 3:] = -np.eye(3)
+    matrix = rows.reshape(-1, 6)
+    solution = np.asarray(np.linalg.lstsq(matrix, -positions.ravel(), rcond=None)[0], np.float64)
+    squares = float(((matrix @ solution + positions.ravel()) ** 2).sum())
+    covariance = np.linalg.inv(matrix.T @ matrix) * squares / (3 * count - 6)
+    return solution, covariance, math.sqrt(squares / count)
+
+
+def _consistent(
+    rotations: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(K,) which poses agree with most others on a fixed point."""
+    rng = np.random.default_rng(0)  # the same poses, the same answer
+    best = np.inf
+    squares = np.zeros(len(rotations))
+    for _ in range(_TRIALS):
+        chosen = rng.choice(len(rotations), _SAMPLE, replace=False)
+        if np.linalg.norm(rotations[chosen].mean(axis=0), 2) > 1.0 - _SMALLEST_SWING**2 / 8:
+            continue
+        solution = _least_squares(rotations[chosen], positions[chosen])[0]
+        distances = _squared_distances(rotations, positions, solution)
+        median = float(np.median(distances))
+        if median < best:
+            best, squares = median, distances
+    inliers = _near(squares)
+    for _ in range(10):
+        solution = _least_squares(rotations[inliers], positions[inliers])[0]
+        again = _near(_squared_distances(rotations, positions, solution))
+        if (again == inliers).all():
+            break
+        inliers = again
+    return inliers
+
+
+def _squared_distances(
+    rotations: NDArray[np.float64], positions: NDArray[np.float64], solution: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    squares: NDArray[np.float64] = ((rotations @ solution[:3] + positions - solution[3:]) ** 2).sum(
+        axis=1
+    )
+    return squares
+
+
+def _near(squares: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Distances that a normal error of the median's size would have; at least rounding errors."""
+    variance = float(np.median(squares)) / _MEDIAN_SQUARE
+    near: NDArray[np.bool_] = squares <= max(variance * _LARGEST_SQUARE, 1e-18)
+    return near
