@@ -94,10 +94,19 @@ def given(
     *,
     choices: Sequence[str] = (),
     description: str = "",
+    file: bool = False,
     **kwargs: Any,
 ) -> Any:
-    """A dataclass field that a scene may set: the check its value must pass, and what it is."""
-    metadata = {"quantity": quantity, "choices": tuple(choices), "description": description}
+    """A dataclass field that a scene may set: the check its value must pass, and what it is.
+
+    A text that is a ``file`` is looked up beside the scene, and must be there.
+    """
+    metadata = {
+        "quantity": quantity,
+        "choices": tuple(choices),
+        "description": description,
+        "file": file,
+    }
     return field(metadata=metadata, **kwargs)
 
 

@@ -12,6 +12,8 @@ from typing import Any
 
 from us_sim.quantity import Quantity, given
 from us_sim.slicing.imaging import Imaging
+from us_sim.tracking.camera_settings import CameraSettings
+from us_sim.tracking.filter_settings import FilterSettings, GateSettings
 
 __all__ = [
     "ColliderSection",
@@ -46,7 +48,7 @@ class PoseSection:
 class VolumeSection:
     """The ultrasound volume: a file, or a procedural phantom made from a seed."""
 
-    file: str | None = given(default=None)
+    file: str | None = given(default=None, file=True)
     phantom: str | None = given(default=None, choices=("upper_arm",))
     seed: int = given(Quantity("number", 0, 2**31), default=1)
     voxel_size: float = given(Quantity("length", 2e-4, 5e-3), default=0.3e-3)
@@ -77,7 +79,7 @@ class MeshSection:
     upper: tuple[float, float, float] | None = given(_POSITION, default=None)
     nodes: tuple[int, int, int] = given(Quantity("number", 2, 400), default=(20, 10, 10))
     planes: dict[str, tuple[float, ...]] = given(_POSITION, default_factory=dict)
-    file: str | None = given(default=None)
+    file: str | None = given(default=None, file=True)
     unit: float = given(Quantity("length", 1e-9, 1e3), default=1.0)
     pose: PoseSection = given(default=PoseSection())
     margin: float | None = given(Quantity("length", 1e-6, 1.0), default=None)
@@ -106,7 +108,7 @@ class StructureSection:
     """
 
     label: str | None = given(default=None)
-    file: str | None = given(default=None)
+    file: str | None = given(default=None, file=True)
     unit: float = given(Quantity("length", 1e-9, 1e3), default=1.0)
     pose: PoseSection = given(default=PoseSection())
     colour: tuple[float, float, float] | None = given(Quantity("number", 0.0, 1.0), default=None)
@@ -116,7 +118,7 @@ class StructureSection:
 class SkinSection:
     """The skin membrane: a surface file, or a sheet bent down on both sides of a flat part."""
 
-    file: str | None = given(default=None)
+    file: str | None = given(default=None, file=True)
     size: tuple[float, float] = given(Quantity("length", 0.01, 2.0), default=(0.2, 0.2))
     spacing: float = given(Quantity("length", 5e-4, 0.05), default=4e-3)
     flat_width: float = given(Quantity("length", 0.0, 2.0), default=2.0)
@@ -174,10 +176,40 @@ class SliceSection:
 
 @dataclass(frozen=True)
 class TrackerSection:
-    """Where probe poses come from."""
+    """Where probe poses come from, and what is done to them.
 
-    source: str = given(default="pose", choices=("pose",))
+    ``registration`` is the device's frame in ``patient``, ``calibration`` the probe in the tracked
+    body's frame: a file that `us-sim calibrate` wrote, or a pose. ``frame`` is the device's frame
+    in messages; ``entry`` the number of the body in a PoseArray, ``body`` its name where a device
+    has several by name (a tf frame, an OpenIGTLink device, a transform in a recording), ``file``
+    a recording.
+    """
+
+    source: str = given(
+        default="pose",
+        choices=(
+            "pose",
+            "pose_array",
+            "tf",
+            "camera",
+            "six_dof_mouse",
+            "haptic",
+            "openigtlink",
+            "path",
+        ),
+    )
     frame: str = given(default="patient")
+    entry: int = given(Quantity("number", 0, 1000), default=0)
+    body: str | None = given(default=None)
+    file: str | None = given(default=None, file=True)
+    registration: PoseSection | str | None = given(default=None, file=True)
+    calibration: PoseSection | str | None = given(default=None, file=True)
+    time_offset: float = given(Quantity("time", -10.0, 10.0), default=0.0)
+    coast_for: float = given(Quantity("time", 1e-3, 60.0), default=0.3)
+    lost_after: float = given(Quantity("time", 1e-3, 60.0), default=1.0)
+    filter: FilterSettings = given(default=FilterSettings())
+    gate: GateSettings | None = given(default=None)
+    camera: CameraSettings | None = given(default=None)
 
 
 @dataclass(frozen=True)
@@ -202,7 +234,7 @@ class Scene:
     slice: SliceSection = given(default=SliceSection())
     imaging: Imaging = given(default=Imaging())
     tracker: TrackerSection = given(default=TrackerSection())
-    path: str | None = given(default=None)
+    path: str | None = given(default=None, file=True)
     description: str = given(default="")
     origin: str = "scene"
 

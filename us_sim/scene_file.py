@@ -89,7 +89,8 @@ def parse_scene(document: object, *, origin: str = "scene", folder: Path | None 
         raise SceneError(
             f"{origin}: probe.collider: is missing, and the skin needs one to press it"
         )
-    return _resolve_files(scene, origin, folder or Path.cwd())
+    resolved: Scene = _resolve_files(scene, origin, folder or Path.cwd())
+    return resolved
 
 
 def _with_named_structures(document: object) -> object:
@@ -135,8 +136,7 @@ def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:
         if value is None:
             return None
         options = [option for option in get_args(kind) if option is not type(None)]
-        fitting = (o for o in options if (get_origin(o) is tuple) == isinstance(value, list))
-        kind = next(fitting, options[0])
+        kind = next((option for option in options if _suits(option, value)), options[0])
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return _build(kind, value, origin, key)
     if get_origin(kind) is tuple:
@@ -165,6 +165,15 @@ def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:
         if check["choices"] and value not in check["choices"]:
             raise SceneError(f"{at}{value!r} is not one of {', '.join(check['choices'])}")
     return value
+
+
+def _suits(kind: Any, value: object) -> bool:
+    """Whether a value looks like one of that type, where several are possible."""
+    if isinstance(value, list):
+        return get_origin(kind) is tuple
+    if isinstance(value, dict):
+        return dataclasses.is_dataclass(kind)
+    return kind is str if isinstance(value, str) else kind in (int, float)
 
 
 def _sequence(kinds: tuple[Any, ...], value: object, check: Any, origin: str, key: str) -> Any:
@@ -251,37 +260,33 @@ def _check_structures(scene: Scene, origin: str) -> None:
             raise SceneError(f"{key}: `unit` and `pose` are for a surface from a `file` only")
 
 
-def _resolve_files(scene: Scene, origin: str, folder: Path) -> Scene:
-    """``scene`` with absolute, existing paths."""
+def _resolve_files(section: Any, origin: str, folder: Path, key: str = "") -> Any:
+    """A section, and those in it, with absolute paths of files that are there."""
+    changes: dict[str, Any] = {}
+    for entry in dataclasses.fields(section):
+        value = getattr(section, entry.name)
+        name = f"{key}.{entry.name}" if key else entry.name
+        if isinstance(value, str) and value and entry.metadata.get("file"):
+            changes[entry.name] = _existing(value, origin, folder, name)
+        elif dataclasses.is_dataclass(value):
+            changes[entry.name] = _resolve_files(value, origin, folder, name)
+        elif isinstance(value, dict):
+            changes[entry.name] = {
+                k: _resolve_files(v, origin, folder, f"{name}.{k}")
+                if dataclasses.is_dataclass(v)
+                else v
+                for k, v in value.items()
+            }
+    return dataclasses.replace(section, **changes)
 
-    def existing(key: str, name: str) -> str:
-        path = Path(name).expanduser()
-        candidates = [path] if path.is_absolute() else [folder / path, Path.cwd() / path]
-        if key == "path" and not path.is_absolute():
-            candidates += [root / "bags" / path for root in shared_roots()]
-        for candidate in candidates:
-            if candidate.exists():
-                return str(candidate.resolve())
-        raise SceneError(f"{origin}: {key}: there is no file {candidates[0]}")
 
-    if scene.volume.file:
-        volume = dataclasses.replace(scene.volume, file=existing("volume.file", scene.volume.file))
-        scene = dataclasses.replace(scene, volume=volume)
-    if scene.skin is not None and scene.skin.file:
-        skin = dataclasses.replace(scene.skin, file=existing("skin.file", scene.skin.file))
-        scene = dataclasses.replace(scene, skin=skin)
-    if scene.tissue is not None and scene.tissue.mesh.file:
-        file = existing("tissue.mesh.file", scene.tissue.mesh.file)
-        mesh = dataclasses.replace(scene.tissue.mesh, file=file)
-        scene = dataclasses.replace(scene, tissue=dataclasses.replace(scene.tissue, mesh=mesh))
-    if scene.structures:
-        structures = {
-            name: dataclasses.replace(
-                given, file=given.file and existing(f"structures.{name}.file", given.file)
-            )
-            for name, given in scene.structures.items()
-        }
-        scene = dataclasses.replace(scene, structures=structures)
-    if scene.path:
-        scene = dataclasses.replace(scene, path=existing("path", scene.path))
-    return scene
+def _existing(name: str, origin: str, folder: Path, key: str) -> str:
+    """The absolute path of a file named in a scene."""
+    path = Path(name).expanduser()
+    candidates = [path] if path.is_absolute() else [folder / path, Path.cwd() / path]
+    if key == "path" and not path.is_absolute():
+        candidates += [root / "bags" / path for root in shared_roots()]
+    for candidate in candidates:
+        if candidate.exists():
+            return str(candidate.resolve())
+    raise SceneError(f"{origin}: {key}: there is no file {candidates[0]}")

@@ -42,6 +42,7 @@ class CameraSettings:
 
     body: str = given(
         default="",
+        file=True,
         description="file of the rigid body of markers; empty for one marker",
     )
     marker: int = given(
