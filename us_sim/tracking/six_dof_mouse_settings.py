@@ -121,6 +121,11 @@ class SixDofMouseSettings:
                 "six_dof_mouse.home_orientation: is zero, so it is no orientation: give "
                 "[0, 0, 0, 1] for none"
             )
+        if self.clutch_button == self.reset_button >= 0:
+            raise TrackingError(
+                f"six_dof_mouse.reset_button: {self.reset_button} is the clutch already: name "
+                f"another button, or -1 for none"
+            )
         bounds = zip(self.workspace_low, self.home, self.workspace_high, strict=True)
         if not all(low <= place <= high for low, place, high in bounds):
             raise TrackingError(
