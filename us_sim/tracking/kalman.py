@@ -18,12 +18,17 @@ from math import atan2, cos, pi, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import TrackingError
 from us_sim.pose import Pose
 from us_sim.tracking.filter_settings import FilterSettings
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.pose_filter import PoseFilter
-from us_sim.tracking.se3 import left_jacobian, product, rotation_between, rotation_exp
+from us_sim.tracking.se3 import (
+    cross_matrix,
+    left_jacobian,
+    product,
+    rotation_between,
+    rotation_exp,
+)
 
 __all__ = ["ConstantVelocityKalman"]
 
@@ -31,6 +36,10 @@ __all__ = ["ConstantVelocityKalman"]
 _INITIAL_SPEED = 0.5  # m/s
 _INITIAL_ANGULAR_SPEED = 5.0  # rad/s
 
+_Place = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Position (3,) m and orientation (4,) x, y, z, w: a pose between two steps."""
+
+_IDENTITY = np.eye(12)
 _POSE, _VELOCITY = slice(0, 6), slice(6, 12)
 
 
@@ -49,7 +58,7 @@ class ConstantVelocityKalman(PoseFilter):
         self._settings = settings
         variances = [settings.position_deviation**2] * 3 + [settings.rotation_deviation**2] * 3
         self._usual_noise = np.diag(variances)
-        self._densities = np.array(
+        self._density = np.diag(
             [settings.acceleration**2] * 3 + [settings.angular_acceleration**2] * 3
         )
         self.reset()
@@ -57,12 +66,12 @@ class ConstantVelocityKalman(PoseFilter):
     def reset(self) -> None:
         """Forget everything: the next measurement is the first."""
         self._stamp: int | None = None
-        self._pose = Pose()
+        self._place: _Place = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
         self._velocity = np.zeros(6)  # m/s, then rad/s
         self._covariance: NDArray[np.float64] = np.zeros((12, 12))
         self._step = 0.0  # s, the newest
         self._gain = np.zeros((12, 6))  # the newest
-        self._predicted: tuple[int, Pose, NDArray[np.float64]] | None = None
+        self._predicted: tuple[int, _Place, NDArray[np.float64]] | None = None
 
     def update(self, measurement: Measurement) -> Measurement:
         """The measurement with its pose filtered, and the covariance of that."""
@@ -72,8 +81,10 @@ class ConstantVelocityKalman(PoseFilter):
         else:
             self._correct(measurement, noise)
         self._stamp = measurement.stamp
+        pose = Pose(*self._place)
+        self._place = pose.position, pose.orientation  # of norm 1 again
         return Measurement(
-            measurement.stamp, self._pose, self._covariance[_POSE, _POSE], measurement.error
+            measurement.stamp, pose, self._covariance[_POSE, _POSE], measurement.error
         )
 
     def expected(
@@ -82,9 +93,9 @@ class ConstantVelocityKalman(PoseFilter):
         """The innovation (6,) m, rad, of a measurement, and its covariance (6, 6)."""
         if self._stamp is None:
             return None
-        pose, covariance = self._prediction(measurement.stamp)
+        place, covariance = self._prediction(measurement.stamp)
         return (
-            _difference(pose, measurement.pose),
+            _difference(place, measurement.pose),
             covariance[_POSE, _POSE] + self._noise(measurement),
         )
 
@@ -92,13 +103,13 @@ class ConstantVelocityKalman(PoseFilter):
         return self._usual_noise if measurement.covariance is None else measurement.covariance
 
     def _start(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
-        self._pose = measurement.pose
+        self._place = measurement.pose.position, measurement.pose.orientation
         self._covariance[_POSE, _POSE] = noise
         speeds = [_INITIAL_SPEED**2] * 3 + [_INITIAL_ANGULAR_SPEED**2] * 3
         self._covariance[_VELOCITY, _VELOCITY] = np.diag(speeds)
 
-    def _prediction(self, stamp: int) -> tuple[Pose, NDArray[np.float64]]:
-        """The pose and the error's covariance (12, 12) at a stamp, as the newest velocity goes on.
+    def _prediction(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
+        """Where the pose is at a stamp if its velocity stays, and the error's covariance (12, 12).
 
         The same stamp is asked for by the gate and then by the update.
         """
@@ -107,45 +118,37 @@ class ConstantVelocityKalman(PoseFilter):
         assert self._stamp is not None
         step = 1e-9 * (stamp - self._stamp)
         turn = step * self._velocity[3:]
-        turn_quaternion = rotation_exp(turn)
-        pose = Pose(
-            self._pose.position + step * self._velocity[:3],
-            product(turn_quaternion, self._pose.orientation),
-        )
-        transition = np.eye(12)
-        transition[0:3, 6:9] = step * np.eye(3)
-        transition[3:6, 3:6] = Pose(orientation=turn_quaternion).rotation
-        transition[3:6, 9:12] = step * left_jacobian(turn)
+        position = self._place[0] + step * self._velocity[:3]
+        place = position, product(rotation_exp(turn), self._place[1])
+        jacobian = left_jacobian(turn)
+        transition = _IDENTITY.copy()
+        transition[0:3, 6:9] = step * _IDENTITY[:3, :3]
+        transition[3:6, 3:6] += cross_matrix(turn) @ jacobian  # now the rotation by the turn
+        transition[3:6, 9:12] = step * jacobian
         covariance = transition @ self._covariance @ transition.T
         # White acceleration over a step (Bar-Shalom, Li, Kirubarajan 2001, eq. 6.2.2-4).
-        index = np.arange(6)
-        covariance[index, index] += self._densities * (step**3 / 3.0)
-        covariance[index, index + 6] += self._densities * (step**2 / 2.0)
-        covariance[index + 6, index] += self._densities * (step**2 / 2.0)
-        covariance[index + 6, index + 6] += self._densities * step
-        self._predicted = (stamp, pose, covariance)
-        return pose, covariance
+        covariance[_POSE, _POSE] += self._density * (step**3 / 3.0)
+        covariance[_POSE, _VELOCITY] += self._density * (step**2 / 2.0)
+        covariance[_VELOCITY, _POSE] += self._density * (step**2 / 2.0)
+        covariance[_VELOCITY, _VELOCITY] += self._density * step
+        self._predicted = (stamp, place, covariance)
+        return place, covariance
 
     def _correct(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
         assert self._stamp is not None
-        pose, covariance = self._prediction(measurement.stamp)
-        try:
-            gain = np.linalg.solve(covariance[_POSE, _POSE] + noise, covariance[_POSE]).T
-        except np.linalg.LinAlgError as error:
-            raise TrackingError(
-                "a pose's covariance is of no distribution: it is singular where it must not be"
-            ) from error
-        correction = gain @ _difference(pose, measurement.pose)
-        self._pose = Pose(
-            pose.position + correction[:3],
-            product(rotation_exp(correction[3:6]), pose.orientation),
+        place, covariance = self._prediction(measurement.stamp)
+        gain = np.linalg.solve(covariance[_POSE, _POSE] + noise, covariance[_POSE]).T
+        correction = gain @ _difference(place, measurement.pose)
+        self._place = (
+            place[0] + correction[:3],
+            product(rotation_exp(correction[3:6]), place[1]),
         )
         self._velocity = self._velocity + correction[_VELOCITY]
-        # Joseph's form stays symmetric and positive however sure a measurement is of itself.
-        kept = np.eye(12)
+        # Joseph's form stays positive however sure a measurement is of itself.
+        kept = _IDENTITY.copy()
         kept[:, _POSE] -= gain
-        covariance = kept @ covariance @ kept.T + gain @ noise @ gain.T
-        self._covariance = 0.5 * (covariance + covariance.T)
+        corrected = kept @ covariance @ kept.T + gain @ noise @ gain.T
+        self._covariance = 0.5 * (corrected + corrected.T)
         self._step, self._gain = 1e-9 * (measurement.stamp - self._stamp), gain
         self._predicted = None
 
@@ -184,11 +187,11 @@ class ConstantVelocityKalman(PoseFilter):
         return (above + below) / (2.0 * pi * frequency)
 
 
-def _difference(expected: Pose, measured: Pose) -> NDArray[np.float64]:
+def _difference(expected: _Place, measured: Pose) -> NDArray[np.float64]:
     """(6,) m, rad, from one pose to another, as a measurement's covariance has them."""
     return np.concatenate(
         [
-            measured.position - expected.position,
-            rotation_between(expected.orientation, measured.orientation),
+            measured.position - expected[0],
+            rotation_between(expected[1], measured.orientation),
         ]
     )

@@ -44,7 +44,7 @@ class Measurement:
         if (
             covariance.shape != (6, 6)
             or not np.isfinite(covariance).all()
-            or not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0)
+            or np.abs(covariance - covariance.T).max() > 1e-6 * np.abs(covariance).max()
         ):
             raise TrackingError(
                 f"a pose's covariance must be a finite symmetric (6, 6) matrix, not of shape "

@@ -30,6 +30,7 @@ import dataclasses
 from collections import Counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.pose import Pose
@@ -43,6 +44,9 @@ __all__ = ["ProbeTracking"]
 
 RESTART_NS = 1_000_000_000
 """A stamp that jumps back by more is a restarted source, not a late measurement."""
+
+LARGEST_DEVIATION = 1e3
+"""m or rad: drivers write any large number where they know nothing, and filters lose digits."""
 
 
 class ProbeTracking:
@@ -159,6 +163,7 @@ class ProbeTracking:
         if covariance is not None and not covariance.any():
             covariance = None  # ROS's way to say that nothing is known
         if covariance is not None:
+            covariance = _held_within_sense(covariance)
             # From the body's origin to the probe's, and from the device's axes to the patient's.
             lever = body.rotation @ self._calibration.position
             moved = adjoint(
@@ -174,7 +179,20 @@ class ProbeTracking:
         )
 
 
-def _is_of_a_distribution(covariance: np.ndarray) -> bool:
+def _is_of_a_distribution(covariance: NDArray[np.float64]) -> bool:
     """Whether a symmetric matrix has no negative eigenvalue but for rounding."""
-    variances = np.linalg.eigvalsh(covariance)
-    return bool(variances[0] >= -1e-9 * abs(variances[-1]))
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        variances = np.linalg.eigvalsh(covariance)
+        return bool(variances[0] >= -1e-9 * abs(variances[-1]))
+    return True
+
+
+def _held_within_sense(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The covariance with its larger deviations brought to the largest; correlations stay."""
+    deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    if deviations.max() <= LARGEST_DEVIATION:
+        return covariance
+    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviations, 1e-300))
+    return covariance * np.outer(scale, scale)

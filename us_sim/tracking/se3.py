@@ -109,15 +109,22 @@ def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
 
 def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) J: exp(v + d) is exp(J d) exp(v) to the first order in d (Barfoot 2017, 7.37)."""
-    square = float(vector @ vector)
+    x, y, z = vector.tolist()
+    square = x * x + y * y + z * z
     angle = sqrt(square)
     if angle < _SMALL:
         first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     else:
         first, second = (1.0 - cos(angle)) / square, (angle - sin(angle)) / (square * angle)
-    cross = cross_matrix(vector)
-    matrix: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
-    return matrix
+    xy, yz, zx = second * x * y, second * y * z, second * z * x
+    x1, y1, z1 = first * x, first * y, first * z
+    return np.array(
+        [
+            [1.0 - second * (y * y + z * z), xy - z1, zx + y1],
+            [xy + z1, 1.0 - second * (z * z + x * x), yz - x1],
+            [zx - y1, yz + x1, 1.0 - second * (x * x + y * y)],
+        ]
+    )
 
 
 def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
