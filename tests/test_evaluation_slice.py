@@ -55,6 +55,7 @@ def point(method, ms, size=512, nodes=8192, threads=1, **fields):
         *(method, size, nodes, 5 * nodes, threads, ms, ms),
         deformation=MAIN.deformation,
         plane=MAIN.plane,
+        cpu_ms_median=ms,
         **known,
     )
 
@@ -140,11 +141,11 @@ def test_methods_take_turns():
     def contender(name):
         return Contender(name, 1, lambda _: order.append(name), None, lambda: (1.0, len(order)))
 
-    (timing, _), (_, parts) = timed_together([contender("a"), contender("b")], [None], 0.0)
+    timing, other = timed_together([contender("a"), contender("b")], [None], 0.0)
     assert order == (["a"] * 5 + ["b"] * 5) * 3
     assert len(timing.milliseconds) == 15
-    assert parts == (1.0, np.median([range(6, 11), range(16, 21), range(26, 31)]))
-    assert Timing(np.arange(101.0)).p99 == 99.0
+    assert other.parts == (1.0, np.median([range(6, 11), range(16, 21), range(26, 31)]))
+    assert Timing(np.arange(101.0), np.ones(101)).p99 == 99.0
 
 
 def test_no_dent_turns_a_tetrahedron_inside_out():
@@ -197,6 +198,8 @@ def test_what_is_asked_is_held_against_what_was_seen():
         ("0.50 ms", True),
     ]
     assert all(t.met is None for t in targets([], None, None))
+    slow = replace(point("vtk", 300.0), cpu_ms_median=27.0)
+    assert targets([points[1], slow], None, None)[2].seen == "15.0"
 
 
 @pytest.fixture

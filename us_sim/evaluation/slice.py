@@ -187,14 +187,15 @@ class _Bench:
             points[method, threads] = replace(point, **errors._asdict())
             contenders.append(ready)
         times = timed_together(contenders, frames, self._seconds[case != MAIN])
-        for ready, (timing, parts) in zip(contenders, times, strict=True):
+        for ready, timing in zip(contenders, times, strict=True):
             key = (ready.method, ready.threads)
             points[key] = replace(
                 points[key],
                 ms_median=timing.median,
                 ms_p99=timing.p99,
-                filter_ms=parts[0],
-                sampling_ms=parts[1],
+                cpu_ms_median=float(np.median(timing.processor)),
+                filter_ms=timing.parts[0],
+                sampling_ms=timing.parts[1],
                 images=len(timing.milliseconds),
             )
         return list(points.values())

@@ -2,7 +2,7 @@
 
 >>> import numpy as np
 >>> from us_sim.evaluation.slice_points import Timing
->>> timing = Timing(np.arange(1.0, 102.0))
+>>> timing = Timing(np.arange(1.0, 102.0), np.ones(101))
 >>> timing.median, timing.p99
 (51.0, 100.0)
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +59,7 @@ class Point:
     max_voxel_error: float = float("nan")
     deformation: str = ""
     plane: str = ""
+    cpu_ms_median: float = float("nan")  # processor time, of all threads
     filter_ms: float = float("nan")  # of VTK: finding the pixels in the mesh
     sampling_ms: float = float("nan")  # of VTK: sampling the volume
     images: int = 0  # that were timed
@@ -80,6 +81,8 @@ class Timing:
     """How long one method's images took."""
 
     milliseconds: NDArray[np.float64]
+    processor: NDArray[np.float64]  # ms, of all threads
+    parts: tuple[float, float] = (float("nan"), float("nan"))  # ms, medians, where they are known
 
     @property
     def median(self) -> float:
@@ -94,7 +97,7 @@ class Timing:
 
 def timed_together(
     contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
-) -> list[tuple[Timing, tuple[float, float]]]:
+) -> list[Timing]:
     """Times of all contenders, taken in turns, so that a noisy machine is as noisy for all.
 
     The probe moves on from image to image. Where a method says what parts its images took, their
@@ -107,6 +110,7 @@ def timed_together(
             few out.
     """
     found: list[list[float]] = [[] for _ in contenders]
+    processor: list[list[float]] = [[] for _ in contenders]
     parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
     begin = time.perf_counter()
     turn = 0
@@ -116,19 +120,21 @@ def timed_together(
                 continue
             for image in range(_AGAIN):
                 frame = frames[(turn + image) % len(frames)]
-                before = time.perf_counter()
+                before, worked = time.perf_counter(), time.process_time()
                 contender.image(frame)
                 found[number].append((time.perf_counter() - before) * 1e3)
+                processor[number].append((time.process_time() - worked) * 1e3)
                 if contender.parts is not None:
                     parts[number].append(contender.parts())
                 if min(found[number]) > _SHORT:
                     break
         turn += 1
-    missing = [(float("nan"), float("nan"))]
-    medians = [np.median(known or missing, axis=0) for known in parts]
+    timings = [
+        Timing(np.array(wall), np.array(own)) for wall, own in zip(found, processor, strict=True)
+    ]
     return [
-        (Timing(np.array(ms)), (float(one), float(other)))
-        for ms, (one, other) in zip(found, medians, strict=True)
+        replace(timing, parts=tuple(np.median(known, axis=0).tolist())) if known else timing
+        for timing, known in zip(timings, parts, strict=True)
     ]
 
 

@@ -99,7 +99,10 @@ def _text(
         HOW_TO_GET + "." if without_vtk else "",
         "## What is asked",
         _table(("", "asked", "seen", "met"), [target.cells for target in asked]),
-        "Times are of this run and this machine; ratios are of methods that took turns.",
+        "Times are of this run and this machine. Ratios are of methods that took turns on one "
+        "thread, the lesser of those of wall clock and of processor time; what grows with nodes "
+        "and pixels is processor time. Other programs on the machine lengthen the wall clock, "
+        "that of slow methods most.",
         "## Error against run time",
         "![Error against run time](slice_error.png)",
         _table(*_summary(points)),
@@ -156,7 +159,17 @@ def _text(
 
 
 def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]]]:
-    head = ("method", "threads", "ms", "p99", "wrong px", "max grey", "mean grey", "max voxel")
+    head = (
+        "method",
+        "threads",
+        "ms",
+        "p99",
+        "CPU ms",
+        "wrong px",
+        "max grey",
+        "mean grey",
+        "max voxel",
+    )
     rows: list[Sequence[str]] = []
     for p in main_points(points):
         mine = [q for q in points if (q.method, q.threads) == (p.method, p.threads)]
@@ -167,6 +180,7 @@ def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]
                 f"{p.threads}",
                 f"{p.ms_median:.2f}",
                 f"{p.ms_p99:.2f}",
+                f"{p.cpu_ms_median:.2f}",
                 f"{sum(q.coverage_mismatch_px for q in mine)}",
                 f"{max(q.max_grey_difference for q in mine):g}",
                 f"{max(q.mean_grey_difference for q in mine):.2g}",
@@ -187,7 +201,7 @@ def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
         power = exponent(mine, across)
         rows.append((method, f"{threads}", *cells, f"{power:.2f}" if np.isfinite(power) else ""))
     words = [f"{what} {name}, ms" for _, name in steps]
-    return _table(("method", "threads", *words, "exponent"), rows)
+    return _table(("method", "threads", *words, "exponent of CPU time"), rows)
 
 
 def _cases_table(points: Sequence[Point]) -> str:
