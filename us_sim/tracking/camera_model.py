@@ -49,8 +49,8 @@ class CameraModel:
     distortion_model: str = "plumb_bob"  # of OpenCV's coefficients, in its order
 
     def __post_init__(self) -> None:
-        matrix = _numbers(self.matrix, "the camera matrix").reshape(-1)
-        distortion = _numbers(self.distortion, "the distortion").reshape(-1)
+        matrix: NDArray[np.float64] = _numbers(self.matrix, "the camera matrix").ravel()
+        distortion = _numbers(self.distortion, "the distortion").ravel()
         if matrix.size != 9:
             raise TrackingError(f"the camera matrix has {matrix.size} numbers; it needs 3 × 3")
         matrix = matrix.reshape(3, 3)

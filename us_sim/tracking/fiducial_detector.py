@@ -72,13 +72,22 @@ class FiducialDetector:
         if body.chessboard is not None:
             self._chessboard_detector = cv2.aruco.CharucoDetector(body.chessboard.board)
 
-    def detect(self, image: NDArray[np.uint8]) -> Detection:
-        """The body's markers in an image (rows, columns)."""
-        corners, ids, _ = self._detector.detectMarkers(image)
+    def detect(
+        self, image: NDArray[np.uint8], window: tuple[int, int, int, int] | None = None
+    ) -> Detection:
+        """The body's markers in an image (rows, columns).
+
+        Args:
+            image: grey.
+            window: left, top, right and bottom pixel of where to look; default: everywhere.
+        """
+        left, top, right, bottom = window or (0, 0, image.shape[1], image.shape[0])
+        corners, ids, _ = self._detector.detectMarkers(image[top:bottom, left:right])
         if ids is None or not len(ids):
             return Detection(np.empty(0, np.int64), np.empty((0, 4, 2)))
         numbers = np.asarray(ids, dtype=np.int64).ravel()
         places = np.asarray(corners, dtype=np.float32).reshape(-1, 4, 2)
+        places = places + np.array([left, top], dtype=np.float32)
         wanted = np.isin(numbers, self.body.ids)
         numbers, places = numbers[wanted], places[wanted]
         unique, counts = np.unique(numbers, return_counts=True)
@@ -123,4 +132,5 @@ def _refine(image: NDArray[np.uint8], corners: NDArray[np.float32]) -> NDArray[n
     edge = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
     half = int(np.clip(edge / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    return cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
+    refined = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
+    return np.asarray(refined, dtype=np.float32)

@@ -1,0 +1,258 @@
+"""Where a body of markers is, by a camera: one image in, one measurement out.
+
+>>> import cv2, numpy as np
+>>> from us_sim.tracking.camera_model import CameraModel
+>>> from us_sim.tracking.camera_settings import CameraSettings
+>>> from us_sim.tracking.camera_source import CameraSource
+>>> from us_sim.tracking.markers import dictionary
+>>> from us_sim.tracking.rigid_body import RigidBody
+>>> camera = CameraModel(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+>>> source = CameraSource(camera, RigidBody.single("4X4_50", 7, 0.04))
+>>> image = np.full((480, 640), 255, np.uint8)
+>>> image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 80)
+>>> source.measure(image, 0).pose.position.round(2) + 0.0
+array([0.  , 0.  , 0.25])
+>>> source.measure(np.zeros_like(image), 33_000_000), source.last_problem
+(None, 'no marker of 4X4_50 is in the image, which is black: uncover the lens or add light')
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.pose import Pose
+from us_sim.tracking.body_pose import BodyPose, body_poses, rotation_angle
+from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.camera_settings import CameraSettings
+from us_sim.tracking.fiducial_detector import Detection, FiducialDetector
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.rigid_body import RigidBody
+from us_sim.tracking.stray_markers import StrayMarkers, counted
+
+__all__ = ["CameraSource"]
+
+REMEMBERED = 0.5
+"""s, how long the last pose helps to find the next one and to tell it from its mirror image."""
+
+_BLACK = 24  # grey, below which all of an image is when it shows nothing
+_FORGETTING = 0.9  # of what earlier images say about which of two poses it is, from one to the next
+_SURE = 12.0  # log likelihood ratio beyond which more does not count: so that it can be unlearned
+_MARGIN = 0.35  # of the body's size in the image, around where it is looked for
+_LEAST_MARGIN = 24  # pixels
+
+
+class CameraSource:
+    """Tracks one body of markers through the images of one camera.
+
+    Args:
+        camera: of the images.
+        body: what to look for.
+        settings: when to believe it.
+    """
+
+    def __init__(
+        self, camera: CameraModel, body: RigidBody, settings: CameraSettings | None = None
+    ) -> None:
+        self.camera = camera
+        self.body = body
+        self.settings = settings or CameraSettings()
+        self.last_problem = ""
+        """Why the last image gave no measurement, or what was left out of it; empty when all is
+        well."""
+        self.seen = 0
+        """Markers of the body that the last measurement is made from."""
+        self._detector = FiducialDetector(body)
+        self._last: tuple[int, BodyPose] | None = None
+        self._evidence = 0.0
+        self._strays = StrayMarkers(body)
+
+    def reset(self) -> None:
+        """Forget the last pose."""
+        self._last = None
+        self._evidence = 0.0
+
+    def measure(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
+        """The body's pose in ``camera_optical``, or None with the reason in ``last_problem``.
+
+        Args:
+            image: (rows, columns) grey.
+            stamp: ns, the image's own; the measurement's is earlier by the settings' latency.
+
+        Raises:
+            TrackingError: the image is not grey or not of the camera's size.
+        """
+        image = self.camera.require_image(image)
+        self.last_problem = ""
+        self.seen = 0
+        before = self._before(stamp)
+        detection = self._detect(image, before)
+        if detection.doubled:
+            self.last_problem = _copies(detection.doubled)
+        pose = self._pose(image, detection, before)
+        if pose is None:
+            return None
+        self._last = stamp, pose
+        exposed = stamp - round(self.settings.latency * 1e9)
+        return Measurement(exposed, pose.pose, pose.covariance, pose.error)
+
+    def _before(self, stamp: int) -> Pose | None:
+        """The last pose, where it is from shortly before."""
+        if self._last is None:
+            return None
+        if not 0 <= stamp - self._last[0] <= REMEMBERED * 1e9:
+            self.reset()
+            return None
+        return self._last[1].pose
+
+    def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
+        """The body's markers, near where they were or else anywhere."""
+        if before is not None:
+            window = self._window(before)
+            if window is not None:
+                detection = self._detector.detect(image, window)
+                if len(detection.ids) >= self.settings.minimum_markers:
+                    return detection
+        return self._detector.detect(image)
+
+    def _window(self, pose: Pose) -> tuple[int, int, int, int] | None:
+        """Left, top, right and bottom pixel around the body as it was."""
+        pixels = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        if not np.isfinite(pixels).all():
+            return None
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        margin = max(_LEAST_MARGIN, _MARGIN * float((high - low).max()))
+        size = np.array([self.camera.width, self.camera.height])
+        left, top = np.clip(np.floor(low - margin), 0, size).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(high + margin), 0, size).astype(int).tolist()
+        return (left, top, right, bottom) if right - left > 8 and bottom - top > 8 else None
+
+    def _pose(
+        self, image: NDArray[np.uint8], detection: Detection, before: Pose | None
+    ) -> BodyPose | None:
+        points, pixels, owners = detection.correspondences(self.body)
+        if not len(points):
+            self.last_problem = self.last_problem or self._nothing(image)
+            return None
+        least = self.settings.minimum_markers
+        refusal = ""
+        # Each round leaves out what the pose of the round before shows to be unfit.
+        while True:
+            markers = np.unique(owners)
+            if len(markers) < least and self.body.chessboard is None:
+                count = len(markers)
+                self.last_problem = refusal or (
+                    f"{counted(count)} of the body {'is' if count == 1 else 'are'} seen, fewer "
+                    f"than the {least} of camera.minimum_markers"
+                )
+                return None
+            found = body_poses(
+                self.camera,
+                points,
+                pixels,
+                owners,
+                guess=before,
+                deviation=self.settings.corner_deviation,
+            )
+            if not found:
+                self.last_problem = (
+                    "the markers that are seen have no pose before the camera: check the camera "
+                    "info and the body's file"
+                )
+                return None
+            pose = self._chosen(found, before)
+            unfit, refusal = self._unfit(pose, owners)
+            if not len(unfit):
+                break
+            kept = ~np.isin(owners, unfit)
+            if not kept.any():
+                self.last_problem = refusal
+                return None
+            points, pixels, owners = points[kept], pixels[kept], owners[kept]
+            self.last_problem = refusal
+        self._learn(found, pose)
+        self.seen = len(detection.ids) if self.body.chessboard is not None else len(markers)
+        return pose
+
+    def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
+        """Markers (rows of the body) that cannot be used in a pose, and why."""
+        markers = np.unique(owners)
+        angles = self._view_angles(pose.pose, markers)
+        limit = self.settings.view_angle_limit
+        steep = angles > limit
+        if steep.any():
+            worst = int(np.argmax(angles))
+            return markers[steep], (
+                f"marker {self.body.ids[markers[worst]]} is seen at "
+                f"{math.degrees(angles[worst]):.0f}° from its normal, beyond the "
+                f"{math.degrees(limit):.0f}° of camera.view_angle_limit: it is not used"
+            )
+        if pose.error <= self.settings.reprojection_limit:
+            return markers[:0], ""
+        squares = (pose.residuals**2).sum(axis=1)
+        errors = np.array([math.sqrt(squares[owners == marker].mean()) for marker in markers])
+        worst = int(np.argmax(errors))
+        if len(markers) > 2:
+            return markers[[worst]], (
+                f"marker {self.body.ids[markers[worst]]} is {errors[worst]:.1f} pixels from where "
+                f"the others say: it is not used; check its place in the body's file"
+            )
+        return markers, (
+            f"the corners are {pose.error:.1f} pixels from those of the best pose, more than the "
+            f"{self.settings.reprojection_limit:g} of camera.reprojection_limit: check the "
+            f"marker's size, the body's file and the camera info"
+        )
+
+    def _view_angles(self, pose: Pose, markers: NDArray[np.int64]) -> NDArray[np.float64]:
+        """rad, of each marker's normal to the line from it to the camera."""
+        normals = self.body.normals[markers] @ pose.rotation.T
+        centres = pose.apply(self.body.centres[markers])
+        cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
+        return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+    def _chosen(self, found: list[BodyPose], before: Pose | None) -> BodyPose:
+        """The pose nearest to the last one, unless the images speak for the other by now."""
+        if len(found) == 1 or before is None:
+            return found[0]
+        near, far = sorted(found, key=lambda each: rotation_angle(each.pose, before))
+        return near if self._evidence_for(near, far) >= 0 else far
+
+    def _evidence_for(self, near: BodyPose, far: BodyPose) -> float:
+        """Log likelihood ratio of two poses, of which the near one follows the last."""
+        return _FORGETTING * self._evidence + _ratio(near, far)
+
+    def _learn(self, found: list[BodyPose], pose: BodyPose) -> None:
+        """Keep what this image says for the chosen pose against the other one."""
+        if len(found) == 1:
+            self._evidence = _FORGETTING * self._evidence
+            return
+        other = found[1] if pose is found[0] else found[0]
+        if self._last is not None and self._turned(pose, other):
+            self._evidence = -self._evidence
+        evidence = _FORGETTING * self._evidence + _ratio(pose, other)
+        self._evidence = float(np.clip(evidence, -_SURE, _SURE))
+
+    def _turned(self, pose: BodyPose, other: BodyPose) -> bool:
+        """Whether the chosen pose is not the one that follows the last."""
+        assert self._last is not None
+        before = self._last[1].pose
+        return rotation_angle(pose.pose, before) > rotation_angle(other.pose, before)
+
+    def _nothing(self, image: NDArray[np.uint8]) -> str:
+        start = f"no marker of {self.body.dictionary} is in the image"
+        if int(image.max()) <= _BLACK:
+            return f"{start}, which is black: uncover the lens or add light"
+        return self._strays.look(image, start)
+
+
+def _ratio(one: BodyPose, other: BodyPose) -> float:
+    """Log likelihood ratio."""
+    return 0.5 * (other.misfit - one.misfit)
+
+
+def _copies(numbers: tuple[int, ...]) -> str:
+    listed = ", ".join(str(number) for number in numbers)
+    plural = "marker" if len(numbers) == 1 else "markers"
+    return f"the image has two copies of {plural} {listed}: none is used; show only one"
