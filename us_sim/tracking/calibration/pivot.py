@@ -31,6 +31,7 @@ _FEWEST = 10  # poses
 _SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square
 _TRIALS = 300
 _SAMPLE = 4  # poses a trial: two leave the tip free along their common axis
+_JUDGES = 1000  # poses that tell a trial's worth
 _MEDIAN_SQUARE = 2.366  # median of chi-square with three degrees of freedom
 _LARGEST_SQUARE = 16.27  # its 99.9th percentile
 
@@ -119,17 +120,18 @@ def _consistent(
 ) -> NDArray[np.bool_]:
     """(K,) which poses agree with most others on a fixed point."""
     rng = np.random.default_rng(0)  # the same poses, the same answer
-    best = np.inf
-    squares = np.zeros(len(rotations))
-    for _ in range(_TRIALS):
-        chosen = rng.choice(len(rotations), _SAMPLE, replace=False)
-        if np.linalg.norm(rotations[chosen].mean(axis=0), 2) > 1.0 - _SMALLEST_SWING**2 / 8:
-            continue
-        solution = _least_squares(rotations[chosen], positions[chosen])[0]
-        distances = _squared_distances(rotations, positions, solution)
-        median = float(np.median(distances))
-        if median < best:
-            best, squares = median, distances
+    # Every so many poses judge as well as all, in less memory.
+    judges = slice(None, None, -(-len(rotations) // _JUDGES))
+    chosen = rng.random((_TRIALS, len(rotations))).argpartition(_SAMPLE, axis=1)[:, :_SAMPLE]
+    means = rotations[chosen].mean(axis=1)
+    lengths = np.linalg.svd(means, compute_uv=False)[:, 0]
+    wide = lengths < 1.0 - _SMALLEST_SWING**2 / 8
+    solutions = _solve(means[wide], rotations[chosen[wide]], positions[chosen[wide]])
+    tips = np.einsum("kij,tj->tki", rotations[judges], solutions[:, :3]) + positions[judges]
+    medians = np.median(((tips - solutions[:, None, 3:]) ** 2).sum(axis=2), axis=1)
+    if not len(medians):
+        return np.ones(len(rotations), dtype=np.bool_)
+    squares = _squared_distances(rotations, positions, solutions[int(medians.argmin())])
     inliers = _near(squares)
     for _ in range(10):
         solution = _least_squares(rotations[inliers], positions[inliers])[0]
@@ -138,6 +140,22 @@ def _consistent(
             break
         inliers = again
     return inliers
+
+
+def _solve(
+    means: NDArray[np.float64], rotations: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(T, 6) tip and fixed point of T samples: rotations (T, S, 3, 3), positions (T, S, 3).
+
+    By the normal equations without the fixed point c = mean(R) t + mean(p):
+    (I - mean(R)ᵀ mean(R)) t = mean(R)ᵀ mean(p) - mean(Rᵀ p).
+    """
+    middles = positions.mean(axis=1)
+    turned = np.einsum("tsji,tsj->ti", rotations, positions) / rotations.shape[1]
+    right = np.einsum("tji,tj->ti", means, middles) - turned
+    left = np.eye(3) - means.transpose(0, 2, 1) @ means
+    tips = np.linalg.solve(left, right[..., None])
+    return np.concatenate([tips, means @ tips + middles[..., None]], axis=1)[..., 0]
 
 
 def _squared_distances(

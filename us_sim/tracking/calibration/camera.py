@@ -1,0 +1,157 @@
+"""Camera calibration from photos of a board (Zhang 2000), with what the photos cannot tell.
+
+>>> import numpy as np
+>>> from scipy.spatial.transform import Rotation
+>>> from us_sim.tracking.calibration.board import BoardView
+>>> from us_sim.tracking.calibration.camera import calibrate_camera
+>>> board = 0.05 * np.stack([*np.indices((7, 5)), np.zeros((7, 5))], axis=-1).reshape(-1, 3)
+>>> views = []
+>>> for tilt in ([0.5, 0, 0], [0, 0.5, 0], [-0.4, 0.3, 0], [0.2, -0.6, 0.3]):
+...     seen = Rotation.from_rotvec(tilt).apply(board - [0.15, 0.1, 0]) + [0, 0, 0.35]
+...     pixels = 600 * seen[:, :2] / seen[:, 2:] + [320, 240]
+...     views.append(BoardView(np.float32(board), np.float32(pixels)))
+>>> calibrate_camera(views, 640, 480).camera.matrix.round(1)[0]
+array([600.,   0., 320.])
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.tracking.calibration.board import BoardView
+from us_sim.tracking.camera_model import CameraModel
+
+__all__ = ["INTRINSICS", "CameraCalibration", "calibrate_camera"]
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+_FEWEST_VIEWS = 3
+_SMALLEST_TILT = math.radians(2.0)  # between two of the boards
+_SMALL_TILT = math.radians(10.0)  # that is to blame for what stays open
+_SMALLEST_REACH = 0.3  # of the way from the middle to the image's corners
+_GOOD_REACH = 0.7
+_LARGEST_DEVIATION = 0.05  # of the focal lengths
+_GOOD_DEVIATION = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A camera and how well its photos determine it."""
+
+    camera: CameraModel
+    rms: float  # pixels, root mean square distance of all corners from where they should be
+    residuals: NDArray[np.float64]  # (K,) pixels, the same of each view
+    deviations: NDArray[np.float64]  # (9,) standard deviations of INTRINSICS
+    tilt: float  # rad, the largest angle between two boards
+    reach: float  # how far the corners go from the middle (0) to the image's corners (1)
+
+    @property
+    def note(self) -> str:
+        """What the photos leave open, in a sentence; empty when nothing."""
+        notes = []
+        if self.focal_deviation > _GOOD_DEVIATION:
+            notes.append(
+                f"the focal length is known to {100 * self.focal_deviation:.1f} % only: tilt the "
+                f"board more, to all sides"
+            )
+        if self.reach < _GOOD_REACH:
+            notes.append(
+                f"what the lens does beyond {100 * self.reach:.0f} % of the way from the image's "
+                f"middle to its corners is a guess: take photos with the board near each edge"
+            )
+        return "; ".join(notes)
+
+    @property
+    def focal_deviation(self) -> float:
+        """Standard deviation of the focal lengths, relative, the larger."""
+        return float((self.deviations[:2] / np.diag(self.camera.matrix)[:2]).max())
+
+
+def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> CameraCalibration:
+    """The camera whose pinhole and lens explain the views best.
+
+    Args:
+        views: of one board, each from another place.
+        width: pixels, of all photos.
+        height: pixels.
+
+    Raises:
+        CalibrationError: the views are too few or too alike to determine the camera.
+    """
+    if len(views) < _FEWEST_VIEWS:
+        raise CalibrationError(
+            f"the board is seen in {len(views)} photos, and {_FEWEST_VIEWS} are the least (20 are "
+            f"good): take more, tilted to all sides"
+        )
+    reach = _reach(views, width, height)
+    if reach < _SMALLEST_REACH:
+        raise CalibrationError(
+            f"the board is always in the middle of the image ({100 * reach:.0f} % of the way to "
+            f"its corners), so the lens cannot be told: take photos with the board near each edge"
+        )
+    try:
+        # No camera to start from, which OpenCV's type hints do not know.
+        start: Any = None
+        rms, found, lens, turns, _, deviations, _, residuals = cv2.calibrateCameraExtended(
+            [view.points for view in views],
+            [view.pixels for view in views],
+            (width, height),
+            start,
+            start,
+        )
+    except cv2.error as error:
+        raise CalibrationError(
+            "no camera fits the photos: check the board's size, squares and dictionary"
+        ) from error
+    matrix: NDArray[np.float64] = np.array(found, np.float64)
+    tilt = _largest_tilt([np.asarray(cv2.Rodrigues(turn)[0]) for turn in turns])
+    deviations = np.asarray(deviations, np.float64).ravel()[: len(INTRINSICS)]
+    _check(matrix, deviations, tilt)
+    return CameraCalibration(
+        CameraModel(width, height, matrix, np.array(lens, np.float64).ravel()[:5]),
+        float(rms),
+        np.asarray(residuals, np.float64).ravel(),
+        deviations,
+        tilt,
+        reach,
+    )
+
+
+def _check(matrix: NDArray[np.float64], deviations: NDArray[np.float64], tilt: float) -> None:
+    if not np.isfinite(matrix).all() or not np.isfinite(deviations).all():
+        raise CalibrationError(
+            "the photos do not determine the camera: take 20, tilted to all sides by 30° or more"
+        )
+    relative = float((deviations[:2] / np.diag(matrix)[:2]).max())
+    if tilt >= _SMALLEST_TILT and relative <= _LARGEST_DEVIATION:
+        return
+    if tilt < _SMALL_TILT:
+        raise CalibrationError(
+            f"the boards are all parallel (to {math.degrees(tilt):.1f}°), which leaves the focal "
+            f"length open: take photos tilted to all sides by 30° or more"
+        )
+    raise CalibrationError(
+        f"the photos leave the focal length open by {100 * relative:.0f} % (standard deviation): "
+        f"take more, nearer, and tilted to all sides by 30° or more"
+    )
+
+
+def _reach(views: Sequence[BoardView], width: int, height: int) -> float:
+    """How far corners go from the image's middle: 0 not at all, 1 to its corners."""
+    middle = 0.5 * np.array([width - 1, height - 1])
+    pixels = np.concatenate([view.pixels for view in views])
+    return float(np.linalg.norm(pixels - middle, axis=1).max() / np.linalg.norm(middle))
+
+
+def _largest_tilt(rotations: Sequence[NDArray[np.float64]]) -> float:
+    """rad, the largest angle between the normals of two boards."""
+    normals = np.array([rotation[:, 2] for rotation in rotations])
+    return float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max())
