@@ -3,6 +3,8 @@
 import csv
 import importlib.util
 import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -284,3 +286,11 @@ def test_processes_of_their_own_tell_memory_and_publishing():
     sent = publishing_ms(64)
     assert sent is not None
     assert 0.0 < sent < 100.0
+
+
+def test_nothing_but_vtk_is_needed_beyond_what_is_always_installed():
+    code = (
+        "import sys; sys.modules['skfem'] = sys.modules['vtkmodules'] = None;"
+        "import us_sim.evaluation.slice"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.collider import Capsule, Collider, Sphere
-from us_sim.evaluation.reference import graded_planes
 from us_sim.pose import Pose
 from us_sim.tissue.box import face_nodes
 from us_sim.tissue.materials import Material, uniform_material
@@ -67,6 +66,9 @@ class Scene:
 
     def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
+        # Not above: that needs scikit-fem, which nobody needs who only wants the block's meshes.
+        from us_sim.evaluation.reference import graded_planes
+
         low, high, beside = self.touched
         return (
             graded_planes(*_EXTENT[0], low, high, size),
