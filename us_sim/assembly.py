@@ -30,15 +30,19 @@ if TYPE_CHECKING:
     from us_sim.slicing.probe import Probe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
+    from us_sim.tracking.probe_tracking import ProbeTracking
+    from us_sim.tracking.rigid_body import RigidBody
     from us_sim.volume.volume import Volume
 
 __all__ = [
+    "camera_body_of",
     "collider_of",
     "membrane_of",
     "path_of",
     "probe_of",
     "scanner_of",
     "tissue_model_of",
+    "tracking_of",
     "volume_of",
 ]
 
@@ -120,6 +124,58 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
     method = scene.slice.method
     settings = {"regions": scene.slice.regions} if method == "row_subdivision" else {}
     return BMode(volume, probe_of(scene), scene.imaging, method=method, threads=threads, **settings)
+
+
+def tracking_of(scene: Scene) -> ProbeTracking:
+    """What turns the measurements of the scene's tracker into the probe's poses.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+        TrackingError: the times make no sense.
+    """
+    from us_sim.tracking.pose_filter import make_filter
+    from us_sim.tracking.probe_tracking import ProbeTracking
+
+    tracker = scene.tracker
+    gate = None
+    if tracker.gate is not None:
+        from us_sim.tracking.outlier_gate import OutlierGate
+
+        gate = OutlierGate(tracker.gate)
+    return ProbeTracking(
+        _pose_or_file(tracker.registration),
+        _pose_or_file(tracker.calibration),
+        make_filter(tracker.filter),
+        gate,
+        time_offset=tracker.time_offset,
+        coast_for=tracker.coast_for,
+        lost_after=tracker.lost_after,
+    )
+
+
+def _pose_or_file(given: PoseSection | str | None) -> Pose:
+    if isinstance(given, str):
+        from us_sim.tracking.transform_file import read_transform
+
+        return read_transform(given)
+    return _pose(given) if given is not None else Pose()
+
+
+def camera_body_of(scene: Scene) -> RigidBody:
+    """The markers on the probe that the scene's camera looks for.
+
+    Raises:
+        TrackingError: their file cannot be used.
+    """
+    from us_sim.tracking.camera_settings import CameraSettings
+    from us_sim.tracking.rigid_body import RigidBody
+
+    settings = scene.tracker.camera or CameraSettings()
+    if settings.body:
+        from us_sim.tracking.rigid_body_file import read_rigid_body
+
+        return read_rigid_body(settings.body, settings.dictionary)
+    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
 
 
 def collider_of(scene: Scene) -> Collider:

@@ -14,6 +14,8 @@ from us_sim.quantity import Quantity, given
 from us_sim.slicing.imaging import Imaging
 from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.filter_settings import FilterSettings, GateSettings
+from us_sim.tracking.haptic_settings import HapticSettings
+from us_sim.tracking.six_dof_mouse_settings import SixDofMouseSettings
 
 __all__ = [
     "ColliderSection",
@@ -210,6 +212,8 @@ class TrackerSection:
     filter: FilterSettings = given(default=FilterSettings())
     gate: GateSettings | None = given(default=None)
     camera: CameraSettings | None = given(default=None)
+    six_dof_mouse: SixDofMouseSettings | None = given(default=None)
+    haptic: HapticSettings | None = given(default=None)
 
 
 @dataclass(frozen=True)

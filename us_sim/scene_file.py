@@ -20,7 +20,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from us_sim.assembly import probe_of
-from us_sim.errors import SceneError
+from us_sim.errors import SceneError, UsSimError
 from us_sim.quantity import Quantity
 from us_sim.scene import PoseSection, Scene, TissueSection, VolumeSection
 from us_sim.share import shared_roots
@@ -126,7 +126,12 @@ def _build(cls: type, document: object, origin: str, key: str) -> Any:
             values[name] = _value(types[name], document[name], entry.metadata, origin, path)
         elif entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING:
             raise SceneError(f"{origin}: {path}: is missing")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except SceneError:
+        raise
+    except UsSimError as error:  # values that do not go together
+        raise SceneError(f"{origin}: {error}") from error
 
 
 def _value(kind: Any, value: object, check: Any, origin: str, key: str) -> Any:

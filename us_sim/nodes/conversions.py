@@ -37,6 +37,7 @@ __all__ = [
     "surface_marker",
     "tetrahedra_from",
     "tetrahedra_message",
+    "transform_from",
     "transform_message",
     "vectors_from",
     "wrench_message",
@@ -73,6 +74,16 @@ def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
     p.x, p.y, p.z = map(float, pose.position)
     q.x, q.y, q.z, q.w = map(float, pose.orientation)
     return message
+
+
+def transform_from(message: TransformStamped) -> Pose:
+    """The child's pose in the frame of a transform's header.
+
+    Raises:
+        PoseError: it is not finite, or its quaternion is zero.
+    """
+    t, q = message.transform.translation, message.transform.rotation
+    return Pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:

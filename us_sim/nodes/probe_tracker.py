@@ -1,81 +1,157 @@
-"""Validates the tracker's poses and forwards them as the probe's."""
+"""Takes a device's measurements and publishes where the probe is, and how far that is known."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
+from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from us_sim.errors import PoseError
-from us_sim.nodes.conversions import pose_from, pose_message, transform_message
+from us_sim.assembly import tracking_of
+from us_sim.nodes.conversions import pose_message, transform_message
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.tracker_inputs import create_input
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.tracking_state import TrackingState
 
 __all__ = ["ProbeTracker", "main"]
 
-RESTART_NS = 1_000_000_000
-"""A stamp that jumps back by more is a restarted source, not a late message."""
+PATIENT = "patient"
+CHECKS = 20.0
+"""Times a second that the state is looked at when nothing comes."""
+LEVELS = {
+    TrackingState.WAITING: DiagnosticStatus.STALE,
+    TrackingState.TRACKED: DiagnosticStatus.OK,
+    TrackingState.COASTING: DiagnosticStatus.WARN,
+    TrackingState.LOST: DiagnosticStatus.ERROR,
+}
 
 
 class ProbeTracker(SceneNode):
-    """``tracker/pose`` in, ``probe/pose`` and ``tf`` out."""
+    """A source's measurements in; ``probe/pose``, ``tf`` and ``probe/status`` out.
+
+    What it listens to is up to ``tracker.source`` of the scene, see `tracker_inputs`. A pose goes
+    out once, with the stamp of its measurement. ``probe/status``, latched, says whether the probe
+    is ``tracked``, ``coasting`` or ``lost``, each time that changes.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
-        self._frame = self.scene.tracker.frame
-        self._last_stamp = 0
+        self._tracking = tracking_of(self.scene)
+        self._state = TrackingState.WAITING
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
-        self.listen(PoseStamped, "tracker/pose", self._take, EVERY if self.lockstep else FOREIGN)
+        self._status = self.latched(DiagnosticStatus, "probe/status")
+        self._input = create_input(self.scene.tracker.source, self)
         self.health.state = "waiting for poses"
+        self._say_status()
+        if not self.lockstep:
+            self.create_timer(1.0 / CHECKS, self._check)
 
-    def _take(self, message: PoseStamped) -> None:
-        self.health.received += 1
-        if message.header.frame_id != self._frame:
-            self.health.problem(
-                "frame",
-                f"tracker/pose is in frame '{message.header.frame_id}', not '{self._frame}': "
-                f"set the tracker's frame, or tracker.frame in the scene",
-            )
+    def listen_to_device(
+        self, message_type: Any, topic: str, callback: Callable[[Any], None]
+    ) -> None:
+        """Subscribe as drivers may publish, best effort; all that come count as received."""
+
+        def count(message: Any) -> None:
+            self.health.received += 1
+            callback(message)
+
+        self.listen(message_type, topic, count, self.of_device)
+
+    @property
+    def of_device(self) -> QoSProfile:
+        """The quality of service of a subscription to a device."""
+        return EVERY if self.lockstep else FOREIGN
+
+    def is_in_frame(self, header: Header, topic: str) -> bool:
+        """Whether a device's message is in the frame that the scene says; said when it is not."""
+        frame = self.scene.tracker.frame
+        if header.frame_id == frame:
+            return True
+        self.refuse(
+            "frame",
+            f"{topic} is in frame '{header.frame_id}', not '{frame}': set the tracker's frame, or "
+            f"tracker.frame in the scene",
+        )
+        return False
+
+    def stamp_of(self, header: Header, topic: str) -> int:
+        """When a device's message was measured, ns; its arrival where it does not say."""
+        stamp = Time.from_msg(header.stamp).nanoseconds
+        if stamp == 0:
+            self.health.problem("stamp", f"{topic} has no stamp: its time of arrival is used")
+            stamp = self._now()
+        return stamp
+
+    def refuse(self, kind: str, sentence: str) -> None:
+        """Count and say, now and then, why a device's message is not used."""
+        self.health.problem(kind, sentence)
+
+    def take(self, measurement: Measurement) -> None:
+        """Publish the probe's pose, if the measurement can be believed."""
+        restarts = self._tracking.restarts.total()
+        probe = self._tracking.take(measurement, self._now())
+        if self._tracking.restarts.total() > restarts:
+            self.get_logger().info("the tracker's poses start anew, and so does the filter")
+        if probe is None:
+            tracking = self._tracking
+            self.refuse(tracking.last_refused, f"{tracking.last_problem}; it is not used")
+            self._check()
             return
-        try:
-            pose = pose_from(message)
-        except PoseError as error:
-            self.health.problem("pose", f"tracker/pose: {error}; it is not used")
-            return
-        if not self._in_order(message):
-            return
-        stamp = message.header.stamp
-        self._poses.publish(pose_message(pose, stamp, self._frame))
+        stamp = Time(nanoseconds=max(probe.stamp, 0)).to_msg()
+        self._poses.publish(pose_message(probe.pose, stamp, PATIENT))
         self.health.published("probe/pose", stamp)
         if self._transforms.get_subscription_count():
-            transform = transform_message(pose, stamp, self._frame, "probe")
+            transform = transform_message(probe.pose, stamp, PATIENT, "probe")
             self._transforms.publish(TFMessage(transforms=[transform]))
             self.health.published("tf")
-        self.health.state = "tracking"
+        self._report(probe)
+        self._check()
 
-    def _in_order(self, message: PoseStamped) -> bool:
-        """Whether the stamp is new; an unstamped pose is stamped with its arrival."""
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
-        if stamp == 0:
-            now = self.get_clock().now()
-            message.header.stamp = now.to_msg()
-            stamp = now.nanoseconds
-            self.health.problem("stamp", "tracker/pose has no stamp: its time of arrival is used")
-        step = stamp - self._last_stamp
-        if self._last_stamp and -RESTART_NS < step <= 0:
-            self.health.problem(
-                "order", "tracker/pose is not newer than the pose before it; it is not used"
-            )
-            return False
-        if step <= -RESTART_NS:
-            self.get_logger().info(f"tracker/pose starts again {-step * 1e-9:.3f} s earlier")
-        self._last_stamp = stamp
-        return True
+    def _report(self, probe: Measurement) -> None:
+        """What diagnostics say of a measurement that was believed."""
+        deviation = probe.position_deviation
+        self.health.values |= {
+            "filter_lag_ms": f"{1e3 * self._tracking.filter.lag:.1f}",
+            **({"fit_error": f"{probe.error:.3g}"} if probe.error is not None else {}),
+            **({"deviation_mm": f"{1e3 * deviation:.3f}"} if deviation is not None else {}),
+        }
+
+    def _check(self) -> None:
+        """Say so when the state has changed."""
+        state = self._tracking.state(self._now())
+        if state is self._state:
+            return
+        if state is TrackingState.LOST:
+            self.get_logger().warning("the probe is lost: no pose of it can be used any more")
+        elif state is TrackingState.TRACKED and self._state is not TrackingState.COASTING:
+            self.get_logger().info("the probe is tracked")
+        self._state = state
+        self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
+        self._say_status()
+
+    def _say_status(self) -> None:
+        status = DiagnosticStatus(
+            level=LEVELS[self._state],
+            name="probe",
+            message=self._state.value,
+            hardware_id=self.scene.tracker.source,
+        )
+        refused = self._tracking.refused
+        status.values = [KeyValue(key=f"refused {k}", value=str(n)) for k, n in refused.items()]
+        self._status.publish(status)
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
 
 
 def main(args: list[str] | None = None) -> int:

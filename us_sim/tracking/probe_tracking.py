@@ -87,7 +87,7 @@ class ProbeTracking:
         self._believed: int | None = None  # ns, stamp of the newest that was believed
         self.refused: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
-        self.last_problem = ""
+        self.last_refused = self.last_problem = ""
 
     def reset(self) -> None:
         """Forget all poses: the next one is the first. What was counted stays."""
@@ -102,13 +102,13 @@ class ProbeTracking:
     def refuse(self, kind: str, sentence: str) -> None:
         """Count a measurement that cannot be used, be it one that never became a pose."""
         self.refused[kind] += 1
-        self.last_problem = sentence
+        self.last_refused, self.last_problem = kind, sentence
 
     def take(self, measurement: Measurement, now_ns: int) -> Measurement | None:
         """The probe in ``patient``, or None where the measurement is refused.
 
-        Why is then in `last_problem`, and counted in `refused` as "order" (not newer than one
-        before), "covariance" (of no distribution) or "gate".
+        Why is then in `last_problem`, and `last_refused` is what it is counted as in `refused`:
+        "order" (not newer than one before), "covariance" (of no distribution) or "gate".
 
         Args:
             measurement: the tracked body in the device's frame.

@@ -1,0 +1,100 @@
+"""Grey pixels of a camera's images, in whatever encoding its driver sends them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera_model import CameraModel
+
+__all__ = ["camera_from", "grey_from", "grey_from_compressed"]
+
+# Bytes a pixel, and OpenCV's conversion to grey where one is needed. A Bayer pattern is named by
+# ROS after its first row's first two pixels, and by OpenCV after its second row's second two.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "mono16": (2, None),
+    "16UC1": (2, None),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": (4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+}
+
+
+def camera_from(message: CameraInfo) -> CameraModel:
+    """The camera that a driver describes.
+
+    Raises:
+        TrackingError: it is not calibrated, or the numbers are none of a camera.
+    """
+    return CameraModel(
+        message.width,
+        message.height,
+        np.array(message.k, dtype=np.float64).reshape(3, 3),
+        np.array(message.d, dtype=np.float64),
+        message.distortion_model or "plumb_bob",
+    )
+
+
+def grey_from(message: Image) -> NDArray[np.uint8]:
+    """(rows, columns) grey pixels.
+
+    Raises:
+        TrackingError: the encoding is not known, or there are fewer bytes than the size says.
+    """
+    if message.encoding not in _ENCODINGS:
+        raise TrackingError(
+            f"the image's encoding is '{message.encoding}'; known are {', '.join(_ENCODINGS)}"
+        )
+    size, conversion = _ENCODINGS[message.encoding]
+    row = message.width * size
+    step = message.step or row
+    if not message.width or not message.height or step < row:
+        raise TrackingError(
+            f"the image says it has {message.height} rows of {message.width} pixels in {step} "
+            f"bytes each, which cannot be"
+        )
+    if len(message.data) < message.height * step:
+        raise TrackingError(
+            f"the image holds {len(message.data)} bytes, but says it has {message.height} rows "
+            f"of {step}"
+        )
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=message.height * step)
+    rows = flat.reshape(message.height, step)[:, :row]
+    if message.encoding in ("mono16", "16UC1"):
+        high = 0 if message.is_bigendian else 1  # the more significant byte is enough
+        return np.ascontiguousarray(rows[:, high::2])
+    if conversion is None:
+        return np.ascontiguousarray(rows)
+    pixels = rows if size == 1 else rows.reshape(message.height, message.width, size)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+
+
+def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
+    """(rows, columns) grey pixels of a JPEG or PNG.
+
+    Raises:
+        TrackingError: it cannot be decoded.
+    """
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    if pixels is None:
+        raise TrackingError(
+            f"the compressed image ('{message.format}', {data.size} bytes) cannot be decoded"
+        )
+    return np.asarray(pixels, dtype=np.uint8)

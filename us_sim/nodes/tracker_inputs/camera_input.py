@@ -1,0 +1,83 @@
+"""A camera that sees the markers on the probe's grip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from us_sim.assembly import camera_body_of
+from us_sim.errors import TrackingError
+from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
+from us_sim.nodes.newest import Newest
+from us_sim.tracking.camera_settings import CameraSettings
+from us_sim.tracking.camera_source import CameraSource
+
+if TYPE_CHECKING:
+    from us_sim.nodes.probe_tracker import ProbeTracker
+
+__all__ = ["CameraInput"]
+
+
+class CameraInput:
+    """``camera/image_raw``, or ``camera/image_raw/compressed``, with ``camera/camera_info``."""
+
+    def __init__(self, node: ProbeTracker) -> None:
+        self._node = node
+        self._settings = node.scene.tracker.camera or CameraSettings()
+        self._body = camera_body_of(node.scene)
+        self._source: CameraSource | None = None
+        self._described: CameraInfo | None = None
+        node.listen(CameraInfo, "camera/camera_info", self._describe, node.of_device)
+        for message_type, topic, decode in (
+            (Image, "camera/image_raw", grey_from),
+            (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
+        ):
+            work = self._looking(topic, decode)
+            newest = Newest(node, node.health, work, lockstep=node.lockstep)
+            node.listen(message_type, topic, newest, node.of_device)
+
+    def _describe(self, message: CameraInfo) -> None:
+        """Look through this camera from now on; drivers repeat it with every image."""
+        if self._described is not None and _is_same(message, self._described):
+            return
+        self._described = message
+        try:
+            self._source = CameraSource(camera_from(message), self._body, self._settings)
+        except TrackingError as error:
+            self._source = None
+            self._node.refuse("camera", f"camera/camera_info: {error}")
+
+    def _looking(
+        self, topic: str, decode: Callable[[Any], NDArray[Any]]
+    ) -> Callable[[Image | CompressedImage], None]:
+        def look(message: Image | CompressedImage) -> None:
+            if self._source is None:
+                if self._described is None:
+                    self._node.refuse(
+                        "camera",
+                        "no camera/camera_info has come, so no pose can be measured: calibrate the "
+                        "camera (us-sim calibrate camera) and give its driver the file",
+                    )
+                return
+            stamp = self._node.stamp_of(message.header, topic)
+            try:
+                measurement = self._source.measure(decode(message), stamp)
+            except TrackingError as error:
+                self._node.refuse("image", f"{topic}: {error}; it is not used")
+                return
+            if measurement is None:
+                self._node.refuse("markers", f"{topic}: {self._source.last_problem}")
+            else:
+                self._node.take(measurement)
+
+        return look
+
+
+def _is_same(a: CameraInfo, b: CameraInfo) -> bool:
+    """Whether two descriptions are of the same camera."""
+    return (a.width, a.height, a.distortion_model) == (b.width, b.height, b.distortion_model) and (
+        list(a.k) == list(b.k) and list(a.d) == list(b.d)
+    )

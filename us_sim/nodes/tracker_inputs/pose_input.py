@@ -1,0 +1,34 @@
+"""Poses of any driver: NDI, OptiTrack, Vicon, a recorded path."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from geometry_msgs.msg import PoseStamped
+
+from us_sim.errors import PoseError
+from us_sim.nodes.conversions import pose_from
+from us_sim.tracking.measurement import Measurement
+
+if TYPE_CHECKING:
+    from us_sim.nodes.probe_tracker import ProbeTracker
+
+__all__ = ["PoseInput"]
+
+
+class PoseInput:
+    """``tracker/pose`` in the frame that the scene names."""
+
+    def __init__(self, node: ProbeTracker) -> None:
+        self._node = node
+        node.listen_to_device(PoseStamped, "tracker/pose", self._take)
+
+    def _take(self, message: PoseStamped) -> None:
+        if not self._node.is_in_frame(message.header, "tracker/pose"):
+            return
+        try:
+            pose = pose_from(message)
+        except PoseError as error:
+            self._node.refuse("pose", f"tracker/pose: {error}; it is not used")
+            return
+        self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/pose"), pose))

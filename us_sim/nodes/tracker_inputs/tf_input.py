@@ -1,0 +1,102 @@
+"""A body's frame in the tree that ``tf`` and ``tf_static`` make."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from tf2_msgs.msg import TFMessage
+
+from us_sim.errors import PoseError, SceneError
+from us_sim.nodes.conversions import transform_from
+from us_sim.pose import Pose
+from us_sim.tracking.measurement import Measurement
+
+if TYPE_CHECKING:
+    from us_sim.nodes.probe_tracker import ProbeTracker
+
+__all__ = ["TfInput"]
+
+STATIC = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+FRAMES = 1000
+"""Most frames kept; a tree of more is somebody's mistake."""
+
+
+class TfInput:
+    """The frame ``tracker.body`` in the frame ``tracker.frame``, each time a frame between moves.
+
+    Its stamp is that of the transform that came: frames between are taken where they last were.
+    """
+
+    def __init__(self, node: ProbeTracker) -> None:
+        self._node = node
+        tracker = node.scene.tracker
+        if tracker.body is None:
+            raise SceneError(
+                f"{node.scene.origin}: tracker.body: is missing; name the probe's frame in tf"
+            )
+        if tracker.body == "probe":
+            raise SceneError(
+                f"{node.scene.origin}: tracker.body: `probe` is the frame that this node publishes "
+                f"itself; name the frame that the tracker gives the probe"
+            )
+        self._frame, self._body = tracker.frame, tracker.body
+        self._parents: dict[str, tuple[str, Pose]] = {}
+        node.listen_to_device(TFMessage, "tf", self._take)
+        node.listen(TFMessage, "tf_static", self._take_static, STATIC)
+
+    def _take_static(self, message: TFMessage) -> None:
+        self._keep(message)
+
+    def _keep(self, message: TFMessage) -> set[str]:
+        """Remember the transforms of a message; the frames that have moved."""
+        moved = set()
+        for transform in message.transforms:
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id
+            try:
+                pose = transform_from(transform)
+            except PoseError as error:
+                self._node.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
+                continue
+            if child in self._parents or len(self._parents) < FRAMES:
+                self._parents[child] = parent.lstrip("/"), pose
+                moved.add(child)
+        return moved
+
+    def _take(self, message: TFMessage) -> None:
+        moved = self._keep(message)
+        chain = self._chain()
+        if chain is None:
+            self._node.refuse(
+                "frame",
+                f"tf has no way from '{self._body}' up to '{self._frame}' yet: see tracker.body "
+                f"and tracker.frame in the scene",
+            )
+            return
+        stamps = [
+            Time.from_msg(transform.header.stamp).nanoseconds
+            for transform in message.transforms
+            if transform.child_frame_id.lstrip("/") in moved & set(chain)
+        ]
+        if stamps:
+            pose = Pose()
+            for frame in chain:
+                pose = self._parents[frame][1] @ pose
+            self._node.take(Measurement(max(stamps), pose))
+
+    def _chain(self) -> list[str] | None:
+        """The frames from the body up to below the device's; None when they do not meet."""
+        chain: list[str] = []
+        frame = self._body
+        while frame != self._frame:
+            if frame not in self._parents or frame in chain:
+                return None
+            chain.append(frame)
+            frame = self._parents[frame][0]
+        return chain
