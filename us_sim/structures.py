@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,11 @@ from numpy.typing import NDArray
 from us_sim.errors import SceneError, UsSimError
 from us_sim.pose import Pose
 from us_sim.scene import Scene
-from us_sim.tissue.embedding import EmbeddedSurface
-from us_sim.tissue.mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
+
+if TYPE_CHECKING:
+    from us_sim.tissue.embedding import EmbeddedSurface
+    from us_sim.tissue.mesh import TetrahedralMesh
 
 __all__ = ["Structure", "colour_of", "require_labels", "structures_of"]
 
@@ -89,6 +92,8 @@ def structures_of(
         SceneError: the volume has no such label, or no surface can be made of it.
         MeshError: a file cannot be read, or its surface is not in the tissue.
     """
+    from us_sim.tissue.embedding import EmbeddedSurface
+
     require_labels(scene, volume)
     numbers = {name: label for label, name in volume.label_names.items()}
     labels = {

@@ -128,7 +128,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
 
 
 def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench, show):
-    node = show(stale_after=0.2, lost_after=0.5)
+    node = show(stale_after=1.0, lost_after=1.5)  # looked at five times a second
     bench.spin_until(lambda: node.health.values.get("probe_pose") == "waiting")
     assert node.health.problems("pose age") == 0
     for times in (1, 2):

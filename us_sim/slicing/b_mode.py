@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.mesh_faces import boundary_triangles
 from us_sim.pose import Pose
 from us_sim.slicing.image_formation import ImageFormation
 from us_sim.slicing.imaging import Imaging
@@ -156,8 +157,6 @@ class BMode:
             from us_sim.slicing.coupling import ContactSurface
 
             if deformed and self._mesh is not None:
-                from us_sim.tissue.mesh_check import boundary_triangles
-
                 rest_nodes, tetrahedra = self._mesh
                 self._surface = ContactSurface(rest_nodes, boundary_triangles(tetrahedra))
             else:

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.mesh_faces import face_order
 from us_sim.slicing.clusters import Clusters
 from us_sim.slicing.cut_polygons import cut_tetrahedra, room_for_cuts
 from us_sim.slicing.location import BLACK
@@ -46,7 +47,6 @@ from us_sim.slicing.span_sampling import (
     sample_spans,
 )
 from us_sim.slicing.spans import convert_cuts
-from us_sim.tissue.mesh_check import face_order
 
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume

@@ -21,13 +21,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh_check import (
-    EDGES,
-    boundary_faces,
-    boundary_triangles,
-    check_mesh,
-    signed_volumes,
-)
+from us_sim.mesh_faces import boundary_faces, boundary_triangles
+from us_sim.tissue.mesh_check import EDGES, check_mesh, signed_volumes
 
 __all__ = ["TetrahedralMesh", "box_mesh", "uniform_planes"]
 

@@ -20,25 +20,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
+from us_sim.mesh_faces import FACES, MOST_NODES, face_order
 
-__all__ = [
-    "EDGES",
-    "FACES",
-    "MOST_NODES",
-    "boundary_faces",
-    "boundary_triangles",
-    "check_arrays",
-    "check_mesh",
-    "face_order",
-    "signed_volumes",
-]
+__all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
 
-#: The six edges of a tetrahedron, and the four outward faces of a positively oriented one.
+#: The six edges of a tetrahedron.
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-
-#: So many nodes at most, so that the three of a face fit into one 64-bit number.
-MOST_NODES = 2**21
 
 # m, beyond which no body is, and volumes would overflow.
 _FARTHEST = 1e6
@@ -120,37 +107,6 @@ def signed_volumes(
     y = c[:, 2] * d[:, 0] - c[:, 0] * d[:, 2]
     z = c[:, 0] * d[:, 1] - c[:, 1] * d[:, 0]
     return (b[:, 0] * x + b[:, 1] * y + b[:, 2] * z) / 6
-
-
-def face_order(
-    tetrahedra: NDArray[np.integer],
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Faces brought together with the faces of the same three nodes.
-
-    Face f of tetrahedron t, ``FACES[f]``, has the number 4 t + f.
-
-    Returns:
-        (4M,) face numbers, those of the same nodes in a row and ascending; and for each set of
-        same faces where its row starts, and how many they are.
-    """
-    faces = np.sort(tetrahedra[:, FACES].reshape(-1, 3).astype(np.int64), axis=1)
-    keys = faces[:, 0] << 42 | faces[:, 1] << 21 | faces[:, 2]
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-    return order, starts, np.diff(np.append(starts, len(keys)))
-
-
-def boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
-    """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
-    faces = tetrahedra[:, FACES].reshape(-1, 3)[boundary_faces(tetrahedra)]
-    return np.ascontiguousarray(faces, dtype=np.int32)
-
-
-def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
-    """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
-    order, starts, counts = face_order(tetrahedra)
-    return np.sort(order[starts[counts == 1]])
 
 
 def _check_places(nodes: NDArray[np.float64]) -> None:
