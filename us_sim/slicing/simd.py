@@ -2,7 +2,7 @@
 
 >>> import numpy as np
 >>> from numba import njit
->>> from us_sim.slicing.simd import LANES, load_pair, write_ramp
+>>> from us_sim.slicing.simd import LANES, write_ramp
 >>> @njit
 ... def write(line):
 ...     write_ramp(line, np.uint64(1), np.int32(10), np.int32(3), np.int32(4))
@@ -20,13 +20,16 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["LANES", "load_pair", "write_ramp"]
+__all__ = ["LANES", "load_pairs", "write_ramp"]
 
 LANES = 16
-"""Numbers that `write_ramp` touches at once: an array has room for these beyond its last one."""
+"""Numbers that are touched at once: an array has room for these beyond its last one."""
 
 _NUMBER = ir.IntType(32)
 _VECTOR = ir.VectorType(_NUMBER, LANES)
+_PAIR = ir.IntType(16)
+_PAIRS = ir.VectorType(_PAIR, LANES)
+_INDEX = ir.IntType(64)
 
 
 def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
@@ -50,18 +53,42 @@ def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: An
     return types.void(array, index, *numbers), generate
 
 
-def _load_pair(_: Any, array: Any, index: Any) -> Any:
-    """A pair's signature and the instructions that load it."""
+def _load_pairs(
+    _: Any, voxels: Any, near: Any, first: Any, to_y: Any, to_x: Any, p00: Any, p01: Any,
+    p10: Any, p11: Any,
+) -> Any:  # fmt: skip
+    """The signature of the loads of four corners and their instructions."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array, index = arguments
-        data = context.make_array(signature.args[0])(context, builder, array).data
-        place = builder.bitcast(builder.gep(data, [index]), ir.IntType(16).as_pointer())
-        pair = builder.load(place)
-        pair.align = 1
-        return pair
+        def data(argument: int) -> Any:
+            array = context.make_array(signature.args[argument])
+            return array(context, builder, arguments[argument]).data
 
-    return types.uint16(array, index), generate
+        _, _, first, to_y, to_x, *_ = arguments
+        origin = data(0)
+        corners = [
+            builder.gep(origin, [way])
+            for way in (ir.Constant(_INDEX, 0), to_y, to_x, builder.add(to_x, to_y))
+        ]
+        pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 4
+        places = builder.gep(data(1), [first])
+        for lane in range(LANES):
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
+            place = builder.zext(place, _INDEX)
+            for k, corner in enumerate(corners):
+                pair = builder.load(
+                    builder.bitcast(builder.gep(corner, [place]), _PAIR.as_pointer())
+                )
+                pair.align = 1
+                pairs[k] = builder.insert_element(pairs[k], pair, ir.Constant(_NUMBER, lane))
+        for k, loaded in enumerate(pairs):
+            place = builder.bitcast(builder.gep(data(5 + k), [first]), _PAIRS.as_pointer())
+            builder.store(loaded, place).align = 1
+        return context.get_dummy_value()
+
+    index = types.uint64
+    numbers = [index for _ in (first, to_y, to_x)]
+    return types.void(voxels, near, *numbers, p00, p01, p10, p11), generate
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
@@ -78,8 +105,10 @@ It writes ``count`` numbers from ``array[index]`` on, at most `LANES` of them, w
 of so few rounds is not vectorised, or does most of them in its tail.
 """
 
-load_pair: Any = intrinsic(_load_pair)
-"""``load_pair(array, index)`` of a uint8 array: its number there, and the next one times 256.
+load_pairs: Any = intrinsic(_load_pairs)
+"""``load_pairs(voxels, near, first, to_y, to_x, p00, p01, p10, p11)`` loads for `LANES` pixels.
 
-One load, aligned or not.
+From the voxel ``near[first]`` (uint32) of a uint8 array, the one ``to_y`` further, the one ``to_x``
+further, and the one both further: each with the next one times 256, as one uint16. They are put
+together in registers, since a store of each would take longer than its load.
 """

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from us_sim.slicing.rest_outline import mark_covered
-from us_sim.slicing.simd import LANES, load_pair, write_ramp
+from us_sim.slicing.simd import LANES, load_pairs, write_ramp
 from us_sim.slicing.spans import CUT_SHIFT, END_SHIFT
 from us_sim.slicing.trilinear import SLACK
 
@@ -56,10 +56,12 @@ def sample_spans(
     """
     columns = image.shape[1]
     # Lines of a multiple of 4096 bytes would make loads wait for stores that are not theirs.
-    room = np.empty((9, (columns + LANES + 671) // 1024 * 1024 + 352), dtype=np.int32)
+    room = np.empty((11, (columns + LANES + 671) // 1024 * 1024 + 352), dtype=np.int32)
     x = room[0]
     y = room[1]
     z = room[2]
+    # Pixels are loaded in groups: where the last group ends beyond the row, from somewhere.
+    room[3] = 0
     winding = np.empty(columns + 1, dtype=np.int32)
     covered = np.empty(columns, dtype=np.bool_)
     for row in range(first_row, end_row):
@@ -250,7 +252,7 @@ def _least(x):
 def _sample(voxels, shape, x, y, z, room, line):
     """Trilinear values of the pixels of a row; any value for those that lie nowhere.
 
-    ``room``: (9, …) int32, of which the last six lines are used.
+    ``room``: (11, …) int32, of which the last eight lines are used.
     """
     # All loops here count from 0 and indices are unsigned: numba lets a signed index count from
     # the end, and a test for that keeps a loop from being vectorised.
@@ -272,21 +274,15 @@ def _sample(voxels, shape, x, y, z, room, line):
         fx[k] = np.int16(x[k] >> _DROPPED & weight)
         fy[k] = np.int16(y[k] >> _DROPPED & weight)
         fz[k] = np.int16(z[k] >> _DROPPED & weight)
-    lower = room[7].view(np.uint32)
-    upper = room[8].view(np.uint32)
-    high = np.uint32(16)
+    p00 = room[7].view(np.uint16)
+    p01 = room[8].view(np.uint16)
+    p10 = room[9].view(np.uint16)
+    p11 = room[10].view(np.uint16)
+    for k in range(0, len(line), LANES):
+        load_pairs(voxels, near, np.uint64(k), to_y, to_x, p00, p01, p10, p11)
     for k in range(len(line)):
-        i = np.uint64(near[k])
-        j = i + to_x
-        lower[k] = np.uint32(load_pair(voxels, i)) | np.uint32(load_pair(voxels, i + to_y)) << high
-        upper[k] = np.uint32(load_pair(voxels, j)) | np.uint32(load_pair(voxels, j + to_y)) << high
-    lower_pairs = lower.view(np.uint16)
-    upper_pairs = upper.view(np.uint16)
-    for k in range(len(line)):
-        i = np.uint64(2) * np.uint64(k)
-        j = i + np.uint64(1)
-        c0 = _blend(_blend_pair(lower_pairs[i], fz[k]), _blend_pair(lower_pairs[j], fz[k]), fy[k])
-        c1 = _blend(_blend_pair(upper_pairs[i], fz[k]), _blend_pair(upper_pairs[j], fz[k]), fy[k])
+        c0 = _blend(_blend_pair(p00[k], fz[k]), _blend_pair(p01[k], fz[k]), fy[k])
+        c1 = _blend(_blend_pair(p10[k], fz[k]), _blend_pair(p11[k], fz[k]), fy[k])
         line[k] = np.uint8(np.int16(_blend(c0, c1, fx[k]) + np.int16(32)) >> np.int16(6))
 
 
