@@ -9,7 +9,7 @@ from slicing_cases import KINDS, random_case
 
 from us_sim.slicing.slicer import create_slicer
 
-CASES = {"scan_conversion": 150, "row_subdivision": 25}
+CASES = {"scan_conversion": 130, "row_subdivision": 25}
 """How many of each kind; the same ones always, since a pixel may lie within rounding of an edge."""
 
 _CLOSE = 0.1
