@@ -1,0 +1,177 @@
+"""The offset between two clocks, from one motion that both recorded.
+
+The offset with the largest normalised cross-correlation, to a part of a sample; its standard
+deviation by leaving out a tenth of the recording at a time (block jackknife, Künsch 1989), which
+holds for errors that are correlated in time too.
+
+>>> import numpy as np
+>>> from us_sim.tracking.calibration.position_signal import PositionSignal
+>>> from us_sim.tracking.calibration.time_offset import find_time_offset
+>>> def swing(t):
+...     return np.sin(2 * t) + np.sin(3.1 * t + 0.2 * t**2)
+>>> tracker, video = np.arange(0, 10, 0.02), np.arange(1, 9, 0.085)
+>>> late = PositionSignal(tracker + 0.064, swing(tracker))
+>>> found = find_time_offset(late, PositionSignal(video, -300 * swing(video)))
+>>> round(found.offset, 3), round(found.correlation, 3)
+(-0.064, -1.0)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+
+from us_sim.errors import CalibrationError
+from us_sim.tracking.calibration.position_signal import PositionSignal
+
+__all__ = ["TimeOffset", "find_time_offset"]
+
+_LARGEST_STEP = 0.005  # s, between tried offsets
+_FEWEST_SAMPLES = 30
+_SHORTEST = 3.0  # s, of both recordings together
+_LEAST_CORRELATION = 0.7
+_CLEAREST = 1.5  # times the best's squared error that any other offset's must have
+_BLOCKS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class TimeOffset:
+    """What to add to the moving signal's stamps so that it agrees with the fixed one."""
+
+    offset: float  # s
+    deviation: float  # s, its standard deviation
+    correlation: float  # there; its sign says whether the two count in the same direction
+    residual: float  # of the fixed signal's standard deviation, what the moving leaves unexplained
+    seconds: float  # how long both were compared
+    tried: NDArray[np.float64]  # (N,) s
+    correlations: NDArray[np.float64]  # (N,) at these
+
+
+def find_time_offset(
+    moving: PositionSignal, fixed: PositionSignal, *, largest: float = 0.5
+) -> TimeOffset:
+    """The offset of the moving signal's stamps against the fixed one's.
+
+    Args:
+        moving: of the device whose stamps are to be mended.
+        fixed: of the device whose stamps are right.
+        largest: s, offsets up to which are tried.
+
+    Raises:
+        CalibrationError: they overlap too little, do not move alike, or move so regularly that
+            several offsets come into question.
+    """
+    if min(len(moving), len(fixed)) < _FEWEST_SAMPLES:
+        raise CalibrationError(
+            f"a time offset needs at least {_FEWEST_SAMPLES} samples of each signal, not "
+            f"{len(moving)} and {len(fixed)}"
+        )
+    # The denser signal is interpolated at the other's times.
+    moving_is_dense = _interval(moving) <= _interval(fixed)
+    dense, sparse = (moving, fixed) if moving_is_dense else (fixed, moving)
+    times, values = _compared(dense, sparse, largest)
+    match = _Match(CubicSpline(dense.times, dense.values), times, values)
+    step = min(_LARGEST_STEP, 0.5 * _interval(dense))
+    tried = np.linspace(-largest, largest, 2 * round(largest / step) + 1)
+    correlations = np.array([match.correlation(shift) for shift in tried])
+    best = int(np.abs(correlations).argmax())
+    _check(tried, correlations, best, largest)
+    shift = match.refined(tried[best], step)
+    correlation = match.correlation(shift)
+    without = [match.without(block).refined(shift, 10 * step) for block in _blocks(len(times))]
+    spread = np.asarray(without) - np.mean(without)
+    # The dense signal at t + shift is the sparse one at t.
+    sign = -1.0 if moving_is_dense else 1.0
+    return TimeOffset(
+        sign * shift,
+        float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum())),
+        correlation,
+        float(np.sqrt(max(1.0 - correlation**2, 0.0))),
+        float(np.ptp(times)),
+        sign * tried,
+        correlations,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """A curve and the samples that it is compared with."""
+
+    curve: CubicSpline
+    times: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    def correlation(self, shift: float) -> float:
+        """Of the samples with the curve so much later."""
+        return float(np.corrcoef(self.curve(self.times + shift), self.values)[0, 1])
+
+    def refined(self, shift: float, step: float) -> float:
+        """The best shift within a step of one."""
+        found = minimize_scalar(
+            lambda x: 1.0 - self.correlation(x) ** 2,
+            bounds=(shift - step, shift + step),
+            method="bounded",
+            options={"xatol": 1e-7},
+        )
+        return float(found.x)
+
+    def without(self, block: NDArray[np.intp]) -> _Match:
+        """Less some of the samples."""
+        return _Match(self.curve, np.delete(self.times, block), np.delete(self.values, block))
+
+
+def _interval(signal: PositionSignal) -> float:
+    return float(np.median(np.diff(signal.times)))
+
+
+def _blocks(count: int) -> list[NDArray[np.intp]]:
+    return np.array_split(np.arange(count), _BLOCKS)
+
+
+def _compared(
+    dense: PositionSignal, sparse: PositionSignal, largest: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The sparse signal's samples that the dense one covers at every offset."""
+    inside = (sparse.times - largest >= dense.times[0]) & (
+        sparse.times + largest <= dense.times[-1]
+    )
+    times, values = sparse.times[inside], sparse.values[inside]
+    if len(times) < _FEWEST_SAMPLES or np.ptp(times) < _SHORTEST:
+        raise CalibrationError(
+            f"the two recordings overlap too little ({len(times)} samples that stay inside at "
+            f"offsets up to {largest:g} s): record both at once for 20 seconds"
+        )
+    if np.ptp(values) == 0.0 or np.ptp(dense.values) == 0.0:
+        raise CalibrationError("a signal does not move at all: move the probe while recording")
+    return times, values
+
+
+def _check(
+    tried: NDArray[np.float64], correlations: NDArray[np.float64], best: int, largest: float
+) -> None:
+    highest = abs(float(correlations[best]))
+    if highest < _LEAST_CORRELATION:
+        raise CalibrationError(
+            f"the two signals do not move alike (correlation {highest:.2f} at best): record one "
+            f"motion with both, or try larger offsets than {largest:g} s"
+        )
+    if best in (0, len(tried) - 1):
+        raise CalibrationError(
+            f"the signals agree best at the largest tried offset, {largest:g} s: try larger ones"
+        )
+    heights = np.abs(correlations)
+    peaks = 1 + np.flatnonzero((heights[1:-1] >= heights[:-2]) & (heights[1:-1] >= heights[2:]))
+    others = peaks[peaks != best]
+    if not len(others):
+        return
+    other = int(others[heights[others].argmax()])
+    if 1.0 - heights[other] ** 2 < _CLEAREST * (1.0 - highest**2):
+        raise CalibrationError(
+            f"the motion is so regular that offsets of {tried[best]:.2f} s and "
+            f"{tried[other]:.2f} s fit alike: record again with pauses and uneven strokes, or try "
+            f"smaller offsets"
+        )
