@@ -19,6 +19,7 @@ TOPICS = {
     "/skin/nodes": "sensor_msgs/msg/PointCloud2",
     "/skin/marker": "visualization_msgs/msg/Marker",
     "/ultrasound/image": "sensor_msgs/msg/Image",
+    "/ultrasound/image_to_probe": "std_msgs/msg/Float64MultiArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage",
 }
