@@ -45,7 +45,7 @@ def box(counts=(7, 5, 6)):
 
 def times_written(slicer, nodes, plane):
     """(rows, columns) how many polygons hold each pixel, outlines left aside."""
-    count, _, _ = slicer._cut(nodes, plane)
+    count, *_ = slicer._cut(nodes, plane)
     cuts = slicer._cuts
     found = np.empty((plane.rows, plane.columns), dtype=np.int64)
     used = np.empty(plane.rows, dtype=np.int32)

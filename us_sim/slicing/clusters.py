@@ -54,9 +54,15 @@ class Clusters:
         cluster = np.repeat(np.arange(len(tetrahedra), dtype=np.int64) // _SIZE, 4)
         count = max(len(rest_nodes), 1)
         once = np.unique(cluster * count + self.tetrahedra.ravel())
-        self._members = (once % count).astype(np.int32)
         clusters = -(-len(tetrahedra) // _SIZE)
-        self._starts = np.searchsorted(once // count, np.arange(clusters + 1)).astype(np.int64)
+        starts = np.searchsorted(once // count, np.arange(clusters + 1))
+        # Repeating its first node, each cluster has a multiple of four: they are looked at so.
+        missing = -np.diff(starts) % 4
+        once = np.insert(
+            once, np.repeat(starts[:-1], missing), np.repeat(once[starts[:-1]], missing)
+        )
+        self._members = (once % count).astype(np.int32).reshape(-1, 4)
+        self._starts = (starts + np.append(0, np.cumsum(missing))) // 4
         self._sides = np.empty(len(rest_nodes), dtype=np.uint8)
         self._near = np.empty(len(tetrahedra), dtype=np.int32)
 
@@ -106,19 +112,23 @@ def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, ne
 
     Args:
         nodes: (N, 3) m. to_pixel: (3, 4) from m to column, row and height above the plane.
-        starts (clusters + 1,), members: the nodes of each cluster.
+        starts (clusters + 1,), members (…, 4): the nodes of each cluster.
         sides: (N,) uint8 to work in: a bit for each side of the image that a node is beyond.
     """
     if not _find_sides(nodes, to_pixel, columns - 1 + _MARGIN, rows - 1 + _MARGIN, sides):
         return -1
     count = np.uint64(0)
-    for c in range(len(starts) - 1):
-        beyond = np.uint8(63)
-        for k in range(starts[c], starts[c + 1]):
-            beyond &= sides[np.uint32(members[np.uint64(k)])]
-        if beyond:
+    for cluster in range(len(starts) - 1):
+        a = b = c = d = np.uint8(63)
+        for k in range(starts[cluster], starts[cluster + 1]):
+            i = np.uint64(k)
+            a &= sides[np.uint32(members[i, 0])]
+            b &= sides[np.uint32(members[i, 1])]
+            c &= sides[np.uint32(members[i, 2])]
+            d &= sides[np.uint32(members[i, 3])]
+        if a & b & c & d:
             continue
-        for k in range(c * _SIZE, min((c + 1) * _SIZE, len(tetrahedra))):
+        for k in range(cluster * _SIZE, min((cluster + 1) * _SIZE, len(tetrahedra))):
             e = np.uint64(k)
             near[count] = e
             both = sides[np.uint32(tetrahedra[e, 0])] & sides[np.uint32(tetrahedra[e, 1])]
@@ -127,7 +137,7 @@ def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, ne
     return np.int64(count)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _find_sides(nodes, to_pixel, right, bottom, sides):
     """Which sides of the image each node is beyond; returns whether all nodes are finite."""
     cx, cy, cz, c0 = to_pixel[0, 0], to_pixel[0, 1], to_pixel[0, 2], to_pixel[0, 3]

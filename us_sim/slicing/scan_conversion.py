@@ -81,7 +81,7 @@ class ScanConversion(Slicer):
         self._full = np.empty((0, 2, 2), dtype=np.int32)
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        count, pieces, outline = self._cut(nodes, plane)
+        count, pieces, outline, is_covered = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
 
@@ -89,7 +89,7 @@ class ScanConversion(Slicer):
             spans = self._convert(count, pieces, runs, first_row, end_row)
             sample_spans(
                 self._voxels, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
-                self._used, runs, *outline, first_row, end_row, image,
+                self._used, runs, is_covered, *outline, first_row, end_row, image,
             )  # fmt: skip
 
         share_rows(self._threads, plane.rows, draw)
@@ -119,17 +119,19 @@ class ScanConversion(Slicer):
         self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
-        count, pieces, outline = self._cut(nodes, plane)
+        count, pieces, outline, _ = self._cut(nodes, plane)
         runs = self._shown(plane)
         spans = self._convert(count, pieces, runs, 0, plane.rows)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
         return elements, self._cuts.maps[: count + 1]
 
-    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline]:
-        """Fills the cuts: how many there are and how many outlines, and the mesh at rest.
+    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline, bool]:
+        """Fills the cuts, followed by the rigid map.
 
-        The map that follows those of the cuts is the rigid one.
+        Returns:
+            how many there are, and how many outlines; the mesh at rest; and whether the cuts are
+            known to cover the image, so that the mesh at rest does not matter.
         """
         moved = self._as_kernels_take(nodes)
         near = self._clusters.near(moved, plane)
@@ -141,7 +143,8 @@ class ScanConversion(Slicer):
             self._rest_index, self._within, self._cuts,
         )  # fmt: skip
         self._cuts.maps[count] = pixel_to_index(self._volume, plane)
-        return count, pieces, NO_OUTLINE if is_covered else self._surface.cut(plane)
+        outline = NO_OUTLINE if is_covered else self._surface.cut(plane)
+        return count, pieces, outline, is_covered
 
     def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
         """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""

@@ -42,7 +42,7 @@ _COLUMN = (1 << END_SHIFT) - 1
 @njit(cache=True, nogil=True, error_model="numpy")
 def sample_spans(
     voxels, shape, maps, inside, rigid, spans, used, runs,
-    outlines, points, turns, outline_number, first_row, end_row, image,
+    is_covered, outlines, points, turns, outline_number, first_row, end_row, image,
 ):  # fmt: skip
     """Trilinear grey values of rows ``first_row`` to ``end_row - 1`` of an image.
 
@@ -51,7 +51,8 @@ def sample_spans(
         maps, inside: as `cut_polygons.Cuts`; the map with the number ``rigid`` is that of pixels
             outside the mesh.
         spans, used, runs: as for `spans.convert_cuts`.
-        outlines … outline_number: as `rest_outline.Outline`.
+        is_covered: whether the spans are known to leave no pixel out; then there need be no
+            outline. outlines … outline_number: as `rest_outline.Outline`.
         image: (rows, columns) uint8, filled here.
     """
     columns = image.shape[1]
@@ -65,7 +66,10 @@ def sample_spans(
     winding = np.empty(columns + 1, dtype=np.int32)
     covered = np.empty(columns, dtype=np.bool_)
     for row in range(first_row, end_row):
-        x[:columns] = _OPEN
+        # Some pixels may be negative: open, or nowhere.
+        doubtful = not is_covered
+        if doubtful:
+            x[:columns] = _OPEN
         for k in range(used[row]):
             span = spans[row, k]
             q = np.uint64(span >> CUT_SHIFT)
@@ -75,19 +79,21 @@ def sample_spans(
                 _write_span(maps[q], row, first, end, x, y, z)
             else:
                 _write_clipped(maps[q], shape, row, first, end, x, y, z)
+                doubtful = True
         line = image[row]
-        line[:] = 0
+        if runs[row, 0, 1] - runs[row, 0, 0] < columns:
+            line[:] = 0
         for k in range(2):
             first = np.int64(runs[row, k, 0])
             end = np.int64(runs[row, k, 1])
             if first >= end:
                 continue
-            gaps = _least(x[first:end])
-            if gaps < 0:
+            negative = doubtful and _least(x[first:end]) < 0
+            if negative and not is_covered:
                 mark_covered(outlines, points, turns, outline_number, row, winding, covered)
                 _write_rigid(maps[rigid], shape, row, first, end, covered, x, y, z)
             _sample(voxels, shape, x[first:end], y[first:end], z[first:end], room, line[first:end])
-            if gaps < 0:
+            if negative:
                 for i in range(first, end):
                     if x[i] < 0:
                         line[i] = 0
