@@ -36,6 +36,7 @@ from us_sim.tissue.averaged_pressure import averaged_pressure
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.compliant_contact import CompliantContact
 from us_sim.tissue.contact import wrench_on_probe
+from us_sim.tissue.contact_stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.friction import FrictionalContact
 from us_sim.tissue.model import TissueModel
@@ -102,6 +103,23 @@ class Fem(TissueSolver):
     def state(self) -> TissueState:
         """Where the tissue is; a quasi-static solver has no velocity."""
         return TissueState(self._displacement.copy(), np.zeros_like(self._displacement))
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """Exact without friction; with it, how much a node may be dragged is not known."""
+        pushed = np.flatnonzero(self._contact.forces.any(axis=1))
+        if self._pose is None or len(pushed) == 0:
+            return np.zeros((6, 6))
+        if isinstance(self._contact, FrictionalContact):
+            return None
+        touched = self._reached[pushed]
+        return contact_stiffness(
+            self.model.collider,
+            self._pose,
+            self.model.mesh.nodes[touched] + self._displacement[touched],
+            self._contact.forces[pushed],
+            compliance_between(self._compliance.matrix, pushed),
+            self.model.contact_spacing,
+        )
 
     def _restore(self, state: TissueState) -> None:
         self._displacement = state.displacement.copy()

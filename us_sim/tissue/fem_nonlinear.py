@@ -42,6 +42,7 @@ from us_sim.tissue.carried_correction import CarriedCorrection
 from us_sim.tissue.compliance import surface_compliance
 from us_sim.tissue.contact import GAP_TOLERANCE, push_out, wrench_on_probe
 from us_sim.tissue.contact_prediction import predict_forces
+from us_sim.tissue.contact_stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity import require_held
 from us_sim.tissue.model import TissueModel
@@ -146,6 +147,21 @@ class FemNonlinear(TissueSolver):
         """Where the tissue is; a quasi-static solver has no velocity."""
         displacement = self._newton.displacement.T.copy()
         return TissueState(displacement, np.zeros_like(displacement))
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """As if the tissue yielded to a little more force as it does at rest."""
+        contact = self._newton.contact
+        pushed = np.flatnonzero(contact.push > 0.0)
+        if self._pose is None or len(pushed) == 0:
+            return np.zeros((6, 6))
+        return contact_stiffness(
+            self.model.collider,
+            self._pose,
+            self._newton.surface[pushed],
+            contact.push[pushed, None] * contact.normal[pushed],
+            compliance_between(self._compliance.matrix, pushed),
+            self.model.contact_spacing,
+        )
 
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()

@@ -29,6 +29,7 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.pose import Pose
@@ -174,6 +175,15 @@ class TissueSolver(ABC):
     @abstractmethod
     def state(self) -> TissueState:
         """A copy of where the tissue is."""
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """How the wrench of the last frame changes with the probe's pose.
+
+        Returns:
+            (6, 6) as `us_sim.tissue.contact_stiffness` says, zero without contact; None where this
+            solver does not know it.
+        """
+        return None
 
     @abstractmethod
     def _advance(self, pose: Pose | None) -> Deformation:

@@ -87,6 +87,10 @@ class SwitchableTissue:
         """Name of the solver beside it, '' when there is none."""
         return self._beside.name if self._beside else ""
 
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """Of the solver in use, see `TissueSolver.contact_stiffness`."""
+        return self._solver.contact_stiffness()
+
     def prepare(self, name: str) -> TissueSolver:
         """Make and compile a solver, so that a later switch to it takes no time.
 
