@@ -60,14 +60,14 @@ class FilterSettings:
     )
     acceleration: float = given(
         Quantity("number", 1e-6, 1e4),
-        default=1.0,
-        description="m/s² over a second, Kalman: root of the spectral density of the probe's "
-        "white acceleration",
+        default=0.1,
+        description="m/s per root second, Kalman: how much the speed changes within a second, one "
+        "standard deviation; within a time t by the root of t as much",
     )
     angular_acceleration: float = given(
         Quantity("number", 1e-6, 1e5),
-        default=10.0,
-        description="rad/s² over a second, Kalman: the same of its rotation",
+        default=1.0,
+        description="rad/s per root second, Kalman: the same of the rotation",
     )
     position_deviation: float = given(
         Quantity("length", 1e-9, 0.1),

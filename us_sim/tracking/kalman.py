@@ -13,7 +13,8 @@
 
 from __future__ import annotations
 
-from math import atan2, cos, pi, sin
+from cmath import exp, phase
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +138,9 @@ class ConstantVelocityKalman(PoseFilter):
     def _correct(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
         assert self._stamp is not None
         place, covariance = self._prediction(measurement.stamp)
-        gain = np.linalg.solve(covariance[_POSE, _POSE] + noise, covariance[_POSE]).T
+        gain: NDArray[np.float64] = np.linalg.solve(
+            covariance[_POSE, _POSE] + noise, covariance[_POSE]
+        ).T.astype(np.float64, copy=False)
         correction = gain @ _difference(place, measurement.pose)
         self._place = (
             place[0] + correction[:3],
@@ -178,13 +181,9 @@ class ConstantVelocityKalman(PoseFilter):
         step = self._step
         a = float(np.trace(self._gain[0:3, 0:3])) / 3.0
         b = step * float(np.trace(self._gain[6:9, 0:3])) / 3.0
-        angle = 2.0 * pi * frequency * step
-        above = atan2((a - b) * sin(angle), a + (b - a) * cos(angle))
-        below = atan2(
-            (2.0 - a - b) * sin(angle) - (1.0 - a) * sin(2.0 * angle),
-            1.0 - (2.0 - a - b) * cos(angle) + (1.0 - a) * cos(2.0 * angle),
-        )
-        return (above + below) / (2.0 * pi * frequency)
+        late = exp(-2j * pi * frequency * step)  # 1 / z
+        response = (a + (b - a) * late) / (1.0 - (2.0 - a - b) * late + (1.0 - a) * late**2)
+        return -phase(response) / (2.0 * pi * frequency)
 
 
 def _difference(expected: _Place, measured: Pose) -> NDArray[np.float64]:

@@ -42,7 +42,8 @@ class OutlierGate:
     limits on speed, to which the settings' jumps are added: they are for a pose's noise.
 
     Refused measurements in a row of which each is within the speed limits of the one before are
-    the new place after so many of them: the probe did move fast, or was registered anew.
+    the new place after so many of them: the probe did move fast, or was registered anew. As long
+    as fewer were believed, one more than these is enough, since the first of all may be wrong.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -55,6 +56,7 @@ class OutlierGate:
         self._believed: Measurement | None = None
         self._refused: Measurement | None = None  # the newest of a row
         self._row = 0
+        self._support = 0  # how many have been believed at this place
         self.reason = ""
 
     def judge(
@@ -74,9 +76,10 @@ class OutlierGate:
         if self.reason:
             agrees = self._refused is not None and not self._too_fast(self._refused, measurement)
             self._refused, self._row = measurement, self._row + 1 if agrees else 1
-            if self._row < self._settings.accept_after:
+            if self._row < min(self._settings.accept_after, self._support + 1):
                 return Verdict.REFUSED
-            verdict = Verdict.NEW_PLACE
+            verdict, self._support = Verdict.NEW_PLACE, self._row - 1
+        self._support += 1
         self._believed, self._refused, self._row = measurement, None, 0
         return verdict
 

@@ -1,0 +1,152 @@
+"""What the gate refuses: by known speeds, by chi-square's own shares, and never for good."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.pose import Pose
+from us_sim.tracking.filter_settings import FilterSettings, GateSettings
+from us_sim.tracking.kalman import ConstantVelocityKalman
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.outlier_gate import OutlierGate, Verdict
+from us_sim.tracking.se3 import rotation_exp
+
+BELIEVED, REFUSED, NEW_PLACE = Verdict.BELIEVED, Verdict.REFUSED, Verdict.NEW_PLACE
+MS = 1_000_000
+LIMITS = GateSettings(
+    maximum_speed=1.0, maximum_angular_speed=10.0, jump=2e-3, rotation_jump=0.02, accept_after=4
+)
+
+
+def seen(ms, x, turn=0.0, covariance=None):
+    pose = Pose([x, 0.0, 0.0], rotation_exp(np.array([0.0, turn, 0.0])))
+    return Measurement(round(ms * MS), pose, covariance)
+
+
+def verdicts(gate, *measurements):
+    return [gate.judge(measurement) for measurement in measurements]
+
+
+@pytest.mark.parametrize(
+    ("ms", "x", "turn", "believed"),
+    [
+        (10, 0.0119, 0.0, True),  # 1 m/s · 10 ms + 2 mm
+        (10, 0.0121, 0.0, False),
+        (1, 0.0029, 0.0, True),
+        (1, 0.0031, 0.0, False),
+        (500, 0.501, 0.0, True),
+        (10, 0.0, 0.119, True),  # 10 rad/s · 10 ms + 0.02 rad
+        (10, 0.0, 0.121, False),
+        (10, 0.0, -0.121, False),
+        (1000, 0.0, np.pi, True),
+    ],
+)
+def test_limits_on_speed(ms, x, turn, believed):
+    gate = OutlierGate(LIMITS)
+    assert gate.judge(seen(0, 0.0)) is BELIEVED
+    assert gate.judge(seen(ms, x, turn)) is (BELIEVED if believed else REFUSED)
+    assert bool(gate.reason) is not believed
+
+
+def test_the_reason_is_a_sentence_with_numbers():
+    gate = OutlierGate(LIMITS)
+    verdicts(gate, seen(0, 0.0), seen(10, 0.25))
+    assert gate.reason == ("the pose is 250.0 mm from the one 10.0 ms before: faster than 1 m/s")
+    gate.judge(seen(10, 0.0, 0.5))
+    assert gate.reason == (
+        "the pose is turned 28.6° from the one 10.0 ms before: faster than 10 rad/s"
+    )
+
+
+def settled():
+    gate = OutlierGate(LIMITS)
+    assert verdicts(gate, *(seen(10 * k, 0.0) for k in range(-5, 1))) == [BELIEVED] * 6
+    return gate
+
+
+def test_refused_poses_that_agree_are_the_new_place():
+    gate = settled()
+    moved = verdicts(gate, *(seen(10 * k, 0.5 + 0.001 * k) for k in range(1, 7)))
+    assert moved == [REFUSED, REFUSED, REFUSED, NEW_PLACE, BELIEVED, BELIEVED]
+    assert gate.judge(seen(70, 0.0)) is REFUSED
+
+
+def test_refused_poses_that_do_not_agree_are_no_place():
+    gate = settled()
+    rng = np.random.default_rng(2)
+    scattered = [seen(10 * k, x) for k, x in enumerate(rng.permutation(np.arange(40)) + 1.0, 1)]
+    assert verdicts(gate, *scattered) == [REFUSED] * 40
+
+
+def test_a_believed_pose_ends_a_row():
+    gate = settled()
+    there = [seen(10 * k, 0.0 if k % 4 == 0 else 0.5) for k in range(1, 41)]
+    assert verdicts(gate, *there) == ([REFUSED] * 3 + [BELIEVED]) * 10
+
+
+def test_a_first_pose_that_is_wrong_is_outvoted_by_two():
+    gate = OutlierGate(LIMITS)
+    answers = verdicts(gate, seen(0, -2.0), *(seen(10 * k, 0.0) for k in range(1, 5)))
+    assert answers == [BELIEVED, REFUSED, NEW_PLACE, BELIEVED, BELIEVED]
+
+
+def test_after_a_reset_any_pose_is_believed():
+    gate = settled()
+    gate.reset()
+    assert gate.judge(seen(10, 5.0)) is BELIEVED
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 200), st.floats(-1, 1)), max_size=30), st.floats(-5, 5))
+def test_no_past_locks_a_steady_probe_out(past, place):
+    gate, time = OutlierGate(LIMITS), 0
+    for step, x in past:
+        time += step
+        gate.judge(seen(time, x))
+    answers = verdicts(gate, *(seen(time + 10 * k, place) for k in range(1, 6)))
+    assert answers[-1] is BELIEVED
+
+
+COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 1e-6, 1e-6, 4e-6])
+COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-8
+
+
+def test_with_covariances_right_poses_are_refused_as_rarely_as_was_asked():
+    """Two looks at a probe at rest: of d² with six degrees of freedom a share is beyond."""
+    rng = np.random.default_rng(7)
+    gate = OutlierGate(GateSettings(confidence=0.95))
+    refused, pairs = 0, 4000
+    root = np.linalg.cholesky(COVARIANCE)
+    for _ in range(pairs):
+        gate.reset()
+        for k in range(2):
+            noise = root @ rng.normal(size=6)
+            pose = Pose(noise[:3], rotation_exp(noise[3:]))
+            verdict = gate.judge(Measurement(1 + 1000 * k, pose, COVARIANCE))
+        refused += verdict is REFUSED
+    assert abs(refused - 0.05 * pairs) < 3.3 * np.sqrt(0.05 * 0.95 * pairs)  # 99.9 per cent
+
+
+def test_with_covariances_the_fastest_motion_is_at_the_limit():
+    sure = np.diag([1e-14] * 6)
+    for way, verdict in ((0.0999, BELIEVED), (0.1001, REFUSED)):
+        gate = OutlierGate(LIMITS)
+        gate.judge(seen(0, 0.0, covariance=sure))
+        assert gate.judge(seen(100, way, covariance=sure)) is verdict
+    assert gate.reason.endswith("Mahalanobis distance 5.3, the limit is 5.3")  # root of 27.86
+
+
+def test_a_filters_expectation_is_narrower_than_the_limits():
+    """1 cm in 33 ms is slower than the limit, but not where the filter expects the probe."""
+    covariance = np.diag([1e-8] * 3 + [1e-6] * 3)
+    kalman, gate = ConstantVelocityKalman(FilterSettings("kalman")), OutlierGate(LIMITS)
+    for k in range(30):
+        resting = seen(33 * k, 0.0, covariance=covariance)
+        assert gate.judge(resting, kalman.expected(resting)) is BELIEVED
+        kalman.update(resting)
+    away = seen(33 * 30, 0.01, covariance=covariance)
+    assert gate.judge(away, kalman.expected(away)) is REFUSED
+    assert OutlierGate(LIMITS).judge(away) is BELIEVED
+    without = seen(33 * 31, 0.01)
+    assert gate.judge(without, kalman.expected(without)) is BELIEVED  # by the limits
