@@ -11,12 +11,11 @@ us_sim.errors.TrackingError: filter.method: 'median' is not one of none, one_eur
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
 from us_sim.errors import TrackingError
-from us_sim.quantity import Quantity, given
+from us_sim.quantity import Quantity, given, require_given
 
 __all__ = ["FILTER_METHODS", "FilterSettings", "GateSettings"]
 
@@ -81,7 +80,7 @@ class FilterSettings:
     )
 
     def __post_init__(self) -> None:
-        _check("filter", self)
+        require_given(self, "filter", TrackingError)
 
 
 @dataclass(frozen=True)
@@ -120,24 +119,4 @@ class GateSettings:
     )
 
     def __post_init__(self) -> None:
-        _check("gate", self)
-
-
-def _check(section: str, settings: FilterSettings | GateSettings) -> None:
-    """Replace each value by what its field says it is; see the classes for what is raised."""
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        quantity, choices = field.metadata["quantity"], field.metadata["choices"]
-        try:
-            if choices:
-                if value not in choices:
-                    raise ValueError(f"{value!r} is not one of {', '.join(choices)}")
-                continue
-            number = quantity.parse(value)
-            if field.type == "int":
-                if number != int(number):
-                    raise ValueError(f"{value!r} is not a whole number")
-                number = int(number)
-        except ValueError as error:
-            raise TrackingError(f"{section}.{field.name}: {error}") from error
-        object.__setattr__(settings, field.name, number)
+        require_given(self, "gate", TrackingError)
