@@ -28,7 +28,7 @@ from us_sim.tracking.plane_pose import plane_poses
 
 __all__ = ["BodyPose", "body_poses", "rotation_angle"]
 
-CORNER_DEVIATION = 0.25
+CORNER_DEVIATION = 0.1
 """Pixels, of a corner's coordinates in a sharp image with little noise."""
 
 _FLAT = 1e-3  # thickness of a body, of its extent, up to which one homography shows all of it
@@ -172,7 +172,7 @@ def _refined(
             return None
         normal, gradient = _normal_equations(arms, slopes, residuals, deviation)
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-        turn = _rotation(step[3:])
+        turn = np.asarray(cv2.Rodrigues(step[3:])[0])
         new_rotation, new_position = turn @ rotation, position + step[:3]
         new_arms = points @ new_rotation.T
         new_seen, new_slopes = camera.linearise(new_arms + new_position)
@@ -221,8 +221,3 @@ def _normal_equations(
     jacobian *= weights[:, None, None]
     flat = jacobian.reshape(-1, 6)
     return flat.T @ flat, flat.T @ (residuals * weights[:, None]).ravel()
-
-
-def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of a rotation vector (3,) rad (Rodrigues)."""
-    return np.asarray(cv2.Rodrigues(vector)[0])

@@ -74,7 +74,7 @@ class CameraSettings:
     )
     corner_deviation: float = given(
         Quantity("number", 0.01, 10.0),
-        default=0.25,
+        default=0.1,
         description="pixels, standard deviation of a corner, the least that the covariance of "
         "the pose is made with",
     )

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.tracking.marker_edges import refined_corners
 from us_sim.tracking.markers import dictionary
 from us_sim.tracking.rigid_body import RigidBody
 
@@ -68,6 +69,7 @@ class FiducialDetector:
         self.body = body
         parameters = cv2.aruco.DetectorParameters()
         self._detector = cv2.aruco.ArucoDetector(dictionary(body.dictionary), parameters)
+        self._cells = dictionary(body.dictionary).markerSize + 2
         self._chessboard_detector = None
         if body.chessboard is not None:
             self._chessboard_detector = cv2.aruco.CharucoDetector(body.chessboard.board)
@@ -99,8 +101,8 @@ class FiducialDetector:
         refused = tuple(doubled.tolist())
         if self._chessboard_detector is not None:
             return self._with_chessboard(image, numbers, places, refused)
-        refined = np.array([_refine(image, each) for each in places]).reshape(-1, 4, 2)
-        return Detection(numbers, refined.astype(np.float64), doubled=refused)
+        refined = np.array([_refine(image, each, self._cells) for each in places])
+        return Detection(numbers, refined.reshape(-1, 4, 2), doubled=refused)
 
     def _with_chessboard(
         self,
@@ -127,10 +129,14 @@ class FiducialDetector:
         )
 
 
-def _refine(image: NDArray[np.uint8], corners: NDArray[np.float32]) -> NDArray[np.float32]:
+def _refine(
+    image: NDArray[np.uint8], corners: NDArray[np.float32], cells: int
+) -> NDArray[np.float64]:
     """Corners (4, 2) of one marker where its edges really meet."""
     edge = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
     half = int(np.clip(edge / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    refined = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
-    return np.asarray(refined, dtype=np.float32)
+    near = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
+    near = np.asarray(near, dtype=np.float64)
+    refined = refined_corners(image, near, cells)
+    return near if refined is None else refined

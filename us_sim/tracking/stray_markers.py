@@ -60,7 +60,7 @@ def _numbers_in(image: NDArray[np.uint8], name: str) -> list[int]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 0.0
     ids = cv2.aruco.ArucoDetector(dictionary(name), parameters).detectMarkers(image)[1]
-    return [] if ids is None else sorted(set(np.asarray(ids).ravel().tolist()))
+    return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
 
 
 def counted(count: int) -> str:
