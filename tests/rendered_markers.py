@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from us_sim.pose import Pose
 from us_sim.tracking.markers import dictionary
 
 
@@ -74,8 +75,6 @@ def _draw(picture, camera, body, row, pose, black, white, samples):
 
 def random_views(count, distance, angles, seed):
     """Poses that show a body's front at angles (rad) up to the largest, somewhere in the image."""
-    from us_sim.pose import Pose
-
     random = np.random.default_rng(seed)
     for _ in range(count):
         angle = random.uniform(*angles)
@@ -91,8 +90,6 @@ def random_views(count, distance, angles, seed):
 
 def _towards(place):
     """The rotation that takes the optical axis to the line of sight of a place."""
-    from us_sim.pose import Pose
-
     direction = place / np.linalg.norm(place)
     axis = np.cross([0.0, 0.0, 1.0], direction)
     return Pose(np.zeros(3), [*axis, 1.0 + direction[2]])

@@ -1,0 +1,249 @@
+"""Every source that a scene may name moves the probe, and bad input of it is said and survived."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from bench import pose_at
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rendered_markers import render
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
+from tf2_msgs.msg import TFMessage
+
+from us_sim.errors import SceneError
+from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.pose import Pose
+from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.rigid_body import RigidBody
+
+BARE = """
+name: bare
+volume: {phantom: upper_arm, voxel_size: 1 mm}
+probe: {aperture: 40 mm, depth: 40 mm, image: [60, 50]}
+tracker: """
+
+
+@pytest.fixture
+def tracker(bench, tmp_path):
+    """Makes a tracker node of a scene with that `tracker:`; with it what collects its poses."""
+
+    def make(section, **parameters):
+        file = tmp_path / "bare.yaml"
+        file.write_text(BARE + section)
+        node = bench.make(ProbeTracker, scene=str(file), **{"lockstep": True, **parameters})
+        return node, bench.collect(PoseStamped, "probe/pose")
+
+    return make
+
+
+def place(message):
+    p = message.pose.position
+    return [p.x, p.y, p.z]
+
+
+def test_a_scene_registers_the_device_and_calibrates_the_probe(bench, tracker):
+    # The tracker stands 0.5 m above the patient and looks down; the face is 0.1 m from the body.
+    _, poses = tracker("""
+  frame: ndi
+  registration: {position: [0, 0, -0.5]}
+  calibration: {position: [0, 0, 0.1]}
+  time_offset: -0.5 s""")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    publisher.publish(pose_at(0.41, 7, frame="ndi"))
+    bench.spin_until(lambda: poses)
+    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.01], atol=1e-12)
+    assert poses[0].header.frame_id == "patient"
+    assert (poses[0].header.stamp.sec, poses[0].header.stamp.nanosec) == (6, 500_000_000)
+
+
+def test_one_body_of_several_in_a_message(bench, tracker):
+    node, poses = tracker("{source: pose_array, entry: 1}")
+    publisher = bench.publisher(PoseArray, "tracker/poses")
+    for second, bodies in ((1, 1), (2, 3)):
+        message = PoseArray()
+        message.header.frame_id, message.header.stamp = "patient", Time(sec=second)
+        message.poses = [pose_at(0.01 * (i + 1), 0).pose for i in range(bodies)]
+        publisher.publish(message)
+    bench.spin_until(lambda: poses)
+    assert poses[0].header.stamp.sec == 2
+    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.02])
+    assert node.health.problems("entry") == 1
+
+
+def transform(parent, child, z, second):
+    message = TransformStamped()
+    message.header.frame_id, message.header.stamp = parent, Time(sec=second)
+    message.child_frame_id = child
+    message.transform.translation.z = z
+    message.transform.rotation.w = 1.0
+    return TFMessage(transforms=[message])
+
+
+def test_a_frame_of_tf_is_followed_through_the_tree(bench, tracker):
+    node, poses = tracker("{source: tf, frame: world, body: stylus}")
+    moving = bench.publisher(TFMessage, "tf")
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    fixed = bench.peer.create_publisher(TFMessage, "tf_static", latched)
+    moving.publish(transform("tracker", "tool", 0.002, 1))
+    bench.spin_until(lambda: node.health.problems("frame") == 1)
+    fixed.publish(transform("world", "tracker", 0.1, 1))
+    fixed.publish(transform("tool", "stylus", 0.03, 1))
+    bench.spin_until(lambda: node.health.problems("frame") == 1 and len(node._input._parents) == 3)
+    moving.publish(transform("elsewhere", "other", 5.0, 2))
+    moving.publish(transform("tracker", "tool", 0.004, 3))
+    bench.spin_until(lambda: poses)
+    assert poses[0].header.stamp.sec == 3
+    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.134])
+
+
+@pytest.mark.parametrize("body", ["", ", body: probe"])
+def test_tf_needs_the_name_of_a_frame_that_is_not_its_own(tracker, body):
+    with pytest.raises(SceneError, match=r"tracker\.body"):
+        tracker(f"{{source: tf{body}}}")
+
+
+def joy(axes, second, buttons=(0, 0)):
+    message = Joy(axes=[float(a) for a in axes], buttons=list(buttons))
+    message.header.stamp = Time(sec=1, nanosec=int(1e9 * (second - 1)))
+    return message
+
+
+def test_a_mouse_moves_the_probe_and_bad_axes_do_not(bench, tracker):
+    node, poses = tracker(
+        "{source: six_dof_mouse, six_dof_mouse: {home: [0, 0, 0], dead_band: 0,"
+        " speed: [50 mm/s, 50 mm/s, 50 mm/s], workspace_low: [-0.1, -0.1, -0.1]}}"
+    )
+    publisher = bench.publisher(Joy, "spacenav/joy")
+    for axes, second in (
+        ([0, 0, 1, 0, 0, 0], 1.0),
+        ([0, 0, 1, 0, 0, 0], 1.1),
+        ([math.nan] * 6, 1.12),
+        ([0, 0], 1.14),
+        ([0, 0, 0, 0, 0, 0], 1.2),
+    ):
+        publisher.publish(joy(axes, second))
+    bench.spin_until(lambda: len(poses) == 3 and node.health.problems("axes") == 2)
+    assert np.linalg.norm(place(poses[1])) == pytest.approx(0.005, rel=1e-6)
+    twists = bench.publisher(Twist, "spacenav/twist")
+    twists.publish(Twist())  # the same mouse again
+    bench.spin_for(10)
+    assert len(poses) == 3
+
+
+CAMERA = CameraModel(640, 480, [[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1]], [-0.1, 0.02, 0, 0, 0])
+SEEN = Pose([0.02, -0.01, 0.35], [math.sin(math.pi / 2 + 0.2), 0, 0, math.cos(math.pi / 2 + 0.2)])
+
+
+def camera_info(camera=CAMERA):
+    message = CameraInfo(width=camera.width, height=camera.height, distortion_model="plumb_bob")
+    message.k = [float(v) for v in camera.matrix.ravel()]
+    message.d = [float(v) for v in camera.distortion]
+    return message
+
+
+def image(pixels, encoding, second):
+    message = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    message.header.stamp = Time(sec=second)
+    message.data = pixels.tobytes()
+    message.step = len(message.data) // pixels.shape[0]
+    return message
+
+
+@pytest.fixture(scope="module")
+def view():
+    return render(CAMERA, RigidBody.single("6X6_250", 3, 0.04), SEEN)
+
+
+SECTION = "{source: camera, camera: {dictionary: 6X6_250, marker: 3, size: 40 mm}}"
+
+
+def bayer(pixels):
+    return pixels  # of a grey scene every colour's pixels are grey
+
+
+@pytest.mark.parametrize(
+    ("encoding", "encode"),
+    [
+        ("mono8", lambda grey: grey),
+        ("mono16", lambda grey: grey.astype(np.uint16) << 8),
+        ("bgr8", lambda grey: cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)),
+        ("rgba8", lambda grey: cv2.cvtColor(grey, cv2.COLOR_GRAY2RGBA)),
+        ("yuv422_yuy2", lambda grey: np.stack([grey, np.full_like(grey, 128)], axis=-1)),
+        ("yuv422", lambda grey: np.stack([np.full_like(grey, 128), grey], axis=-1)),
+        ("bayer_rggb8", bayer),
+        ("bayer_grbg8", bayer),
+    ],
+)
+def test_a_marker_is_measured_in_every_common_encoding(bench, tracker, view, encoding, encode):
+    _, poses = tracker(SECTION)
+    infos = bench.publisher(CameraInfo, "camera/camera_info")
+    images = bench.publisher(Image, "camera/image_raw")
+    infos.publish(camera_info())
+    bench.spin_for(5)
+    images.publish(image(encode(view), encoding, 5))
+    bench.spin_until(lambda: poses)
+    assert poses[0].header.stamp.sec == 5
+    np.testing.assert_allclose(place(poses[0]), SEEN.position, atol=5e-4)
+
+
+def test_a_compressed_image_will_do(bench, tracker, view):
+    _, poses = tracker(SECTION)
+    infos = bench.publisher(CameraInfo, "camera/camera_info")
+    images = bench.publisher(CompressedImage, "camera/image_raw/compressed")
+    infos.publish(camera_info())
+    bench.spin_for(5)
+    message = CompressedImage(format="jpeg")
+    message.header.stamp = Time(sec=6)
+    message.data = cv2.imencode(".jpg", view)[1].tobytes()
+    images.publish(message)
+    bench.spin_until(lambda: poses)
+    np.testing.assert_allclose(place(poses[0]), SEEN.position, atol=1e-3)
+
+
+def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):
+    node, poses = tracker(SECTION)
+    images = bench.publisher(Image, "camera/image_raw")
+    infos = bench.publisher(CameraInfo, "camera/camera_info")
+
+    def wrong(publisher, message, kind, count):
+        publisher.publish(message)
+        bench.spin_until(lambda: node.health.problems(kind) == count)
+
+    wrong(images, image(view, "mono8", 1), "camera", 1)  # nobody described the camera
+    wrong(infos, CameraInfo(width=640, height=480), "camera", 2)  # not calibrated
+    infos.publish(camera_info())
+    bench.spin_for(5)
+    wrong(images, image(view, "jpeg2000", 2), "image", 1)
+    short = image(view, "mono8", 3)
+    short.data = short.data[:1000]
+    wrong(images, short, "image", 2)
+    wrong(images, image(view[::2, ::2].copy(), "mono8", 4), "image", 3)  # another size
+    wrong(images, image(np.zeros_like(view), "mono8", 5), "markers", 1)  # black
+    images.publish(image(view, "mono8", 6))
+    bench.spin_until(lambda: poses)
+    assert poses[0].header.stamp.sec == 6
+
+
+def test_status_says_tracked_coasting_lost_and_tracked_again(bench, tracker):
+    node, poses = tracker("{coast_for: 0.1 s, lost_after: 0.25 s}", lockstep=False)
+    status = bench.collect(DiagnosticStatus, "probe/status", latched=True)
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    bench.spin_until(lambda: status)
+    now = node.get_clock().now().nanoseconds // 1_000_000_000
+    publisher.publish(pose_at(0.001, now))
+    bench.spin_until(lambda: status[-1].message == "lost")
+    publisher.publish(pose_at(0.002, now + 1))
+    bench.spin_until(lambda: status[-1].message == "tracked")
+    words = [s.message for s in status]
+    assert words[:5] == ["waiting", "tracked", "coasting", "lost", "tracked"]
+    assert [s.level for s in status[:4]] == [
+        DiagnosticStatus.STALE,
+        DiagnosticStatus.OK,
+        DiagnosticStatus.WARN,
+        DiagnosticStatus.ERROR,
+    ]
+    assert len(poses) == 2  # nothing was sent again meanwhile
