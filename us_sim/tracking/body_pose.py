@@ -11,7 +11,7 @@
 >>> poses[0].pose.position.round(6)
 array([0.02, 0.01, 0.4 ])
 >>> [round(each.error, 3) for each in poses]  # pixels, of the pose and of the other one
-[0.0, 0.794]
+[0.0, 0.856]
 """
 
 from __future__ import annotations

@@ -5,10 +5,10 @@
 >>> settings = CameraSettings(dictionary="6X6_250", size="30 mm", marker=7)
 >>> settings.size, round(math.degrees(settings.view_angle_limit))
 (0.03, 75)
->>> CameraSettings(dictionary="7X8")
+>>> CameraSettings(minimum_markers=0)
 Traceback (most recent call last):
 ...
-us_sim.errors.TrackingError: camera.dictionary: '7X8' is not one of 4X4_50, ...
+us_sim.errors.TrackingError: camera.minimum_markers: 0 is outside 1 to 1000
 """
 
 from __future__ import annotations

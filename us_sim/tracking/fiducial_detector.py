@@ -136,7 +136,7 @@ def _refine(
     edge = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
     half = int(np.clip(edge / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    near = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
-    near = np.asarray(near, dtype=np.float64)
+    moved = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
+    near: NDArray[np.float64] = np.array(moved, dtype=np.float64)
     refined = refined_corners(image, near, cells)
     return near if refined is None else refined

@@ -136,8 +136,8 @@ def _fit_edge(image, start, end, cells, edge, widths, k):
     flat = abs(tx) >= abs(ty)
     along = abs(tx) if flat else abs(ty)
     middle = mx if flat else my
-    first = int(math.ceil(middle - ends * half * along))
-    last = int(math.floor(middle + ends * half * along))
+    first = math.ceil(middle - ends * half * along)
+    last = math.floor(middle + ends * half * along)
     stride = 1 + (last - first) // _LONGEST
     most = ((last - first) // stride + 1) * (int(2 * reach / along) + 3)
     if last - first < 3:
@@ -150,7 +150,7 @@ def _fit_edge(image, start, end, cells, edge, widths, k):
         else:
             centre = mx + (i - my) / ty * tx
         spread = reach / along
-        for j in range(int(math.ceil(centre - spread)), int(math.floor(centre + spread)) + 1):
+        for j in range(math.ceil(centre - spread), math.floor(centre + spread) + 1):
             column, row = (i, j) if flat else (j, i)
             if row < 0 or column < 0 or row >= rows or column >= columns:
                 return False
