@@ -11,6 +11,7 @@ from rosbags.highlevel import AnyReader
 TOPICS = {
     "/tracker/pose": "geometry_msgs/msg/PoseStamped",
     "/probe/pose": "geometry_msgs/msg/PoseStamped",
+    "/probe/status": "diagnostic_msgs/msg/DiagnosticStatus",
     "/tissue/nodes": "sensor_msgs/msg/PointCloud2",
     "/tissue/rest": "sensor_msgs/msg/PointCloud2",
     "/tissue/tetrahedra": "std_msgs/msg/Int32MultiArray",
