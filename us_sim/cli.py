@@ -1,4 +1,4 @@
-"""The command `us-sim`: demo, run, render, play, bag info, evaluate."""
+"""The command `us-sim`: demo, run, render, play, bag info, calibrate, evaluate."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim import __version__
+from us_sim.calibrate import add_calibrate
 from us_sim.errors import UsSimError
 from us_sim.share import find_bag
 
@@ -94,6 +95,8 @@ def _parser() -> argparse.ArgumentParser:
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)
     info.set_defaults(command=_bag_info)
+
+    add_calibrate(commands)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
     subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice")

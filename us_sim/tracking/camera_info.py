@@ -60,8 +60,19 @@ def read_camera_info(path: Path | str) -> CameraModel:
         raise TrackingError(f"{path}: {error}") from error
 
 
-def write_camera_info(path: Path | str, camera: CameraModel, name: str = "camera") -> None:
+def write_camera_info(
+    path: Path | str,
+    camera: CameraModel,
+    name: str = "camera",
+    notes: Mapping[str, Any] | None = None,
+) -> None:
     """Write the file that `read_camera_info` and ROS's drivers read.
+
+    Args:
+        path: of the new file.
+        camera: what it says.
+        name: the camera's.
+        notes: further keys, which readers pass over: how it was calibrated, and how well.
 
     Raises:
         TrackingError: the file exists.
@@ -77,6 +88,7 @@ def write_camera_info(path: Path | str, camera: CameraModel, name: str = "camera
         "distortion_coefficients": _matrix(camera.distortion[None]),
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(projection),
+        **(notes or {}),
     }
     try:
         with path.open("x", encoding="utf-8") as file:

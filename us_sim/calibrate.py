@@ -1,0 +1,175 @@
+"""The command `us-sim calibrate`: camera, pivot, landmarks, probe, time."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import CalibrationError
+from us_sim.quantity import Quantity
+
+__all__ = ["add_calibrate"]
+
+_LENGTH = Quantity("length")
+_TIME = Quantity("time", 0.01, 60.0)
+
+
+def add_calibrate(commands: Any) -> None:
+    """Add the command and its five kinds to `us-sim`'s."""
+    calibrate = commands.add_parser("calibrate", help="find out where trackers and tools are")
+    kinds = calibrate.add_subparsers(required=True, metavar="camera|pivot|landmarks|probe|time")
+    _add_camera(kinds)
+    _add_pivot(kinds)
+    _add_landmarks(kinds)
+    _add_time(kinds)
+
+
+def _add_camera(kinds: Any) -> None:
+    parser = kinds.add_parser("camera", help="lens and focal length from photos of a board")
+    parser.add_argument(
+        "photos", nargs="+", help="files, folders or patterns such as 'shots/*.jpg'"
+    )
+    parser.add_argument(
+        "--board", default="charuco", help="charuco (default), grid of markers, or chessboard"
+    )
+    parser.add_argument(
+        "--size", required=True, metavar="CxR", help="squares or markers across and down: 5x7"
+    )
+    for name, what in (
+        ("square", "side of a square"),
+        ("marker", "side of a marker"),
+        ("separation", "between the markers of a grid"),
+    ):
+        parser.add_argument(
+            f"--{name}", type=_quantity(_LENGTH), default=0.0, metavar="M", help=f"{what}: '40 mm'"
+        )
+    parser.add_argument("--dictionary", default="", help="of the markers: 6X6_250")
+    parser.add_argument("--name", default="camera", help="the camera's name in the file")
+    _add_out(parser, "camera.yaml", "camera info; a picture of the coverage beside it")
+    parser.set_defaults(command=_camera)
+
+
+def _add_pivot(kinds: Any) -> None:
+    parser = kinds.add_parser("pivot", help="a stylus' tip from turning it about the tip")
+    parser.add_argument("recording", type=Path, help="bag, or tracker recording of Plus")
+    _add_pose(parser)
+    _add_out(parser, "tip.yaml", "the tip in the stylus' frame")
+    parser.set_defaults(command=_pivot)
+
+
+def _add_landmarks(kinds: Any) -> None:
+    parser = kinds.add_parser("landmarks", help="where the tracker is, from points touched")
+    parser.add_argument(
+        "known", type=Path, help="landmarks in the patient's frame: CSV name,x,y,z or Plus' XML"
+    )
+    parser.add_argument(
+        "measured",
+        type=Path,
+        help="the same as the tracker measured them: CSV, or a recording of the stylus",
+    )
+    parser.add_argument("--tip", type=Path, metavar="FILE", help="the stylus' tip, of a recording")
+    parser.add_argument("--to", default="patient", help="frame of the known ones (%(default)s)")
+    _add_pose(parser)
+    _add_out(parser, "registration.yaml", "the registration")
+    parser.set_defaults(command=_landmarks)
+
+
+def _add_time(kinds: Any) -> None:
+    parser = kinds.add_parser("time", help="offset of a tracker's clock from one motion")
+    parser.add_argument("moving", type=Path, help="recording whose stamps are to be mended")
+    parser.add_argument(
+        "fixed", type=Path, help="recording whose stamps are right: poses or images"
+    )
+    parser.add_argument(
+        "--largest",
+        type=_quantity(_TIME),
+        default=0.5,
+        metavar="S",
+        help="offsets up to which are tried (%(default)s s)",
+    )
+    _add_pose(parser)
+    _add_out(parser, "time.yaml", "the offset; a picture of both signals beside it")
+    parser.set_defaults(command=_time)
+
+
+def _add_pose(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--pose",
+        metavar="NAME",
+        help="topic of a bag, or transform of Plus such as StylusToReference; may be left out "
+        "where there is one",
+    )
+
+
+def _add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
+    parser.add_argument(
+        "--out", type=Path, default=Path(default), help=f"file to write: {what} (%(default)s)"
+    )
+
+
+def _quantity(quantity: Quantity) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            return quantity.parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parse
+
+
+def _camera(args: argparse.Namespace) -> int:
+    from us_sim.tracking.calibration.board import Board
+    from us_sim.tracking.calibration.camera_command import calibrate_photos
+
+    columns, _, rows = args.size.lower().partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise CalibrationError(f"--size {args.size}: write the board's size as 5x7")
+    board = Board(
+        args.board,
+        int(columns),
+        int(rows),
+        args.square,
+        args.marker,
+        args.separation,
+        args.dictionary,
+    )
+    print(calibrate_photos(args.photos, board, _new(args.out), args.name))
+    return 0
+
+
+def _pivot(args: argparse.Namespace) -> int:
+    from us_sim.tracking.calibration.recording_commands import calibrate_tip
+
+    print(calibrate_tip(args.recording, args.pose, _new(args.out)))
+    return 0
+
+
+def _landmarks(args: argparse.Namespace) -> int:
+    from us_sim.tracking.calibration.recording_commands import calibrate_registration
+
+    print(
+        calibrate_registration(
+            args.known, args.measured, args.tip, args.pose, args.to, _new(args.out)
+        )
+    )
+    return 0
+
+
+def _time(args: argparse.Namespace) -> int:
+    from us_sim.tracking.calibration.recording_commands import calibrate_clock
+
+    print(calibrate_clock(args.moving, args.fixed, args.pose, args.largest, _new(args.out)))
+    return 0
+
+
+def _new(path: Path) -> Path:
+    """A file that is still to be written, which is worth knowing before the work."""
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise CalibrationError(f"--out {path}: must be a file that ends in .yaml")
+    if path.exists():
+        raise CalibrationError(f"--out {path}: exists already; choose another name")
+    if not path.absolute().parent.is_dir():
+        raise CalibrationError(f"--out {path}: there is no folder {path.absolute().parent}")
+    return path

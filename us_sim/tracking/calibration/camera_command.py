@@ -1,0 +1,151 @@
+"""`us-sim calibrate camera`: photos in, camera info and a picture of the coverage out."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.progress import Progress
+from us_sim.tracking.calibration.board import Board, BoardView
+from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
+from us_sim.tracking.calibration.report_picture import draw_coverage
+from us_sim.tracking.camera_info import write_camera_info
+
+__all__ = ["calibrate_photos", "find_photos"]
+
+_IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
+
+
+def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -> str:
+    """Calibrate a camera and write its info and a picture; returns a sentence with the result.
+
+    Args:
+        given: files, folders and patterns.
+        board: what the photos show.
+        out: YAML file to write; the picture goes beside it.
+        name: of the camera.
+
+    Raises:
+        CalibrationError: the photos cannot be read or do not determine the camera, or a file to
+            write exists.
+    """
+    picture = out.with_suffix(".png")
+    if picture.exists():
+        raise CalibrationError(f"{picture}: exists already; choose another name for --out")
+    photos = find_photos(given)
+    names, views, blank, size = _views(photos, board)
+    if not views:
+        raise CalibrationError(
+            f"none of the {len(photos)} photos shows the board: check --board, --size and "
+            f"--dictionary"
+        )
+    found = calibrate_camera(views, *size)
+    write_camera_info(out, found.camera, name, _notes(found, board, names, views, blank))
+    draw_coverage(picture, found, views, names)
+    focal = " and ".join(
+        f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
+        for k, intrinsic in enumerate(INTRINSICS[:2])
+    )
+    left_out = f"; {len(blank)} without the board: {', '.join(blank)}" if blank else ""
+    note = f"; {found.note}" if found.note else ""
+    return (
+        f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {len(views)} photos, coverage in "
+        f"{picture}{left_out}{note}"
+    )
+
+
+def find_photos(given: Sequence[str]) -> list[Path]:
+    """The files that are named, lie in named folders or match patterns, in natural order.
+
+    Raises:
+        CalibrationError: a name stands for no photo.
+    """
+    photos: dict[Path, None] = {}
+    for text in given:
+        path = Path(text).expanduser()
+        if path.is_file():
+            photos[path] = None
+            continue
+        if path.is_dir():
+            candidates = list(path.iterdir())
+        else:
+            candidates = [Path(match) for match in glob.glob(str(path), recursive=True)]
+        matches = [file for file in candidates if file.suffix.lower() in _IMAGES]
+        if not matches:
+            raise CalibrationError(f"{text}: there is no such photo, and no folder with any")
+        photos.update(dict.fromkeys(sorted(matches, key=_natural)))
+    return list(photos)
+
+
+def _natural(path: Path) -> list[tuple[bool, int, str]]:
+    """2.jpg before 10.jpg."""
+    parts = re.findall(r"\d+|\D+", str(path))
+    return [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
+
+
+def _views(
+    photos: Sequence[Path], board: Board
+) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
+    """Names and views of the photos that show the board, names of those that do not, the size."""
+    names, views, blank = [], [], []
+    size: tuple[int, int] | None = None
+    with Progress("looking for the board", len(photos), "photos") as progress:
+        for k, photo in enumerate(photos):
+            image = _read(photo)
+            columns_rows = (image.shape[1], image.shape[0])
+            if size is not None and columns_rows != size:
+                raise CalibrationError(
+                    f"{photo}: has {columns_rows[0]} × {columns_rows[1]} pixels and the photos "
+                    f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
+                )
+            size = columns_rows
+            view = board.find(image)
+            if view is None:
+                blank.append(photo.name)
+            else:
+                names.append(photo.name)
+                views.append(view)
+            progress.update(k + 1, f"{len(views)} found")
+    if size is None:
+        raise CalibrationError("no photo is given; name files, a folder or a pattern")
+    return names, views, blank, size
+
+
+def _read(photo: Path) -> NDArray[np.uint8]:
+    """Grey values (rows, columns), turned by nothing: a calibration is of the sensor."""
+    data = np.fromfile(photo, np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise CalibrationError(f"{photo}: is no image that can be read")
+    return np.asarray(image, np.uint8)
+
+
+def _notes(
+    found: CameraCalibration,
+    board: Board,
+    names: Sequence[str],
+    views: Sequence[BoardView],
+    blank: Sequence[str],
+) -> dict[str, object]:
+    """What the file says besides the camera; ROS' readers pass it over."""
+    return {
+        "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
+        "residuals": {
+            "rms": found.rms,  # pixels
+            "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
+            "corners": sum(len(view) for view in views),
+        },
+        "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
+        "largest_tilt": found.tilt,  # rad, between two boards
+        "reach": found.reach,  # of the way from the image's middle to its corners
+        "photos_without_board": list(blank),
+        "note": found.note,
+    }
