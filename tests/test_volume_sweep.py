@@ -75,12 +75,21 @@ def test_images_may_lie_in_a_file_beside_the_header(tmp_path):
         ({"ImageToReferenceTransform": None}, "no ImageToReferenceTransform"),
         ({"ImageToReferenceTransform": "1 0 0"}, "a transform that is not 16 numbers"),
         ({"ImageToReferenceTransform": "1 0 x " + "0 " * 13}, "a transform that is not 16 numbers"),
-        ({"ImageToReferenceTransform": " ".join("0" * 16)}, "a transform that places no image"),
-        ({"ImageToReferenceTransform": MATRIX.format(x="nan")}, "a transform that places no image"),
-        ({"ImageToReferenceTransform": MATRIX.format(x="inf")}, "a transform that places no image"),
+        (
+            {"ImageToReferenceTransform": " ".join("0" * 16)},
+            "a transform that is singular or not finite",
+        ),
+        (
+            {"ImageToReferenceTransform": MATRIX.format(x="nan")},
+            "a transform that is singular or not finite",
+        ),
+        (
+            {"ImageToReferenceTransform": MATRIX.format(x="inf")},
+            "a transform that is singular or not finite",
+        ),
         (
             {"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"},
-            "a transform that places no image",
+            "a transform that is singular or not finite",
         ),
         (
             {"ImageToReferenceTransformStatus": "INVALID"},

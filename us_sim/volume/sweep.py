@@ -27,8 +27,6 @@ array([ 8,  9, 10, 11], dtype=uint8)
 
 from __future__ import annotations
 
-import math
-import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -39,13 +37,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
 from us_sim.volume.stored_size import check_stored_size, metaimage_header
 
 __all__ = ["Sweep", "read_sweep"]
 
 _METRES = 1e-3  # the format holds millimetres
 _CHUNK = 1 << 20
-_FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ def read_sweep(path: Path) -> Sweep:
         if b"=" not in file.read(256):
             raise VolumeError(f"{path}: is no MetaImage; give a sequence (.igs.mha) of Plus")
     header, header_bytes = metaimage_header(path)
-    frames = _frame_fields(header)
+    frames = frame_fields(header)
     if not frames:
         raise VolumeError(
             f"{path}: holds no tracked frames (Seq_Frame0000_...); give a sequence of Plus"
@@ -131,14 +129,6 @@ def read_sweep(path: Path) -> Sweep:
         left_out,
         _Data.of(path, header, header_bytes, columns * rows),
     )
-
-
-def _frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
-    frames: dict[int, dict[str, str]] = {}
-    for key, value in header.items():
-        if match := _FRAME_KEY.fullmatch(key):
-            frames.setdefault(int(match[1]), {})[match[2]] = value
-    return frames
 
 
 def _size(path: Path, header: Mapping[str, str]) -> tuple[int, int, int]:
@@ -180,32 +170,11 @@ def _usable(fields: Mapping[str, str]) -> tuple[NDArray[np.float64], float]:
     Raises:
         ValueError: with the reason why it cannot be used.
     """
-    for key in ("ImageStatus", "ImageToReferenceTransformStatus"):
-        if fields.get(key, "OK").upper() != "OK":
-            raise ValueError(f"{key} is not OK")
-    if "ImageToReferenceTransform" not in fields:
-        raise ValueError("no ImageToReferenceTransform")
-    try:
-        numbers = [float(number) for number in fields["ImageToReferenceTransform"].split()]
-        matrix = np.array(numbers).reshape(4, 4)
-    except ValueError:
-        raise ValueError("a transform that is not 16 numbers") from None
-    steps = np.linalg.norm(matrix[:3, :3], axis=0)
-    if not (
-        np.isfinite(matrix).all()
-        and steps.all()
-        and np.array_equal(matrix[3], [0, 0, 0, 1])
-        and abs(np.linalg.det(matrix[:3, :3] / steps)) > 1e-6
-    ):
-        raise ValueError("a transform that places no image")
-    try:
-        time = float(fields["Timestamp"])
-    except (KeyError, ValueError):
-        time = math.nan
-    if not math.isfinite(time):
-        raise ValueError("no Timestamp")
+    if fields.get("ImageStatus", "OK").upper() != "OK":
+        raise ValueError("ImageStatus is not OK")
+    matrix = frame_matrix(fields, "ImageToReferenceTransform")
     matrix[:3] *= _METRES
-    return matrix, time
+    return matrix, frame_time(fields)
 
 
 def _nothing_usable(
