@@ -104,6 +104,10 @@ class HapticDevice:
         swing = (moved.rotation - probe.rotation) @ self._lever
         return Pose(probe.position + way + swing, orientation)
 
+    def direction_on_handle(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
+        return direction @ self._turn
+
     def on_handle(self, probe: Pose, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
 

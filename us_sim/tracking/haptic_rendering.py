@@ -52,7 +52,7 @@ _LEVER = 0.05
 _SMOOTHED = 5
 """Ticks over which the handle's way is averaged to tell the next one's."""
 
-_RESERVE = 5
+_RESERVE = 10
 """Ticks at the present speed for which there is energy left, below which less is given back."""
 
 _STORED = 2.0
@@ -100,7 +100,13 @@ class HapticRendering:
         self._pose_time: int | None = None
         self._model: ContactModel | None = None
         self._model_time = 0
-        self._not_before: int | None = None  # ns, stamp that a model must have after a doubt
+        self._not_before: int | None = None  # ns, that the next model's stamp must be after
+        self._anchor = Pose()  # of the handle, when the model was made
+        self._begun: int | None = None  # ns, when the ramp began
+        self._left_over, self._since = np.zeros(6), 0  # of the models before, and from when on, ns
+        self._felt = np.zeros(6)
+        self._ways: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
+        self._energy = 0.0  # J, taken from the handle since contact began, less what it was given
         self._doubted("no pose of the handle yet")
 
     @property
@@ -145,7 +151,6 @@ class HapticRendering:
         if doubt:
             return self._doubted(doubt)
         assert self._model is not None
-        assert self._anchor is not None
         handle = self._poses[-1]
         probe = self._device.probe_moved(self._model.pose, self._anchor, handle)
         doubt = self._far(probe)
@@ -154,16 +159,13 @@ class HapticRendering:
         self.doubt = ""
         if self._begun is None:
             self._begun = now
-        law = self._model.wrench_at(probe)
-        wrench = self._handed_over(law, now)
-        felt = self._device.on_handle(probe, wrench)
+        wrench = self._model.wrench_at(probe) + self._left(now)
+        felt = self._unilateral(self._device.on_handle(probe, wrench))
         felt = self._limited(felt) * min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
-        if not wrench.any():
-            self._energy = 0.0  # what was lost in this contact is not given back in the next
-        self._energy = min(
-            self._energy, _STORED * self._device.share * self._model.energy_at(probe)
-        )
-        self._felt = self._passive(felt)
+        if self._energy > 0.0:
+            stored = _STORED * self._device.share * self._model.energy_at(probe)
+            self._energy = min(self._energy, max(stored, 0.0)) if wrench.any() else 0.0
+        self._felt = self._limited(self._unilateral(self._passive(felt)))
         return self._felt.copy()
 
     def _take_poses(self, now: int) -> str:
@@ -218,7 +220,7 @@ class HapticRendering:
         if anchor is None:
             return
         before = self._model
-        if before is not None and self._anchor is not None and self.doubt == "":
+        if before is not None and not self.doubt:
             # What is felt now goes over into the new model's.
             handle = self._poses[-1]
             old = self._device.probe_moved(before.pose, self._anchor, handle)
@@ -256,13 +258,12 @@ class HapticRendering:
     def _doubted(self, doubt: str) -> NDArray[np.float64]:
         """Zero, and begin anew with the next model."""
         self.doubt = doubt
-        self._begun: int | None = None  # ns, when the ramp began
+        self._begun = None
         self._model = None
-        self._anchor: Pose | None = None  # of the handle, when the model was made
         self._left_over, self._since = np.zeros(6), 0
         self._felt = np.zeros(6)
-        self._energy = 0.0  # J, taken from the handle since contact began, less what it was given
-        self._ways: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
+        self._ways.clear()
+        self._energy = min(self._energy, 0.0)  # what was given away is still owed
         return np.zeros(6)
 
     def _left(self, now: int) -> NDArray[np.float64]:
@@ -270,15 +271,12 @@ class HapticRendering:
         share = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
         return self._left_over * max(share, 0.0)
 
-    def _handed_over(self, law: NDArray[np.float64], now: int) -> NDArray[np.float64]:
-        """The model's wrench with what is left of the one before, which must not pull."""
+    def _unilateral(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
-        wrench = law + self._left(now)
-        push = self._model.push
-        along = float(wrench[:3] @ push)
-        if along < 0.0:
-            wrench[:3] -= along * push
-        return wrench
+        push = self._device.direction_on_handle(self._model.push)
+        pulled = min(float(felt[:3] @ push), 0.0)
+        return np.concatenate([felt[:3] - pulled * push, felt[3:]])
 
     def _limited(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
         """At most what the arm may give."""
@@ -307,7 +305,7 @@ class HapticRendering:
         # Along the way no more is taken off than is there, and than damping gives back.
         most = max(given, 0.0) + _DAMPING * self._settings.rate * square
         off = min(given - allowed, most) / square
-        return self._limited(felt - off * self._metric * direction)
+        return felt - off * self._metric * direction
 
 
 def _way(first: Pose, second: Pose) -> NDArray[np.float64]:
