@@ -52,10 +52,12 @@ def test_limits_on_speed(ms, x, turn, believed):
 def test_the_reason_is_a_sentence_with_numbers():
     gate = OutlierGate(LIMITS)
     verdicts(gate, seen(0, 0.0), seen(10, 0.25))
-    assert gate.reason == ("the pose is 250.0 mm from the one 10.0 ms before: faster than 1 m/s")
-    gate.judge(seen(10, 0.0, 0.5))
     assert gate.reason == (
-        "the pose is turned 28.6° from the one 10.0 ms before: faster than 10 rad/s"
+        "the pose is 250.0 mm from the one 10.0 ms before, where 12.0 mm are believed"
+    )
+    gate.judge(seen(20, 0.0, 0.5))
+    assert gate.reason == (
+        "the pose is turned 28.6° from the one 20.0 ms before, where 12.6° are believed"
     )
 
 
@@ -73,10 +75,17 @@ def test_refused_poses_that_agree_are_the_new_place():
 
 
 def test_refused_poses_that_do_not_agree_are_no_place():
+    """However long they come: for 10 s, in which a probe may go anywhere, but does not so."""
     gate = settled()
     rng = np.random.default_rng(2)
-    scattered = [seen(10 * k, x) for k, x in enumerate(rng.permutation(np.arange(40)) + 1.0, 1)]
-    assert verdicts(gate, *scattered) == [REFUSED] * 40
+    scattered = [seen(10 * k, x) for k, x in enumerate(rng.permutation(np.arange(1000)) / 5 + 1)]
+    assert verdicts(gate, *scattered[1:]) == [REFUSED] * 999
+
+
+def test_after_refused_poses_the_probe_is_believed_where_it_can_have_come_to():
+    gate = settled()
+    assert verdicts(gate, seen(10, 5.0), seen(20, -5.0)) == [REFUSED] * 2
+    assert gate.judge(seen(30, 0.0319)) is BELIEVED  # 1 m/s · 30 ms + 2 mm
 
 
 def test_a_believed_pose_ends_a_row():

@@ -171,6 +171,18 @@ def test_while_all_is_refused_it_coasts():
     assert states[29] is TrackingState.COASTING  # 0.3 s after the last that was believed
 
 
+def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
+    rng = np.random.default_rng(8)
+    tracked = tracking("one_euro", GateSettings())
+    take(tracked, *(at(20 * k) for k in range(10)))
+    nonsense = take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(200) + 1)))
+    assert nonsense == [None] * 200
+    assert tracked.state(at(4200).stamp) is TrackingState.LOST
+    answers = take(tracked, *(at(4200 + 20 * k, 0.3) for k in range(6)))
+    assert [answer is None for answer in answers] == [True] * 4 + [False] * 2
+    assert answers[4].pose.position[0] == 0.3
+
+
 def test_after_a_reset_it_waits():
     tracked = tracking("kalman", GateSettings())
     take(tracked, at(0))

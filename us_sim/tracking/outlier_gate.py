@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import sqrt
+from math import degrees, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ class OutlierGate:
     Refused measurements in a row of which each is within the speed limits of the one before are
     the new place after so many of them: the probe did move fast, or was registered anew. As long
     as fewer were believed, one more than these is enough, since the first of all may be wrong.
+
+    While measurements come and are refused, the time in which the probe may have moved is at most
+    that of so many of them: else a stream of nonsense were believed now and then.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -74,14 +77,21 @@ class OutlierGate:
         self.reason = self._doubt(measurement, expected)
         verdict = Verdict.BELIEVED
         if self.reason:
-            agrees = self._refused is not None and not self._too_fast(self._refused, measurement)
-            self._refused, self._row = measurement, self._row + 1 if agrees else 1
+            self._row = self._row + 1 if self._agrees(measurement) else 1
+            self._refused = measurement
             if self._row < min(self._settings.accept_after, self._support + 1):
                 return Verdict.REFUSED
             verdict, self._support = Verdict.NEW_PLACE, self._row - 1
         self._support += 1
         self._believed, self._refused, self._row = measurement, None, 0
         return verdict
+
+    def _agrees(self, measurement: Measurement) -> bool:
+        """Whether the probe can have come to a measurement from the refused one before it."""
+        before = self._refused
+        if before is None:
+            return False
+        return not self._too_fast(before, measurement, 1e-9 * (measurement.stamp - before.stamp))
 
     def _doubt(
         self,
@@ -93,10 +103,10 @@ class OutlierGate:
         if before is None:
             return ""
         if measurement.covariance is None:
-            return self._too_fast(before, measurement)
+            return self._too_fast(before, measurement, self._time_to_move(before, measurement))
         if expected is None:
             if before.covariance is None:
-                return self._too_fast(before, measurement)
+                return self._too_fast(before, measurement, self._time_to_move(before, measurement))
             expected = self._at_rest(before, measurement)
         difference, covariance = expected
         distance = float(difference @ np.linalg.solve(covariance, difference))
@@ -104,16 +114,24 @@ class OutlierGate:
             return ""
         return (
             f"the pose is {1e3 * _norm(difference[:3]):.1f} mm and "
-            f"{np.degrees(_norm(difference[3:])):.1f}° from where it is expected: "
+            f"{degrees(_norm(difference[3:])):.1f}° from where it is expected: "
             f"Mahalanobis distance {sqrt(max(distance, 0.0)):.1f}, the limit is "
             f"{sqrt(self._limit):.1f}"
         )
+
+    def _time_to_move(self, before: Measurement, measurement: Measurement) -> float:
+        """s that the probe has had since a believed measurement, see the class."""
+        step = measurement.stamp - before.stamp
+        if self._refused is not None:
+            newest = measurement.stamp - self._refused.stamp
+            step = min(step, self._settings.accept_after * newest)
+        return 1e-9 * step
 
     def _at_rest(
         self, before: Measurement, measurement: Measurement
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The difference of two measurements with covariances, and its covariance."""
-        settings, step = self._settings, 1e-9 * (measurement.stamp - before.stamp)
+        settings, step = self._settings, self._time_to_move(before, measurement)
         difference = np.concatenate(
             [
                 measurement.pose.position - before.pose.position,
@@ -128,20 +146,22 @@ class OutlierGate:
         covariance[index, index] += np.array(speeds) * (step * step / self._limit)
         return difference, covariance
 
-    def _too_fast(self, before: Measurement, measurement: Measurement) -> str:
-        """Why a probe cannot have come from one pose to another, or nothing."""
-        settings, step = self._settings, 1e-9 * (measurement.stamp - before.stamp)
+    def _too_fast(self, before: Measurement, measurement: Measurement, step: float) -> str:
+        """Why a probe cannot have come from one pose to another in a time (s), or nothing."""
+        settings, elapsed = self._settings, 1e-6 * (measurement.stamp - before.stamp)
         way = _norm(measurement.pose.position - before.pose.position)
-        if way > settings.jump + settings.maximum_speed * step:
+        limit = settings.jump + settings.maximum_speed * step
+        if way > limit:
             return (
-                f"the pose is {1e3 * way:.1f} mm from the one {1e3 * step:.1f} ms before: "
-                f"faster than {settings.maximum_speed:g} m/s"
+                f"the pose is {1e3 * way:.1f} mm from the one {elapsed:.1f} ms before, where "
+                f"{1e3 * limit:.1f} mm are believed"
             )
         turn = _norm(rotation_between(before.pose.orientation, measurement.pose.orientation))
-        if turn > settings.rotation_jump + settings.maximum_angular_speed * step:
+        limit = settings.rotation_jump + settings.maximum_angular_speed * step
+        if turn > limit:
             return (
-                f"the pose is turned {np.degrees(turn):.1f}° from the one {1e3 * step:.1f} ms "
-                f"before: faster than {settings.maximum_angular_speed:g} rad/s"
+                f"the pose is turned {degrees(turn):.1f}° from the one {elapsed:.1f} ms before, "
+                f"where {degrees(limit):.1f}° are believed"
             )
         return ""
 
