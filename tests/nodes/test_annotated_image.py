@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from bench import pose_at
 from builtin_interfaces.msg import Time as TimeMessage
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
@@ -136,6 +137,24 @@ def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench,
         bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
         bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
         assert node.health.problems("pose age") == times
+
+
+def test_diagnostics_warn_for_as_long_as_poses_stay_away(bench, show):
+    node = show(stale_after=1.0, lost_after=60.0)
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    node.annotated.pose_came(node.stamp())
+    warned = DiagnosticStatus.WARN, "the probe's pose is stale: the image is frozen"
+    bench.spin_until(lambda: (reports and words(reports[-1])) == warned)
+    count = len(reports)
+    bench.spin_until(lambda: len(reports) == count + 2)
+    assert words(reports[-1]) == warned
+    node.annotated.pose_came(node.stamp())
+    bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
+    assert node.health.warning == ""
+
+
+def words(report):
+    return report.status[0].level, report.status[0].message
 
 
 def test_a_pose_that_is_old_by_its_stamp_is_never_shown_as_live(bench, show):

@@ -124,6 +124,7 @@ class AnnotatedImage:
         elif self._missing and state == "live":
             node.get_logger().info("probe poses come again")
         self._missing = missing
+        node.health.warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
 
     def _badge(self) -> Badge | None:
         """What marks an image that is not live."""

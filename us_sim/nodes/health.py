@@ -30,6 +30,7 @@ class Health:
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
         self._last_problem = ""
+        self.warning = ""  # what is wrong for as long as it is
         self._last_total = 0
         self._last_time = node.get_clock().now().nanoseconds
         self.state = "starting"
@@ -81,9 +82,10 @@ class Health:
 
     def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:
         status = DiagnosticStatus()
-        status.level = DiagnosticStatus.WARN if self._last_problem else DiagnosticStatus.OK
+        wrong = self._last_problem or self.warning
+        status.level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status.name = self._node.get_fully_qualified_name()
-        status.message = self._last_problem or self.state
+        status.message = wrong or self.state
         status.hardware_id = self._hardware_id
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         message = DiagnosticArray()
