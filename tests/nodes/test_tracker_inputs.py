@@ -12,6 +12,7 @@ from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rendered_markers import render
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
+from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import SceneError
@@ -132,6 +133,24 @@ def test_a_mouse_moves_the_probe_and_bad_axes_do_not(bench, tracker):
     twists.publish(Twist())  # the same mouse again
     bench.spin_for(10)
     assert len(poses) == 3
+
+
+def test_a_haptic_arms_handle_moves_the_probe_unless_its_clutch_is_held(bench, tracker):
+    node, poses = tracker("{source: haptic, frame: arm, haptic: {scale: 0.5}}")
+    handle = bench.publisher(PoseStamped, "haptic/pose")
+    clutch = bench.publisher(Bool, "haptic/clutch")
+    handle.publish(pose_at(0.01, 1, frame="arm"))
+    bench.spin_until(lambda: len(poses) == 1)
+    clutch.publish(Bool(data=True))
+    bench.spin_until(lambda: node._input._device.is_held)
+    handle.publish(pose_at(0.05, 2, frame="arm"))
+    bench.spin_until(lambda: len(poses) == 2)
+    clutch.publish(Bool(data=False))
+    bench.spin_until(lambda: not node._input._device.is_held)
+    handle.publish(pose_at(0.06, 3, frame="arm"))
+    handle.publish(pose_at(math.nan, 4, frame="arm"))
+    bench.spin_until(lambda: len(poses) == 3 and node.health.problems("pose") == 1)
+    np.testing.assert_allclose([place(p)[2] for p in poses], [0.005, 0.005, 0.01], atol=1e-12)
 
 
 CAMERA = CameraModel(640, 480, [[600, 0, 319.5], [0, 600, 239.5], [0, 0, 1]], [-0.1, 0.02, 0, 0, 0])
