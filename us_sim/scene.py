@@ -15,6 +15,7 @@ from us_sim.slicing.imaging import Imaging
 from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.filter_settings import FilterSettings, GateSettings
 from us_sim.tracking.haptic_settings import HapticSettings
+from us_sim.tracking.openigtlink_settings import OpenIGTLinkSettings
 from us_sim.tracking.six_dof_mouse_settings import SixDofMouseSettings
 
 __all__ = [
@@ -214,6 +215,7 @@ class TrackerSection:
     camera: CameraSettings | None = given(default=None)
     six_dof_mouse: SixDofMouseSettings | None = given(default=None)
     haptic: HapticSettings | None = given(default=None)
+    openigtlink: OpenIGTLinkSettings | None = given(default=None)
 
 
 @dataclass(frozen=True)
