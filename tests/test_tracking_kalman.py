@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
+from us_sim.errors import TrackingError
 from us_sim.pose import Pose
 from us_sim.tracking import se3
 from us_sim.tracking.filter_settings import FilterSettings
@@ -125,7 +126,9 @@ def test_it_errs_as_much_as_it_says():
         for _ in range(steps):
             walk.go(int(rng.integers(3_000_000, 50_000_000)))
             seen = walk.measured()
-            innovation, covariance = kalman.expected(seen)
+            place, covariance = kalman.predicted(seen.stamp)
+            innovation = difference(Pose(*place), seen.pose)
+            covariance = covariance[:6, :6] + seen.covariance
             innovations += innovation @ np.linalg.solve(covariance, innovation)
             filtered = kalman.update(seen)
         error = difference(filtered.pose, walk.pose)
@@ -135,19 +138,9 @@ def test_it_errs_as_much_as_it_says():
         assert low < total < high
 
 
-def test_expecting_changes_nothing():
-    rng = np.random.default_rng(4)
-    asked, unasked = (ConstantVelocityKalman(SETTINGS) for _ in range(2))
-    walk = Walk(rng)
-    assert asked.expected(walk.measured()) is None
-    for _ in range(20):
-        seen, other = walk.measured(), walk.measured()
-        asked.expected(other)
-        asked.expected(Measurement(seen.stamp + 5_000_000, other.pose))
-        np.testing.assert_array_equal(
-            asked.update(seen).pose.matrix, unasked.update(seen).pose.matrix
-        )
-        walk.go(10_000_000)
+def test_before_the_first_measurement_it_predicts_nothing():
+    with pytest.raises(TrackingError, match="predicts nothing before its first measurement"):
+        ConstantVelocityKalman(SETTINGS).predicted(5)
 
 
 @pytest.mark.parametrize("rate", [30.0, 1000.0])

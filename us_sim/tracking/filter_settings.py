@@ -109,7 +109,7 @@ class GateSettings:
     )
     confidence: float = given(
         Quantity("number", 0.5, 1 - 1e-12),
-        default=0.9999,
+        default=0.999999,
         description="share of right poses with a covariance that are believed",
     )
     accept_after: int = given(

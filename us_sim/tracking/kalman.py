@@ -19,6 +19,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import TrackingError
 from us_sim.pose import Pose
 from us_sim.tracking.filter_settings import FilterSettings
 from us_sim.tracking.measurement import Measurement
@@ -72,7 +73,6 @@ class ConstantVelocityKalman(PoseFilter):
         self._covariance: NDArray[np.float64] = np.zeros((12, 12))
         self._step = 0.0  # s, the newest
         self._gain = np.zeros((12, 6))  # the newest
-        self._predicted: tuple[int, _Place, NDArray[np.float64]] | None = None
 
     def update(self, measurement: Measurement) -> Measurement:
         """The measurement with its pose filtered, and the covariance of that."""
@@ -80,24 +80,13 @@ class ConstantVelocityKalman(PoseFilter):
         if self._stamp is None:
             self._start(measurement, noise)
         else:
+            self._step = 1e-9 * (measurement.stamp - self._stamp)
             self._correct(measurement, noise)
         self._stamp = measurement.stamp
         pose = Pose(*self._place)
         self._place = pose.position, pose.orientation  # of norm 1 again
         return Measurement(
             measurement.stamp, pose, self._covariance[_POSE, _POSE], measurement.error
-        )
-
-    def expected(
-        self, measurement: Measurement
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """The innovation (6,) m, rad, of a measurement, and its covariance (6, 6)."""
-        if self._stamp is None:
-            return None
-        place, covariance = self._prediction(measurement.stamp)
-        return (
-            _difference(place, measurement.pose),
-            covariance[_POSE, _POSE] + self._noise(measurement),
         )
 
     def _noise(self, measurement: Measurement) -> NDArray[np.float64]:
@@ -109,14 +98,17 @@ class ConstantVelocityKalman(PoseFilter):
         speeds = [_INITIAL_SPEED**2] * 3 + [_INITIAL_ANGULAR_SPEED**2] * 3
         self._covariance[_VELOCITY, _VELOCITY] = np.diag(speeds)
 
-    def _prediction(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
-        """Where the pose is at a stamp if its velocity stays, and the error's covariance (12, 12).
+    def predicted(self, stamp: int) -> tuple[_Place, NDArray[np.float64]]:
+        """Where the pose is at a later stamp if its velocity stays, and the error's covariance.
 
-        The same stamp is asked for by the gate and then by the update.
+        Returns:
+            position (3,) m and orientation (4,), and (12, 12) as in the class.
+
+        Raises:
+            TrackingError: there was no measurement yet.
         """
-        if self._predicted is not None and self._predicted[0] == stamp:
-            return self._predicted[1:]
-        assert self._stamp is not None
+        if self._stamp is None:
+            raise TrackingError("a Kalman filter predicts nothing before its first measurement")
         step = 1e-9 * (stamp - self._stamp)
         turn = step * self._velocity[3:]
         position = self._place[0] + step * self._velocity[:3]
@@ -132,12 +124,10 @@ class ConstantVelocityKalman(PoseFilter):
         covariance[_POSE, _VELOCITY] += self._density * (step**2 / 2.0)
         covariance[_VELOCITY, _POSE] += self._density * (step**2 / 2.0)
         covariance[_VELOCITY, _VELOCITY] += self._density * step
-        self._predicted = (stamp, place, covariance)
         return place, covariance
 
     def _correct(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
-        assert self._stamp is not None
-        place, covariance = self._prediction(measurement.stamp)
+        place, covariance = self.predicted(measurement.stamp)
         gain: NDArray[np.float64] = np.linalg.solve(
             covariance[_POSE, _POSE] + noise, covariance[_POSE]
         ).T.astype(np.float64, copy=False)
@@ -152,8 +142,7 @@ class ConstantVelocityKalman(PoseFilter):
         kept[:, _POSE] -= gain
         corrected = kept @ covariance @ kept.T + gain @ noise @ gain.T
         self._covariance = 0.5 * (corrected + corrected.T)
-        self._step, self._gain = 1e-9 * (measurement.stamp - self._stamp), gain
-        self._predicted = None
+        self._gain = gain
 
     @property
     def lag(self) -> float:

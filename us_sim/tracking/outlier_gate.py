@@ -26,6 +26,9 @@ from us_sim.tracking.se3 import rotation_between
 __all__ = ["OutlierGate", "Verdict"]
 
 
+_DIAGONAL = np.diag_indices(6)
+
+
 class Verdict(Enum):
     """What the gate says of a measurement."""
 
@@ -37,9 +40,11 @@ class Verdict(Enum):
 class OutlierGate:
     """Compares each measurement with the newest believed one.
 
-    Where both have a covariance, or the filter knows what to expect, by Mahalanobis' distance
-    (chi-square with six degrees of freedom); the fastest motion alone is at the limit. Else by the
-    limits on speed, to which the settings' jumps are added: they are for a pose's noise.
+    Where both have a covariance by Mahalanobis' distance (chi-square with six degrees of freedom);
+    a probe that is as fast and turns as fast as it may is just at the limit, were there no noise.
+    Else by the limits on speed, to which the settings' jumps are added: they are for the noise.
+    No filter is asked what it expects: a hand that starts to move is quicker than its filter, and
+    a fit's covariance is often too small to be all that a gate allows.
 
     Refused measurements in a row of which each is within the speed limits of the one before are
     the new place after so many of them: the probe did move fast, or was registered anew. As long
@@ -62,19 +67,9 @@ class OutlierGate:
         self._support = 0  # how many have been believed at this place
         self.reason = ""
 
-    def judge(
-        self,
-        measurement: Measurement,
-        expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
-    ) -> Verdict:
-        """Whether a measurement is believed; if not, why is in `reason`.
-
-        Args:
-            measurement: newer than any before.
-            expected: how far (6,) m, rad, the pose is from what a filter expects, and the
-                covariance (6, 6) of that.
-        """
-        self.reason = self._doubt(measurement, expected)
+    def judge(self, measurement: Measurement) -> Verdict:
+        """Whether a measurement, newer than any before, is believed; if not, `reason` says why."""
+        self.reason = self._doubt(measurement)
         verdict = Verdict.BELIEVED
         if self.reason:
             self._row = self._row + 1 if self._agrees(measurement) else 1
@@ -93,28 +88,30 @@ class OutlierGate:
             return False
         return not self._too_fast(before, measurement, 1e-9 * (measurement.stamp - before.stamp))
 
-    def _doubt(
-        self,
-        measurement: Measurement,
-        expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-    ) -> str:
+    def _doubt(self, measurement: Measurement) -> str:
         """Why a measurement is not believed, or nothing."""
         before = self._believed
         if before is None:
             return ""
-        if measurement.covariance is None:
-            return self._too_fast(before, measurement, self._time_to_move(before, measurement))
-        if expected is None:
-            if before.covariance is None:
-                return self._too_fast(before, measurement, self._time_to_move(before, measurement))
-            expected = self._at_rest(before, measurement)
-        difference, covariance = expected
+        step = self._time_to_move(before, measurement)
+        if before.covariance is None or measurement.covariance is None:
+            return self._too_fast(before, measurement, step)
+        settings = self._settings
+        difference = np.concatenate(
+            [
+                measurement.pose.position - before.pose.position,
+                rotation_between(before.pose.orientation, measurement.pose.orientation),
+            ]
+        )
+        covariance = before.covariance + measurement.covariance
+        speeds = [settings.maximum_speed] * 3 + [settings.maximum_angular_speed] * 3
+        covariance[_DIAGONAL] += np.square(speeds) * (2.0 * step * step / self._limit)
         distance = float(difference @ np.linalg.solve(covariance, difference))
         if 0.0 <= distance <= self._limit:
             return ""
         return (
             f"the pose is {1e3 * _norm(difference[:3]):.1f} mm and "
-            f"{degrees(_norm(difference[3:])):.1f}° from where it is expected: "
+            f"{degrees(_norm(difference[3:])):.1f}° from the one before: "
             f"Mahalanobis distance {sqrt(max(distance, 0.0)):.1f}, the limit is "
             f"{sqrt(self._limit):.1f}"
         )
@@ -126,25 +123,6 @@ class OutlierGate:
             newest = measurement.stamp - self._refused.stamp
             step = min(step, self._settings.accept_after * newest)
         return 1e-9 * step
-
-    def _at_rest(
-        self, before: Measurement, measurement: Measurement
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The difference of two measurements with covariances, and its covariance."""
-        settings, step = self._settings, self._time_to_move(before, measurement)
-        difference = np.concatenate(
-            [
-                measurement.pose.position - before.pose.position,
-                rotation_between(before.pose.orientation, measurement.pose.orientation),
-            ]
-        )
-        assert before.covariance is not None
-        assert measurement.covariance is not None
-        covariance = before.covariance + measurement.covariance
-        index = np.arange(6)
-        speeds = [settings.maximum_speed**2] * 3 + [settings.maximum_angular_speed**2] * 3
-        covariance[index, index] += np.array(speeds) * (step * step / self._limit)
-        return difference, covariance
 
     def _too_fast(self, before: Measurement, measurement: Measurement, step: float) -> str:
         """Why a probe cannot have come from one pose to another in a time (s), or nothing."""

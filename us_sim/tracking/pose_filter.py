@@ -12,9 +12,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-from numpy.typing import NDArray
-
 from us_sim.tracking.filter_settings import FilterSettings
 from us_sim.tracking.measurement import Measurement
 
@@ -48,15 +45,6 @@ class PoseFilter(ABC):
     @abstractmethod
     def lag_at(self, frequency: float) -> float:
         """s by which, as the filter is set now, its position is behind a sway at ``frequency``."""
-
-    def expected(
-        self, _measurement: Measurement
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """How far (6,) the pose is from what the filter expects, and that difference's covariance.
-
-        None of a filter that does not know; m and rad as in a measurement's covariance.
-        """
-        return None
 
 
 class Unfiltered(PoseFilter):

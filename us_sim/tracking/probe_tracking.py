@@ -127,7 +127,7 @@ class ProbeTracking:
         if found:
             self.filter.reset()
         if self._gate is not None:
-            verdict = self._gate.judge(probe, self.filter.expected(probe))
+            verdict = self._gate.judge(probe)
             if verdict is Verdict.REFUSED:
                 self.refuse("gate", self._gate.reason)
                 return None
