@@ -89,6 +89,9 @@ def _add_time(kinds: Any) -> None:
         metavar="S",
         help="offsets up to which are tried (%(default)s s)",
     )
+    parser.add_argument(
+        "--images", action="store_true", help="the fixed recording's images, though it has poses"
+    )
     _add_pose(parser)
     _add_out(parser, "time.yaml", "the offset; a picture of both signals beside it")
     parser.set_defaults(command=_time)
@@ -160,7 +163,11 @@ def _landmarks(args: argparse.Namespace) -> int:
 def _time(args: argparse.Namespace) -> int:
     from us_sim.tracking.calibration.recording_commands import calibrate_clock
 
-    print(calibrate_clock(args.moving, args.fixed, args.pose, args.largest, _new(args.out)))
+    print(
+        calibrate_clock(
+            args.moving, args.fixed, args.pose, args.largest, _new(args.out), images=args.images
+        )
+    )
     return 0
 
 

@@ -27,6 +27,7 @@ array([ 8,  9, 10, 11], dtype=uint8)
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -80,11 +81,15 @@ class Sweep:
             ) from error
 
 
-def read_sweep(path: Path) -> Sweep:
+def read_sweep(path: Path, *, tracked: bool = True) -> Sweep:
     """A sequence file with an ``ImageToReferenceTransform`` a frame; its images are read later.
 
     Frames whose transform or time stamp is missing, not finite or singular, or whose status is
     not OK, are left out and counted.
+
+    Args:
+        path: of the file.
+        tracked: False takes images without a pose too; the sweep's poses are then all nan.
 
     Raises:
         VolumeError: the file is missing, is no sequence of 8-bit grey images, is cut, or no frame
@@ -110,7 +115,7 @@ def read_sweep(path: Path) -> Sweep:
     for number in range(count):
         fields = frames.get(number, {})
         try:
-            matrix, time = _usable(fields)
+            matrix, time = _usable(fields, tracked)
         except ValueError as reason:
             left_out[str(reason)] = left_out.get(str(reason), 0) + 1
             continue
@@ -164,7 +169,7 @@ def _size(path: Path, header: Mapping[str, str]) -> tuple[int, int, int]:
     return columns, rows, count
 
 
-def _usable(fields: Mapping[str, str]) -> tuple[NDArray[np.float64], float]:
+def _usable(fields: Mapping[str, str], tracked: bool) -> tuple[NDArray[np.float64], float]:
     """A frame's (4, 4) matrix in metres, and its time in s.
 
     Raises:
@@ -172,6 +177,8 @@ def _usable(fields: Mapping[str, str]) -> tuple[NDArray[np.float64], float]:
     """
     if fields.get("ImageStatus", "OK").upper() != "OK":
         raise ValueError("ImageStatus is not OK")
+    if not tracked:
+        return np.full((4, 4), math.nan), frame_time(fields)
     matrix = frame_matrix(fields, "ImageToReferenceTransform")
     matrix[:3] *= _METRES
     return matrix, frame_time(fields)

@@ -105,8 +105,10 @@ def read_table(
                             f"{path}: line {reader.line_num}: {name}: {error}"
                         ) from error
                 rows.append(((row[label] or "").strip(), values))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CalibrationError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(f"{path}: is no CSV: {error}") from error
     return rows
 
 

@@ -29,6 +29,7 @@ __all__ = ["PivotCalibration", "calibrate_pivot"]
 
 _FEWEST = 10  # poses
 _SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square
+_LARGEST_RMS = 5e-3  # m, above which the tip did not stay in one place
 _TRIALS = 300
 _SAMPLE = 4  # poses a trial: two leave the tip free along their common axis
 _JUDGES = 1000  # poses that tell a trial's worth
@@ -63,7 +64,8 @@ def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
         poses: of the body in the device's frame, while the tip stands still.
 
     Raises:
-        CalibrationError: there are too few poses, or they turn about one axis only.
+        CalibrationError: there are too few poses, they turn about one axis only, or the tip did
+            not stay in one place.
     """
     if len(poses) < _FEWEST:
         raise CalibrationError(
@@ -76,6 +78,11 @@ def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
     inliers = _consistent(rotations, positions)
     swing = _check_swing(rotations[inliers])
     solution, covariance, rms = _least_squares(rotations[inliers], positions[inliers])
+    if rms > _LARGEST_RMS:
+        raise CalibrationError(
+            f"the poses have no point in common (RMS {1e3 * rms:.0f} mm): keep the tip in one "
+            f"dimple during the whole recording"
+        )
     return PivotCalibration(
         solution[:3], solution[3:], rms, np.sqrt(np.diag(covariance)[:3]), swing, inliers
     )

@@ -1,0 +1,116 @@
+"""How a body moved in a recording: a bag, or a tracker recording of Plus; or what images showed.
+
+>>> import pathlib, tempfile
+>>> from us_sim.tracking.calibration.recorded_motion import read_motion
+>>> header = '''DimSize = 0 0 1
+... Seq_Frame0000_StylusToTrackerTransform = 1 0 0 10 0 1 0 20 0 0 1 30 0 0 0 1
+... Seq_Frame0000_Timestamp = 7.5
+... ElementDataFile = LOCAL
+... '''
+>>> with tempfile.TemporaryDirectory() as folder:
+...     path = pathlib.Path(folder, "stylus.igs.mha")
+...     _ = path.write_text(header)
+...     read_motion(path, None).positions
+array([[0.01, 0.02, 0.03]])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.pose import Pose
+from us_sim.progress import Progress
+from us_sim.recording.path import ProbePath, read_path
+from us_sim.tracking.calibration.position_signal import (
+    PositionSignal,
+    signal_of_images,
+    signal_of_positions,
+)
+from us_sim.tracking.plus_recording import is_tracker_recording, read_tracker_recording
+from us_sim.volume.sequence_header import frame_fields
+from us_sim.volume.stored_size import metaimage_header
+from us_sim.volume.sweep import Sweep, read_sweep
+
+__all__ = ["poses_of", "read_motion", "read_signal", "seconds_of"]
+
+
+def read_motion(path: Path, name: str | None) -> ProbePath:
+    """The valid poses of a body.
+
+    Args:
+        path: a bag, or a tracker recording of Plus (.igs.mha).
+        name: a topic; or a transform such as StylusToTracker, or StylusToReference where both
+            are recorded. May be None where there is one.
+
+    Raises:
+        CalibrationError: the recording has several and none is named.
+        UsSimError: it cannot be read, or has no such poses.
+    """
+    if not is_tracker_recording(path):
+        return read_path(path, name)
+    recording = read_tracker_recording(path)
+    if name is None:
+        bodies = [key for key in recording.transforms if not key.startswith("Reference")]
+        if len(bodies) != 1:
+            raise CalibrationError(
+                f"{path}: holds several transforms; name one with --pose: "
+                f"{', '.join(recording.transforms)}, or one to Reference such as "
+                f"{sorted(bodies)[-1].partition('To')[0] if bodies else 'Stylus'}ToReference"
+            )
+        name = bodies[0]
+    if name in recording.transforms:
+        return recording.probe_path(name)
+    body, _, reference = name.partition("To")
+    return recording.probe_path(body, reference or None)
+
+
+def read_signal(path: Path, name: str | None, *, images: bool = False) -> PositionSignal:
+    """What moved, as one number over time.
+
+    Args:
+        path: a bag, or a recording of Plus.
+        name: as in :func:`read_motion`.
+        images: take a Plus recording's images even where it has poses.
+
+    Raises:
+        UsSimError: it cannot be read, or shows no motion.
+    """
+    if is_tracker_recording(path) and (images or not _has_transforms(path)):
+        sweep = read_sweep(path, tracked=False)
+        return signal_of_images(sweep.times, _with_progress(sweep))
+    if images:
+        raise CalibrationError(f"{path}: images are read from recordings of Plus (.igs.mha) only")
+    motion = read_motion(path, name)
+    return signal_of_positions(seconds_of(motion), motion.positions)
+
+
+def poses_of(motion: ProbePath) -> list[Pose]:
+    """Its poses, one by one."""
+    return [
+        Pose(position, orientation)
+        for position, orientation in zip(motion.positions, motion.orientations, strict=True)
+    ]
+
+
+def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
+    """(K,) s, its stamps."""
+    return np.asarray(1e-9 * motion.stamps, np.float64)
+
+
+def _has_transforms(path: Path) -> bool:
+    if not path.is_file():
+        raise CalibrationError(f"{path}: there is no such file")
+    frames = frame_fields(metaimage_header(path)[0])
+    return any(key.endswith("Transform") for fields in frames.values() for key in fields)
+
+
+def _with_progress(sweep: Sweep) -> Iterator[NDArray[np.uint8]]:
+    with Progress("looking for the line", len(sweep.times), "images") as progress:
+        for k, image in enumerate(sweep.images()):
+            yield image
+            progress.update(k + 1)

@@ -1,0 +1,198 @@
+"""`us-sim calibrate pivot`, `landmarks` and `time`: recordings in, YAML files out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError
+from us_sim.pose import Pose
+from us_sim.tracking.calibration.dwell import find_dwells
+from us_sim.tracking.calibration.landmark_file import read_landmarks
+from us_sim.tracking.calibration.landmarks import register_landmarks
+from us_sim.tracking.calibration.pivot import calibrate_pivot
+from us_sim.tracking.calibration.recorded_motion import (
+    poses_of,
+    read_motion,
+    read_signal,
+    seconds_of,
+)
+from us_sim.tracking.calibration.report_picture import draw_offset
+from us_sim.tracking.calibration.time_offset import find_time_offset
+from us_sim.tracking.transform_file import read_transform, write_calibration, write_transform
+
+__all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
+
+_TABLES = {".csv", ".txt", ".xml"}
+
+
+def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
+    """Find a stylus' tip and write it; returns a sentence with the result.
+
+    Raises:
+        UsSimError: the recording cannot be read or does not determine the tip.
+    """
+    motion = read_motion(recording, name)
+    found = calibrate_pivot(poses_of(motion))
+    write_transform(
+        out,
+        Pose(found.tip),
+        from_frame="tip",
+        to_frame=motion.topic,
+        method=f"pivot about one point, {recording.name}",
+        residuals={"rms": found.rms, "poses": len(found.inliers), "rejected": found.rejected},
+        more={
+            "standard_deviations": {"position": found.deviations},  # m
+            "pivot": found.pivot,  # m, frame of the recording
+            "swing": found.swing,  # rad, of the direction that turned least
+        },
+    )
+    said = ", ".join(f"{1e3 * number:.2f}" for number in found.tip)
+    largest = 1e3 * float(found.deviations.max())
+    return (
+        f"{out}: tip at {said} mm (± {largest:.2f}), RMS {1e3 * found.rms:.2f} mm over "
+        f"{int(found.inliers.sum())} poses, {found.rejected + motion.rejected} left out"
+    )
+
+
+def calibrate_registration(
+    known_file: Path, measured_file: Path, tip: Path | None, name: str | None, to: str, out: Path
+) -> str:
+    """Register a device to the patient by landmarks; returns a sentence with the result.
+
+    Args:
+        known_file: CSV or Plus' XML.
+        measured_file: the same landmarks in the device's frame, or a recording of the stylus that
+            touched them in the file's order.
+        tip: the stylus' tip, for a recording.
+        name: of the stylus' poses in it.
+        to: name of the known landmarks' frame.
+        out: file to write.
+
+    Raises:
+        UsSimError: the files cannot be read or do not determine the registration.
+    """
+    known = read_landmarks(known_file)
+    if measured_file.suffix.lower() in _TABLES:
+        measured, frame = read_landmarks(measured_file), "tracker"
+        names = [landmark for landmark in known if landmark in measured]
+        if not names:
+            raise CalibrationError(
+                f"{measured_file} and {known_file} share no landmark's name: name the same "
+                f"landmarks alike"
+            )
+    else:
+        measured, frame = _touched(list(known), measured_file, tip, name)
+        names = list(known)
+    found = register_landmarks(
+        np.array([measured[landmark] for landmark in names]),
+        np.array([known[landmark] for landmark in names]),
+        names,
+    )
+    left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
+    write_transform(
+        out,
+        found.pose,
+        from_frame=frame,
+        to_frame=to,
+        method=f"point registration, {measured_file.name} on {known_file.name}",
+        residuals={
+            "fre": found.fre,  # m
+            "tre_leave_one_out": None if math.isnan(found.tre) else found.tre,  # m
+            "landmarks": dict(zip(names, found.residuals, strict=True)),  # m
+            "left_out": dict(zip(names, left_out, strict=True)),  # m
+        },
+        more={
+            "standard_deviations": {
+                "position": found.deviations[:3],  # m
+                "rotation": found.deviations[3:],  # rad
+            }
+        },
+    )
+    worst = int(found.residuals.argmax())
+    tre = "" if math.isnan(found.tre) else f", leave-one-out TRE {1e3 * found.tre:.2f} mm"
+    return (
+        f"{out}: FRE {1e3 * found.fre:.2f} mm over {len(names)} landmarks (worst "
+        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){tre}"
+    )
+
+
+def calibrate_clock(
+    moving_file: Path,
+    fixed_file: Path,
+    name: str | None,
+    largest: float,
+    out: Path,
+    *,
+    images: bool = False,
+) -> str:
+    """Find the offset of a device's stamps; returns a sentence with the result.
+
+    Args:
+        moving_file: recording of the device.
+        fixed_file: recording of what is right: poses, or images of a line.
+        name: of the poses.
+        largest: s, offsets up to which are tried.
+        out: file to write; a picture goes beside it.
+        images: take the fixed recording's images even where it has poses.
+
+    Raises:
+        UsSimError: the recordings cannot be read or do not determine the offset.
+    """
+    picture = out.with_suffix(".png")
+    if picture.exists():
+        raise CalibrationError(f"{picture}: exists already; choose another name for --out")
+    moving = read_signal(moving_file, name)
+    fixed = read_signal(fixed_file, name, images=images)
+    found = find_time_offset(moving, fixed, largest=largest)
+    write_calibration(
+        out,
+        {
+            "time_offset": found.offset,  # s, to add to the device's stamps
+            "standard_deviation": found.deviation,  # s
+            "method": f"correlation of {moving_file.name} with {fixed_file.name}",
+            "residuals": {
+                "correlation": found.correlation,
+                "unexplained": found.residual,  # of the fixed signal's standard deviation
+                "seconds": found.seconds,
+                "left_out": moving.left_out + fixed.left_out,
+            },
+        },
+    )
+    draw_offset(picture, found, moving, fixed)
+    return (
+        f"{out}: time_offset {1e3 * found.offset:.1f} ms ± {1e3 * found.deviation:.1f} ms, "
+        f"correlation {found.correlation:.3f} over {found.seconds:.0f} s, signals in {picture}"
+    )
+
+
+def _touched(
+    names: list[str], recording: Path, tip: Path | None, name: str | None
+) -> tuple[dict[str, NDArray[np.float64]], str]:
+    """Where a stylus touched the landmarks, m, and in which frame."""
+    if tip is None:
+        raise CalibrationError(
+            f"{recording}: is a recording of the stylus, whose tip must be known: give --tip FILE "
+            f"as `us-sim calibrate pivot` writes it"
+        )
+    motion = read_motion(recording, name)
+    poses = poses_of(motion)
+    offset = read_transform(tip).position
+    dwells = find_dwells(
+        seconds_of(motion),
+        np.array([pose.apply(offset) for pose in poses]),
+        np.array([pose.rotation for pose in poses]),
+    )
+    if len(dwells) != len(names):
+        start = seconds_of(motion)[0]
+        at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells) or "none"
+        raise CalibrationError(
+            f"{recording}: the stylus pivoted on {len(dwells)} places (at {at} s) where "
+            f"{len(names)} landmarks are named: touch each for two seconds in the file's order, "
+            f"tilting the stylus with its tip still"
+        )
+    places = [dwell.position for dwell in dwells]
+    return dict(zip(names, places, strict=True)), motion.frame_id
