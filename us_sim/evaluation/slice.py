@@ -37,7 +37,7 @@ __all__ = ["evaluate_slice"]
 _THREADS = {"scan_conversion": (1, 2), "row_subdivision": (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
 _FRAMES = 4  # that a case's images go through
 # s, of timing the main case and another.
-_SECONDS, _QUICK_SECONDS = (15.0, 4.0), (5.0, 1.0)
+_SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)
 
 
 def evaluate_slice(

@@ -49,7 +49,7 @@ class Cost:
     """One line of the table."""
 
     what: str
-    ms: float  # of a whole image, median
+    ms: float  # of a whole image, processor time, median
     shown: float = 1.0  # part of the image's pixels that show something
 
 
@@ -83,11 +83,11 @@ def costs(volume: Volume, quick: bool) -> tuple[list[Cost], list[Cost]]:
 
 
 def _medians(work: Mapping[str, Callable[[int], object]], images: int) -> dict[str, float]:
-    """ms each takes, all in turns; the first image of each is not counted."""
+    """ms of processor time each takes, all in turns; the first image of each is not counted."""
     found: dict[str, list[float]] = {name: [] for name in work}
     for number in range(images + 1):
         for name, image in work.items():
-            before = time.perf_counter()
+            before = time.process_time()
             image(number)
-            found[name].append((time.perf_counter() - before) * 1e3)
+            found[name].append((time.process_time() - before) * 1e3)
     return {name: float(np.median(ms[1:])) for name, ms in found.items()}

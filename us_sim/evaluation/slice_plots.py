@@ -29,7 +29,7 @@ _SMALLEST = 1e-14  # voxels, drawn where a method is exact to the last bit
 
 def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
     """A panel each: the worst pixel's distance from its true place against ms an image."""
-    figure = _figure((3.9 * len(panels) + 1.8, 4.4))
+    figure = _figure((3.9 * len(panels) + 2.2, 4.4))
     axes = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     for panel, (title, points) in zip(axes, panels.items(), strict=True):
         for method, (colour, mark) in STYLES.items():
@@ -37,14 +37,14 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
             mine = [p for p in mine if np.isfinite(p.ms_median)]
             if not mine:
                 continue
-            x = [p.ms_median for p in mine]
+            x = [p.cpu_ms_median if p.threads == 1 else p.ms_median for p in mine]
             y = [max(p.max_voxel_error, _SMALLEST) for p in mine]
             panel.plot(x, y, "-", color=colour, lw=1.2, alpha=0.8)
             for at, error, point in zip(x, y, mine, strict=True):
                 fill = colour if point.threads == 1 else "white"
                 panel.plot(at, error, mark, mfc=fill, mec=colour, ms=8)
         panel.set_title(title, fontsize=11, loc="left")
-        panel.set_xlabel("ms an image (median)")
+        panel.set_xlabel("ms an image (median; one thread: processor time)", fontsize=9)
         panel.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
         panel.set_xscale("log")
         panel.set_yscale("log")
@@ -61,7 +61,7 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
 
 
 def plot_meshes(points: Sequence[Point], title: str, file: Path) -> None:
-    """Time an image against the mesh's nodes."""
+    """Processor time of an image against the mesh's nodes."""
     figure = _figure((8.2, 5.0))
     panel = figure.subplots()
     _times(panel, points, lambda p: p.nodes)
@@ -73,7 +73,7 @@ def plot_meshes(points: Sequence[Point], title: str, file: Path) -> None:
 
 
 def plot_pixels(points: Sequence[Point], title: str, file: Path) -> None:
-    """Time an image against its pixels, with a line of times in proportion to them."""
+    """Processor time of an image against its pixels, with a line in proportion to them."""
     figure = _figure((8.2, 5.0))
     panel = figure.subplots()
     _times(panel, points, lambda p: p.size**2)
@@ -82,7 +82,7 @@ def plot_pixels(points: Sequence[Point], title: str, file: Path) -> None:
         largest = max(first, key=lambda p: p.size)
         pixels = np.array([min(p.size for p in first), largest.size]) ** 2
         panel.plot(
-            pixels, largest.ms_median * pixels / pixels[-1], "--", color="0.6", lw=1, zorder=0
+            pixels, largest.cpu_ms_median * pixels / pixels[-1], "--", color="0.6", lw=1, zorder=0
         )
     sizes = sorted({p.size for p in points})
     panel.set_xticks([n**2 for n in sizes], [f"{n} × {n}" for n in sizes])
@@ -93,35 +93,35 @@ def plot_pixels(points: Sequence[Point], title: str, file: Path) -> None:
 
 def _times(panel, points, across) -> None:  # type: ignore[no-untyped-def]
     for method, (colour, mark) in STYLES.items():
-        for threads in sorted({p.threads for p in points if p.method == method}):
-            mine = [p for p in points if p.method == method and p.threads == threads]
-            mine = sorted((p for p in mine if np.isfinite(p.ms_median)), key=across)
-            panel.plot(
-                [across(p) for p in mine],
-                [p.ms_median for p in mine],
-                mark + ("-" if threads == 1 else ":"),
-                color=colour,
-                mfc=colour if threads == 1 else "white",
-                ms=6,
-                lw=1.4,
-            )
+        mine = [p for p in points if p.method == method and p.threads == 1]
+        mine = sorted((p for p in mine if np.isfinite(p.cpu_ms_median)), key=across)
+        panel.plot(
+            [across(p) for p in mine],
+            [p.cpu_ms_median for p in mine],
+            mark + "-",
+            color=colour,
+            ms=6,
+            lw=1.4,
+        )
     panel.set_xscale("log")
     panel.set_yscale("log")
     panel.axhline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
-    panel.set_ylabel("ms an image (median)")
+    panel.set_ylabel("processor time of an image, ms (median, one thread)")
     _plain(panel)
     panel.xaxis.set_minor_formatter(NullFormatter())
-    _keys(panel, {p.method for p in points})
+    _keys(panel, {p.method for p in points}, two_threads=False)
 
 
-def _keys(panel, known) -> None:  # type: ignore[no-untyped-def]
+def _keys(panel, known, two_threads=True) -> None:  # type: ignore[no-untyped-def]
     """What colours and marks mean, beside a panel."""
     keys = [
         Line2D([], [], color=colour, marker=mark, label=method)
         for method, (colour, mark) in STYLES.items()
         if method in known
     ]
-    keys.append(Line2D([], [], color="0.4", ls=":", marker="o", mfc="white", label="two threads"))
+    if two_threads:
+        words = "two threads, wall clock"
+        keys.append(Line2D([], [], color="0.4", ls="", marker="o", mfc="white", label=words))
     panel.legend(
         handles=keys, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5)
     )

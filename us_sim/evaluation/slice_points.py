@@ -60,8 +60,8 @@ class Point:
     deformation: str = ""
     plane: str = ""
     cpu_ms_median: float = float("nan")  # processor time, of all threads
-    filter_ms: float = float("nan")  # of VTK: finding the pixels in the mesh
-    sampling_ms: float = float("nan")  # of VTK: sampling the volume
+    filter_ms: float = float("nan")  # of VTK: finding pixels, processor time
+    sampling_ms: float = float("nan")  # of VTK: sampling, processor time
     images: int = 0  # that were timed
     failure: str = field(default="", metadata={"column": False})
 

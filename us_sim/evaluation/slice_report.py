@@ -102,7 +102,8 @@ def _text(
         "Times are of this run and this machine. Ratios are of methods that took turns on one "
         "thread, the lesser of those of wall clock and of processor time; what grows with nodes "
         "and pixels is processor time. Other programs on the machine lengthen the wall clock, "
-        "that of slow methods most.",
+        "that of slow methods most, so the plots and tables that compare cases have processor time "
+        "(CPU ms), which is the wall clock of one thread on a machine that does nothing else.",
         "## Error against run time",
         "![Error against run time](slice_error.png)",
         _table(*_summary(points)),
@@ -119,8 +120,8 @@ def _text(
         "![Time against nodes](slice_meshes.png)",
         _across(mesh_points(points), "nodes", lambda p: p.nodes, lambda p: f"{p.nodes:,}"),
         "## Deformations and planes",
-        f"Planes lie {views}. Times are of one thread; wrong pixels are those whose coverage "
-        "(tissue, rigid volume or nothing) is not the reference's.",
+        f"Planes lie {views}. Times are processor time of one thread; wrong pixels are those whose "
+        "coverage (tissue, rigid volume or nothing) is not the reference's.",
         _cases_table(points),
         *_vtk_apart(points),
         "## Probes and image formation",
@@ -128,7 +129,7 @@ def _text(
         f"{_nodes()} nodes pressed by 12 mm, in turns; contact includes finding where the "
         "face touches the skin.",
         _table(
-            ("probe", "ms", "pixels in the image"),
+            ("probe", "CPU ms", "pixels in the image"),
             [(c.what, f"{c.ms:.2f}", f"{100 * c.shown:.0f} %") for c in around.probes],
         ),
         _settings_table(around.settings),
@@ -191,17 +192,17 @@ def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]
 
 
 def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
-    """Times of every method along one axis, and the exponent."""
+    """Processor times of every method along one axis, and the exponent."""
     steps = sorted({across(p): word(p) for p in points}.items())
     rows = []
-    for method, threads in dict.fromkeys((p.method, p.threads) for p in points):
-        mine = [p for p in points if (p.method, p.threads) == (method, threads)]
-        times = {across(p): p.ms_median for p in mine}
+    for method in dict.fromkeys(p.method for p in points):
+        mine = [p for p in points if (p.method, p.threads) == (method, 1)]
+        times = {across(p): p.cpu_ms_median for p in mine}
         cells = [f"{times[at]:.2f}" if at in times else "" for at, _ in steps]
         power = exponent(mine, across)
-        rows.append((method, f"{threads}", *cells, f"{power:.2f}" if np.isfinite(power) else ""))
-    words = [f"{what} {name}, ms" for _, name in steps]
-    return _table(("method", "threads", *words, "exponent of CPU time"), rows)
+        rows.append((method, *cells, f"{power:.2f}" if np.isfinite(power) else ""))
+    words = [f"{what} {name}, CPU ms" for _, name in steps]
+    return _table(("method", *words, "exponent"), rows)
 
 
 def _cases_table(points: Sequence[Point]) -> str:
@@ -220,14 +221,14 @@ def _cases_table(points: Sequence[Point]) -> str:
             mine = {p.method: p for p in shown if (p.deformation, p.plane) == (deformation, plane)}
             if not mine:
                 continue
-            cells = [f"{mine[m].ms_median:.2f}" if m in mine else "" for m in methods]
+            cells = [f"{mine[m].cpu_ms_median:.2f}" if m in mine else "" for m in methods]
             wrong = [f"{mine[m].coverage_mismatch_px}" if m in mine else "" for m in methods]
             rows.append((deformation, plane, *cells, *wrong))
     return _table(
         (
             "deformation",
             "plane",
-            *(f"{m}, ms" for m in methods),
+            *(f"{m}, CPU ms" for m in methods),
             *(f"{m}, wrong px" for m in methods),
         ),
         rows,
@@ -235,12 +236,12 @@ def _cases_table(points: Sequence[Point]) -> str:
 
 
 def _vtk_apart(points: Sequence[Point]) -> list[str]:
-    mine = [p for p in size_points(points) if p.method == "vtk"]
+    mine = [p for p in size_points(points) if p.method == "vtk" and p.threads == 1]
     if not mine:
         return []
     rows = [
-        (f"{p.size}²", f"{p.threads}", f"{p.filter_ms:.1f}", f"{p.sampling_ms:.1f}")
-        for p in sorted(mine, key=lambda p: (p.size, p.threads))
+        (f"{p.size}²", f"{p.filter_ms:.1f}", f"{p.sampling_ms:.1f}")
+        for p in sorted(mine, key=lambda p: p.size)
     ]
     return [
         "## VTK's two parts",
@@ -248,7 +249,7 @@ def _vtk_apart(points: Sequence[Point]) -> list[str]:
         "the rest coordinates of its nodes (filter); another samples the volume there (sampling). "
         "The mesh is given in the image's own coordinates, for the filter ignores an image's "
         "direction. VTK's wheels use one thread unless told otherwise.",
-        _table(("size", "threads", "filter ms", "sampling ms"), rows),
+        _table(("size", "filter, CPU ms", "sampling, CPU ms"), rows),
     ]
 
 
@@ -259,7 +260,7 @@ def _nodes() -> str:
 def _settings_table(settings: Sequence[Cost]) -> str:
     plain = settings[0].ms if settings else 0.0
     rows = [(c.what, f"{c.ms:.2f}", f"{c.ms - plain:+.2f}") for c in settings]
-    return _table(("imaging", "ms", "more than at the defaults"), rows)
+    return _table(("imaging", "CPU ms", "more than at the defaults"), rows)
 
 
 def _recorded(comparison: RecordedComparison | None) -> list[str]:

@@ -44,9 +44,9 @@ class VtkSlicer:
     """
 
     filter_ms: float = float("nan")
-    """What finding the pixels of the latest image took."""
+    """Processor time of finding the pixels of the latest image."""
     sampling_ms: float = float("nan")
-    """What sampling the volume for the latest image took."""
+    """Processor time of sampling the volume for the latest image."""
 
     def __init__(
         self,
@@ -107,10 +107,10 @@ class VtkSlicer:
         """(rows, columns): the grey values of tissue, 0 elsewhere."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
-        begin = time.perf_counter()
+        begin = time.process_time()
         self._use_threads()
         self._find(nodes, plane)
-        found = time.perf_counter()
+        found = time.process_time()
         self._at.SetData(self._finder.GetOutput().GetPointData().GetArray("rest"))
         self._at.Modified()
         self._sampler.Update()
@@ -118,7 +118,7 @@ class VtkSlicer:
         image = vtk_to_numpy(data.GetArray("grey")).reshape(plane.rows, plane.columns)
         image = np.where(self._valid(plane), image, np.uint8(0))
         self.filter_ms = (found - begin) * 1e3
-        self.sampling_ms = (time.perf_counter() - found) * 1e3
+        self.sampling_ms = (time.process_time() - found) * 1e3
         return image
 
     def rest_coordinates(
