@@ -155,7 +155,10 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
         marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in vertices[triangles.ravel()].tolist()]
         expected.markers.append(marker)
-    assert structure_markers(given_ones, STAMP, frame) == serialize_message(expected)
+    serialized = structure_markers(given_ones, STAMP, frame)
+    # Not byte for byte: what fills the gaps between numbers is up to the middleware.
+    assert len(serialized) == len(serialize_message(expected))
+    assert deserialize_message(serialized, MarkerArray) == expected
 
 
 @quick
