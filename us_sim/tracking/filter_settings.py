@@ -59,13 +59,13 @@ class FilterSettings:
     )
     acceleration: float = given(
         Quantity("number", 1e-6, 1e4),
-        default=0.1,
+        default=0.05,
         description="m/s per root second, Kalman: how much the speed changes within a second, one "
         "standard deviation; within a time t by the root of t as much",
     )
     angular_acceleration: float = given(
         Quantity("number", 1e-6, 1e5),
-        default=1.0,
+        default=0.5,
         description="rad/s per root second, Kalman: the same of the rotation",
     )
     position_deviation: float = given(
