@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.pose import Pose
-from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.camera_model import CameraModel, project_points
+from us_sim.tracking.definite_system import solve_definite
 from us_sim.tracking.plane_pose import plane_poses
 
 __all__ = ["BodyPose", "body_poses", "rotation_angle"]
@@ -156,45 +157,18 @@ def _refined(
     position: NDArray[np.float64],
     deviation: float,
 ) -> BodyPose | None:
-    """Levenberg-Marquardt on SE(3) with Huber's weights, from a first pose.
-
-    The step is a shift and a rotation about the camera's axes through the body's origin, so that
-    the inverse of the normal matrix is the covariance as ROS has it.
-    """
-    damping = 1e-4
-    arms = points @ rotation.T
-    seen, slopes = camera.linearise(arms + position)
-    residuals = seen - pixels
-    misfit = _misfit(residuals, deviation)
+    """The pose of least misfit near a first one; None where that leads behind the camera."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, position
     normal = np.empty((6, 6))
-    for _ in range(_ITERATIONS):
-        if not np.isfinite(misfit):
-            return None
-        normal, gradient = _normal_equations(arms, slopes, residuals, deviation)
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-        turn = np.asarray(cv2.Rodrigues(step[3:])[0])
-        new_rotation, new_position = turn @ rotation, position + step[:3]
-        new_arms = points @ new_rotation.T
-        new_seen, new_slopes = camera.linearise(new_arms + new_position)
-        new_misfit = _misfit(new_seen - pixels, deviation)
-        if not new_misfit <= misfit:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-            continue
-        gain = misfit - new_misfit
-        rotation, position, arms, slopes = new_rotation, new_position, new_arms, new_slopes
-        residuals, misfit = new_seen - pixels, new_misfit
-        damping = max(damping * 0.1, 1e-9)
-        if gain <= 1e-9 * misfit + 1e-12:
-            break
-    normal, _ = _normal_equations(arms, slopes, residuals, deviation)
+    residuals = np.empty_like(pixels)
+    misfit = _descend(points, pixels, *camera.lens, deviation, matrix, normal, residuals)
+    if not np.isfinite(misfit):
+        return None
     squares = float((residuals**2).sum())
     freedom = max(1, residuals.size - 6)
     found = max(deviation, float(np.sqrt(min(squares, misfit * deviation**2) / freedom)))
     covariance = np.linalg.pinv(normal, hermitian=True) * (found / deviation) ** 2
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position
     return BodyPose(
         Pose.from_matrix(matrix),
         0.5 * (covariance + covariance.T),
@@ -205,19 +179,113 @@ def _refined(
     )
 
 
-def _normal_equations(
-    arms: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    residuals: NDArray[np.float64],
-    deviation: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _descend(points, pixels, lens, fisheye, deviation, matrix, normal, residuals):
+    """Levenberg-Marquardt on SE(3) with Huber's weights, from the pose in ``matrix`` (4, 4).
+
+    A step is a shift and a rotation about the camera's axes through the body's origin, so that
+    the inverse of the normal matrix is the covariance as ROS has it.
+
+    Returns:
+        The misfit, infinite where points are not before the camera; the pose, the normal matrix
+        (6, 6) in deviations and the residuals (N, 2) pixels in place.
+    """
+    count = len(points)
+    arms = np.empty((count, 3))
+    seen = np.empty((count, 2))
+    slopes = np.empty((count, 2, 3))
+    gradient = np.empty(6)
+    damped = np.empty((6, 6))
+    step = np.empty(6)
+    turn = np.empty((3, 3))
+    trial = matrix.copy()
+    damping = 1e-4
+    misfit = np.inf
+    for iteration in range(_ITERATIONS + 1):
+        _turn_points(points, trial, arms, seen, slopes, lens, fisheye)
+        new_misfit = 0.0
+        for i in range(count):
+            x, y = seen[i, 0] - pixels[i, 0], seen[i, 1] - pixels[i, 1]
+            square = (x * x + y * y) / (deviation * deviation)
+            if square <= _HUBER * _HUBER:
+                new_misfit += square
+            else:
+                new_misfit += 2 * _HUBER * np.sqrt(square) - _HUBER * _HUBER
+        if new_misfit < misfit or (iteration == 0 and np.isfinite(new_misfit)):
+            gain = misfit - new_misfit
+            misfit = new_misfit
+            matrix[:] = trial
+            residuals[:] = seen - pixels
+            _normal_equations(arms, slopes, residuals, deviation, normal, gradient)
+            damping = max(damping * 0.1, 1e-9)
+            if gain <= 1e-9 * misfit + 1e-12:
+                break
+        else:
+            if iteration == 0:
+                return np.inf
+            damping *= 10.0
+            if damping > 1e8:
+                break
+        if iteration == _ITERATIONS:
+            break
+        damped[:] = normal
+        for a in range(6):
+            damped[a, a] *= 1.0 + damping
+            step[a] = -gradient[a]
+        if not solve_definite(damped, step):
+            break
+        _rotation(step[3:], turn)
+        trial[:3, :3] = turn @ matrix[:3, :3].copy()
+        trial[:3, 3] = matrix[:3, 3] + step[:3]
+    return misfit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn_points(points, matrix, arms, seen, slopes, lens, fisheye):
+    """The points turned (``arms``), and where they are seen at the pose, with derivatives."""
+    places = np.empty((len(points), 3))
+    for i in range(len(points)):
+        for a in range(3):
+            arms[i, a] = 0.0
+            for b in range(3):
+                arms[i, a] += matrix[a, b] * points[i, b]
+            places[i, a] = arms[i, a] + matrix[a, 3]
+    project_points(places, lens, fisheye, seen, slopes)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(arms, slopes, residuals, deviation, normal, gradient):
     """JᵀWJ (6, 6) and JᵀWr (6,) in deviations, of the shift and then the rotation."""
-    lengths = np.sqrt(np.einsum("ij,ij->i", residuals, residuals))
-    weights = np.sqrt(np.minimum(1.0, _HUBER * deviation / np.maximum(lengths, 1e-12))) / deviation
-    jacobian = np.empty((len(arms), 2, 6))
-    jacobian[..., :3] = slopes
-    # A rotation w moves a point by w × arm: the slope of that is (arm × slope) · w.
-    jacobian[..., 3:] = np.cross(arms[:, None], slopes)
-    jacobian *= weights[:, None, None]
-    flat = jacobian.reshape(-1, 6)
-    return flat.T @ flat, flat.T @ (residuals * weights[:, None]).ravel()
+    row = np.empty(6)
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    for i in range(len(arms)):
+        length = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2)
+        weight = min(1.0, _HUBER * deviation / max(length, 1e-12)) / (deviation * deviation)
+        x, y, z = arms[i]
+        for side in range(2):
+            a, b, c = slopes[i, side]
+            # A rotation w moves a point by w × arm: the slope of that is (arm × slope) · w.
+            row[0], row[1], row[2] = a, b, c
+            row[3], row[4], row[5] = y * c - z * b, z * a - x * c, x * b - y * a
+            for j in range(6):
+                gradient[j] += weight * row[j] * residuals[i, side]
+                for k in range(6):
+                    normal[j, k] += weight * row[j] * row[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rotation(vector, turn):
+    """Fill in the rotation (3, 3) of a rotation vector (3,) rad, by Rodrigues."""
+    x, y, z = vector
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if angle > 1e-4:
+        sine, cosine = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    turn[0, 0] = 1.0 - cosine * (y * y + z * z)
+    turn[1, 1] = 1.0 - cosine * (x * x + z * z)
+    turn[2, 2] = 1.0 - cosine * (x * x + y * y)
+    turn[0, 1], turn[1, 0] = cosine * x * y - sine * z, cosine * x * y + sine * z
+    turn[0, 2], turn[2, 0] = cosine * x * z + sine * y, cosine * x * z - sine * y
+    turn[1, 2], turn[2, 1] = cosine * y * z - sine * x, cosine * y * z + sine * x

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 
-__all__ = ["DISTORTION_MODELS", "CameraModel"]
+__all__ = ["DISTORTION_MODELS", "CameraModel", "project_points"]
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """ROS's names of the lens models, and how many coefficients each has."""
@@ -90,8 +90,10 @@ class CameraModel:
         object.__setattr__(self, "distortion", distortion)
 
     @cached_property
-    def _lens(self) -> tuple[NDArray[np.float64], bool]:
-        """(13,): fx, fy, cx, cy, skew and eight coefficients; and whether it is a fisheye's."""
+    def lens(self) -> tuple[NDArray[np.float64], bool]:
+        """For `project_points`: (13,) fx, fy, cx, cy, skew and eight coefficients; whether they are
+        a fisheye's.
+        """
         numbers = np.zeros(13)
         matrix = self.matrix
         numbers[:5] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[0, 1]
@@ -109,7 +111,7 @@ class CameraModel:
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         pixels = np.empty((len(points), 2))
         slopes = np.empty((len(points), 2, 3))
-        _project(points, *self._lens, pixels, slopes)
+        project_points(points, *self.lens, pixels, slopes)
         return pixels, slopes
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -118,7 +120,7 @@ class CameraModel:
         """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
         rays = np.empty((len(pixels), 2))
-        _undistort(pixels, *self._lens, rays)
+        _undistort(pixels, *self.lens, rays)
         return rays
 
     def require_image(self, image: NDArray[Any]) -> NDArray[np.uint8]:
@@ -197,8 +199,14 @@ def _distort(x, y, lens, fisheye):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _project(points, lens, fisheye, pixels, slopes):
-    """Pixels (N, 2) and their derivatives (N, 2, 3) of points (N, 3)."""
+def project_points(points, lens, fisheye, pixels, slopes):
+    """Fill in pixels (N, 2) and their derivatives (N, 2, 3) of points (N, 3).
+
+    Args:
+        points: m, in front of the camera; pixels of others are NaN.
+        lens, fisheye: `CameraModel.lens`.
+        pixels, slopes: what is filled in.
+    """
     fx, fy, cx, cy, skew = lens[0], lens[1], lens[2], lens[3], lens[4]
     for i in range(len(points)):
         depth = points[i, 2]
@@ -220,7 +228,7 @@ def _project(points, lens, fisheye, pixels, slopes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _undistort(pixels, lens, fisheye, rays):
-    """Inverts `_project` by Newton's method; NaN where it does not arrive."""
+    """Inverts `project_points` by Newton's method; NaN where it does not arrive."""
     fx, fy, cx, cy, skew = lens[0], lens[1], lens[2], lens[3], lens[4]
     for i in range(len(pixels)):
         v = (pixels[i, 1] - cy) / fy

@@ -42,6 +42,8 @@ _FORGETTING = 0.9  # of what earlier images say about which of two poses it is, 
 _SURE = 12.0  # log likelihood ratio beyond which more does not count: so that it can be unlearned
 _MARGIN = 0.35  # of the body's size in the image, around where it is looked for
 _LEAST_MARGIN = 24  # pixels
+_SEARCHED = 500_000  # pixels, of an image in which all is looked for at once
+_SHORTEST = 40.0  # pixels, of a marker's edge in an image that is reduced to find it
 
 
 class CameraSource:
@@ -109,25 +111,34 @@ class CameraSource:
 
     def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
         """The body's markers, near where they were or else anywhere."""
-        if before is not None:
-            window = self._window(before)
-            if window is not None:
-                detection = self._detector.detect(image, window)
-                if len(detection.ids) >= self.settings.minimum_markers:
-                    return detection
+        least = self.settings.minimum_markers
+        near = self._near(before) if before is not None else None
+        if near is not None:
+            detection = self._detector.detect(image, *near)
+            if len(detection.ids) >= least:
+                return detection
+        if image.size >= 4 * _SEARCHED:
+            reduction = int(math.sqrt(image.size / _SEARCHED))
+            detection = self._detector.detect(image, reduction=reduction)
+            if len(detection.ids) >= least:
+                return detection
         return self._detector.detect(image)
 
-    def _window(self, pose: Pose) -> tuple[int, int, int, int] | None:
-        """Left, top, right and bottom pixel around the body as it was."""
-        pixels = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
-        if not np.isfinite(pixels).all():
+    def _near(self, pose: Pose) -> tuple[tuple[int, int, int, int], int] | None:
+        """The window around the body as it was, and by how much to reduce the image there."""
+        corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        if not np.isfinite(corners).all():
             return None
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        low, high = corners.min(axis=0), corners.max(axis=0)
         margin = max(_LEAST_MARGIN, _MARGIN * float((high - low).max()))
         size = np.array([self.camera.width, self.camera.height])
         left, top = np.clip(np.floor(low - margin), 0, size).astype(int).tolist()
         right, bottom = np.clip(np.ceil(high + margin), 0, size).astype(int).tolist()
-        return (left, top, right, bottom) if right - left > 8 and bottom - top > 8 else None
+        if right - left < _LEAST_MARGIN or bottom - top < _LEAST_MARGIN:
+            return None
+        ways = corners.reshape(-1, 4, 2)
+        edge = float(np.linalg.norm(ways[:, [0, 1]] - ways[:, [1, 2]], axis=2).max(axis=1).min())
+        return (left, top, right, bottom), max(1, min(4, int(edge / _SHORTEST)))
 
     def _pose(
         self, image: NDArray[np.uint8], detection: Detection, before: Pose | None

@@ -24,12 +24,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.tracking.definite_system import solve_definite
+
 __all__ = ["refined_corners"]
 
 _WIDEST = 4.0  # pixels on either side of an edge that are looked at
 _LONGEST = 150  # pixels along an edge, evenly spread, that are looked at
 _ROUNDS = 3
 _STEPS = 6
+_LOGISTIC = 1.702  # so steep is the logistic function that is nearest to the normal integral
+_STEADY = 3e-3  # pixels, a step after which no other is worth its time
+_SETTLED = 0.1  # pixels, of a round: the next would look at the same pixels
 _LEAST_CONTRAST = 5.0  # grey
 
 
@@ -38,8 +43,8 @@ def refined_corners(
 ) -> NDArray[np.float64] | None:
     """The corners (4, 2) pixels of a marker's black square on white.
 
-    Along every edge, grey goes from black to white as the integral of a bell curve; where, how
-    wide, and between which greys is fitted to the pixels about it by least squares. The edge may
+    Across every edge, grey goes from black to white as a logistic function; where, how wide, and
+    between which greys is fitted to the pixels about it by least squares. The edge may
     bow a little, as lenses make it.
 
     Args:
@@ -73,7 +78,7 @@ def _refine(image, corners, cells, refined):
                 return False
             moved = max(moved, abs(x - refined[k, 0]), abs(y - refined[k, 1]))
             refined[k, 0], refined[k, 1] = x, y
-        if moved < 0.01:
+        if moved < _SETTLED:
             break
     return True
 
@@ -118,7 +123,8 @@ def _fit_edge(image, start, end, cells, edge, widths, k):
     it was found. ``widths[k]`` is the blur's deviation, kept from round to round.
 
     Along the edge s goes from -1 to 1; across it, outwards, the grey is
-    black + (white - black) Φ((d - offset - slope s - bow (s² - 1/3)) / width).
+    black + (white - black) S((d - offset - slope s - bow (s² - 1/3)) / width), S the logistic
+    function.
     """
     rows, columns = image.shape
     tx, ty = end[0] - start[0], end[1] - start[1]
@@ -187,37 +193,33 @@ def _fit_profile(place, length, reach, edge, widths, k):
     noise = 0.02 * (white - black)
     bow_weight = (noise / (0.002 * length + 0.01)) ** 2
     width_weight = (noise / 1.0) ** 2
-    normal = np.empty((6, 6))
+    slopes = np.empty((len(place), 7))  # the last column is what is left over
     right = np.empty(6)
-    slopes = np.empty(6)
     for _ in range(_STEPS):
-        normal[:] = 0.0
-        right[:] = 0.0
         contrast = white - black
         for i in range(len(place)):
             s = place[i, 0]
             bend = s * s - 1.0 / 3.0
             z = (place[i, 1] - edge[0] - edge[1] * s - edge[2] * bend) / width
-            step = 0.5 * math.erfc(-0.7071067811865476 * z)
-            bell = 0.3989422804014327 * math.exp(-0.5 * z * z) * contrast / width
-            rest = place[i, 2] - black - contrast * step
-            slopes[0] = -bell
-            slopes[1] = -bell * s
-            slopes[2] = -bell * bend
-            slopes[3] = 1.0 - step
-            slopes[4] = step
-            slopes[5] = -bell * z
-            for a in range(6):
-                right[a] += slopes[a] * rest
-                for b in range(a + 1):
-                    normal[a, b] += slopes[a] * slopes[b]
+            step = 1.0 / (1.0 + math.exp(-_LOGISTIC * z))
+            bell = _LOGISTIC * step * (1.0 - step) * contrast / width
+            slopes[i, 0] = -bell
+            slopes[i, 1] = -bell * s
+            slopes[i, 2] = -bell * bend
+            slopes[i, 3] = 1.0 - step
+            slopes[i, 4] = step
+            slopes[i, 5] = -bell * z
+            slopes[i, 6] = place[i, 2] - black - contrast * step
+        squares = slopes.T @ slopes
+        normal = squares[:6, :6]
+        right[:] = squares[6, :6]
         normal[2, 2] += bow_weight
         right[2] -= bow_weight * edge[2]
         normal[5, 5] += width_weight
         right[5] -= width_weight * (width - 1.0)
         for a in range(6):
             normal[a, a] *= 1.0 + 1e-6
-        if not _solve(normal, right):
+        if not solve_definite(normal, right):
             return False
         turn = min(1.0, 1.0 / max(1e-9, abs(right[0]), abs(right[1])))
         for a in range(3):
@@ -227,33 +229,7 @@ def _fit_profile(place, length, reach, edge, widths, k):
         width = min(3.0, max(0.3, width + max(-0.4, min(0.4, right[5]))))
         if not (white - black > _LEAST_CONTRAST and abs(edge[0]) < reach + 1.0):
             return False
-        if abs(right[0]) < 1e-3 and abs(right[1]) < 1e-3:
+        if abs(right[0]) < _STEADY and abs(right[1]) < _STEADY:
             break
     widths[k] = width
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve(normal, right):
-    """In place by Cholesky's factor of the lower triangle (6, 6); whether it is definite."""
-    size = len(right)
-    for i in range(size):
-        for j in range(i + 1):
-            total = normal[i, j]
-            for k in range(j):
-                total -= normal[i, k] * normal[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                normal[i, i] = math.sqrt(total)
-            else:
-                normal[i, j] = total / normal[j, j]
-    for i in range(size):
-        for j in range(i):
-            right[i] -= normal[i, j] * right[j]
-        right[i] /= normal[i, i]
-    for i in range(size - 1, -1, -1):
-        for j in range(i + 1, size):
-            right[i] -= normal[j, i] * right[j]
-        right[i] /= normal[i, i]
     return True
