@@ -1,6 +1,7 @@
 """Scene files: what they mean, and one sentence with file and key for each kind of mistake."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -256,3 +257,60 @@ def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(s
     middle = LIVER_SWEEP.pose(sweep.image_to_reference[len(sweep.numbers) // 2])
     place = Pose(scene.volume.pose.position, scene.volume.pose.orientation) @ middle
     np.testing.assert_allclose(place.matrix, np.eye(4), atol=2e-6)
+
+
+def test_a_scene_says_only_what_differs_from_the_one_it_is_based_on(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "grip.yaml").write_text("markers: []")
+    (tmp_path / "far" / "base.yaml").write_text(
+        "based_on: upper_arm\ntracker: {source: camera, camera: {body: grip.yaml}}"
+    )
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: mine\nbased_on: far/base.yaml\nprobe: {depth: 3 cm}\nskin: null")
+    scene, arm = load_scene(file), load_scene("upper_arm")
+    assert (scene.name, scene.origin) == ("mine", str(file))
+    assert scene.probe == dataclasses.replace(arm.probe, depth=0.03)
+    assert scene.skin is None
+    assert scene.tissue == arm.tissue
+    assert scene.tracker.camera.body == str(tmp_path / "far" / "grip.yaml")
+
+
+@pytest.mark.parametrize(
+    ("base", "sentence"),
+    [
+        ("mine.yaml", "is based on this scene itself"),
+        ("other.yaml", "is based on this scene itself"),
+        ("nowhere", "there is no scene file nowhere"),
+        ("[1]", "must be a scene's file or name"),
+        ("list.yaml", "is no mapping of keys"),
+        ("bad.yaml", "is not YAML"),
+    ],
+)
+def test_a_base_that_cannot_be_is_one_sentence(tmp_path, base, sentence):
+    (tmp_path / "other.yaml").write_text("based_on: mine.yaml")
+    (tmp_path / "list.yaml").write_text("- 1")
+    (tmp_path / "bad.yaml").write_text("{")
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\nbased_on: {base}")
+    with pytest.raises(SceneError, match=sentence):
+        load_scene(file)
+
+
+@pytest.mark.parametrize(
+    ("tracker", "sentence"),
+    [
+        ("{source: telepathy}", r"tracker\.source: 'telepathy' is not one of pose"),
+        ("{filter: {method: median}}", r"tracker\.filter\.method: 'median' is not one of none"),
+        ("{gate: {maximum_speed: -1}}", r"tracker\.gate\.maximum_speed: -1 m/s is outside"),
+        ("{registration: nowhere.yaml}", r"tracker\.registration: there is no file"),
+        ("{registration: {orientation: [0, 0]}}", r"tracker\.registration\.orientation: needs 4"),
+        ("{six_dof_mouse: {axes: [0, 1]}}", r"six_dof_mouse\.axes: .* has 2 numbers"),
+        ("{camera: {size: 4}}", r"tracker\.camera\.size: 4 m is outside .* '4 cm'|'4 mm'"),
+    ],
+)
+def test_a_tracker_that_cannot_be_is_one_sentence(tmp_path, tracker, sentence):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\nbased_on: upper_arm\ntracker: {tracker}")
+    with pytest.raises(SceneError, match=sentence) as caught:
+        load_scene(file)
+    assert "\n" not in str(caught.value)

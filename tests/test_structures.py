@@ -37,7 +37,7 @@ DOCUMENT = {
 
 @pytest.fixture(scope="module")
 def organ(shared_data):
-    return parse_scene(DOCUMENT, folder=shared_data / "meshes-sofa")
+    return parse_scene(DOCUMENT, folders=[shared_data / "meshes-sofa"])
 
 
 def test_a_mesh_from_a_file_takes_the_place_of_the_box(organ):
@@ -115,7 +115,7 @@ def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, shared_data)
     def scene(mesh):
         return parse_scene(
             DOCUMENT | {"tissue": DOCUMENT["tissue"] | {"mesh": mesh}},
-            folder=shared_data / "meshes-sofa",
+            folders=[shared_data / "meshes-sofa"],
         )
 
     with pytest.raises(MeshError, match=r"truthcylinder1.msh: the mesh is 35.6 m long: give its"):

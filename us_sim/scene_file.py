@@ -13,16 +13,16 @@ import dataclasses
 import difflib
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
-
-import yaml
 
 from us_sim.assembly import probe_of
 from us_sim.errors import SceneError, UsSimError
 from us_sim.quantity import Quantity
 from us_sim.scene import PoseSection, Scene, TissueSection, VolumeSection
+from us_sim.scene_document import read_document
 from us_sim.share import shared_roots
 
 __all__ = ["find_scene", "load_scene", "parse_scene"]
@@ -54,26 +54,18 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
         SceneError: the file or a value in it cannot be used; one sentence with file and key.
     """
     path = find_scene(name)
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}:" if mark else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        raise SceneError(f"{path}:{where} is not YAML: {problem}") from error
+    document, folders = read_document(path, find_scene)
     if volume:
         if not isinstance(document, dict) or not isinstance(document.get("volume"), dict):
             raise SceneError(f"{path}: volume: must be a mapping of keys")
         document["volume"] = {
             key: value for key, value in document["volume"].items() if key != "phantom"
         } | {"file": str(Path(volume).expanduser().resolve())}
-    return parse_scene(document, origin=str(path), folder=path.parent)
+    return parse_scene(document, origin=str(path), folders=folders)
 
 
-def parse_scene(document: object, *, origin: str = "scene", folder: Path | None = None) -> Scene:
-    """Validate an already read document; relative files are looked up beside ``folder``.
+def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Path] = ()) -> Scene:
+    """Validate an already read document; relative files are looked up in ``folders``.
 
     Raises:
         SceneError: see :func:`load_scene`.
@@ -89,7 +81,7 @@ def parse_scene(document: object, *, origin: str = "scene", folder: Path | None 
         raise SceneError(
             f"{origin}: probe.collider: is missing, and the skin needs one to press it"
         )
-    resolved: Scene = _resolve_files(scene, origin, folder or Path.cwd())
+    resolved: Scene = _resolve_files(scene, origin, [*folders, Path.cwd()])
     return resolved
 
 
@@ -265,19 +257,19 @@ def _check_structures(scene: Scene, origin: str) -> None:
             raise SceneError(f"{key}: `unit` and `pose` are for a surface from a `file` only")
 
 
-def _resolve_files(section: Any, origin: str, folder: Path, key: str = "") -> Any:
+def _resolve_files(section: Any, origin: str, folders: Sequence[Path], key: str = "") -> Any:
     """A section, and those in it, with absolute paths of files that are there."""
     changes: dict[str, Any] = {}
     for entry in dataclasses.fields(section):
         value = getattr(section, entry.name)
         name = f"{key}.{entry.name}" if key else entry.name
         if isinstance(value, str) and value and entry.metadata.get("file"):
-            changes[entry.name] = _existing(value, origin, folder, name)
+            changes[entry.name] = _existing(value, origin, folders, name)
         elif dataclasses.is_dataclass(value):
-            changes[entry.name] = _resolve_files(value, origin, folder, name)
+            changes[entry.name] = _resolve_files(value, origin, folders, name)
         elif isinstance(value, dict):
             changes[entry.name] = {
-                k: _resolve_files(v, origin, folder, f"{name}.{k}")
+                k: _resolve_files(v, origin, folders, f"{name}.{k}")
                 if dataclasses.is_dataclass(v)
                 else v
                 for k, v in value.items()
@@ -285,10 +277,10 @@ def _resolve_files(section: Any, origin: str, folder: Path, key: str = "") -> An
     return dataclasses.replace(section, **changes)
 
 
-def _existing(name: str, origin: str, folder: Path, key: str) -> str:
+def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
     """The absolute path of a file named in a scene."""
     path = Path(name).expanduser()
-    candidates = [path] if path.is_absolute() else [folder / path, Path.cwd() / path]
+    candidates = [path] if path.is_absolute() else [folder / path for folder in folders]
     if key == "path" and not path.is_absolute():
         candidates += [root / "bags" / path for root in shared_roots()]
     for candidate in candidates:
