@@ -6,6 +6,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NODES = [
+    "haptic_renderer",
     "path_player",
     "probe_tracker",
     "session_player",

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from us_sim.slicing.probe import Probe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
+    from us_sim.tracking.haptic_rendering import HapticRendering
     from us_sim.tracking.probe_tracking import ProbeTracking
     from us_sim.tracking.rigid_body import RigidBody
     from us_sim.volume.volume import Volume
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "camera_body_of",
     "collider_of",
+    "haptic_rendering_of",
     "membrane_of",
     "path_of",
     "probe_of",
@@ -151,6 +153,24 @@ def tracking_of(scene: Scene) -> ProbeTracking:
         coast_for=tracker.coast_for,
         lost_after=tracker.lost_after,
     )
+
+
+def haptic_rendering_of(scene: Scene) -> HapticRendering:
+    """What tells the wrench on the handle of the scene's haptic arm.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+    """
+    from us_sim.tracking.haptic_device import HapticDevice
+    from us_sim.tracking.haptic_rendering import HapticRendering
+    from us_sim.tracking.haptic_settings import HapticSettings
+
+    tracker = scene.tracker
+    settings = tracker.haptic or HapticSettings()
+    device = HapticDevice(
+        settings, _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
+    )
+    return HapticRendering(settings, device, time_offset=tracker.time_offset)
 
 
 def _pose_or_file(given: PoseSection | str | None) -> Pose:

@@ -14,6 +14,7 @@ from std_msgs.msg import Int32MultiArray
 
 from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError, SolverError, UsSimError
+from us_sim.nodes.contact_model_publisher import ContactModelPublisher
 from us_sim.nodes.conversions import (
     cloud_message,
     pose_from,
@@ -37,7 +38,8 @@ ALWAYS = Time()
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
 
-    ``tissue/structures`` too where the scene has structures, see `StructureMarkers`.
+    ``tissue/contact_model`` too where somebody needs it, see `ContactModelPublisher`, and
+    ``tissue/structures`` where the scene has structures, see `StructureMarkers`.
 
     The parameter ``solver`` switches the method while running; the state is carried over. With
     ``compare_with`` another method runs on the same poses, and diagnostics say how far its nodes
@@ -65,6 +67,7 @@ class TissueDeformer(SceneNode):
         self.add_post_set_parameters_callback(self._switch)
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
+        self._contact = ContactModelPublisher(self)
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
@@ -117,12 +120,14 @@ class TissueDeformer(SceneNode):
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
         felt = self._wrench.get_subscription_count() > 0
+        touched = self._contact.is_wanted
         stamp = message.header.stamp
         shown = self._structures is not None and self._structures.is_due(stamp)
-        if not (wanted or felt or shown):
+        if not (wanted or felt or touched or shown):
             return
         try:
-            deformation = self._tissue.deform(pose_from(message))
+            pose = pose_from(message)
+            deformation = self._tissue.deform(pose)
         except UsSimError as error:
             self.health.problem("pose", f"{error}; the tissue stays as it was")
             return
@@ -134,6 +139,8 @@ class TissueDeformer(SceneNode):
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
+        if touched:
+            self._contact.publish(self._tissue, pose, deformation, stamp)
         if self._structures is not None and shown:
             self._structures.publish(deformation.nodes, stamp)
         self.health.state = self._tissue.name

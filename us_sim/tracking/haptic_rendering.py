@@ -106,8 +106,13 @@ class HapticRendering:
         self._left_over, self._since = np.zeros(6), 0  # of the models before, and from when on, ns
         self._felt = np.zeros(6)
         self._ways: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
-        self._energy = 0.0  # J, taken from the handle since contact began, less what it was given
-        self._doubted("no pose of the handle yet")
+        #: J, taken from the handle since contact began, less what it was given.
+        self.energy = 0.0
+        #: Why nothing is felt; '' while something may be.
+        self.doubt = "no pose of the handle yet"
+        #: How often a doubt has ended what was felt, and the last that did.
+        self.stops, self.stopped = 0, ""
+        self._doubted(self.doubt)
 
     @property
     def stamp(self) -> int | None:
@@ -141,7 +146,7 @@ class HapticRendering:
         way = np.zeros(6)
         if here is not None:
             way = _way(here, self._poses[-1])
-        self._energy -= float(self._felt @ way)
+        self.energy -= float(self._felt @ way)
         self._ways.append(way)
         if doubt:
             # Only what is found from here on is believed.
@@ -162,9 +167,9 @@ class HapticRendering:
         wrench = self._model.wrench_at(probe) + self._left(now)
         felt = self._unilateral(self._device.on_handle(probe, wrench))
         felt = self._limited(felt) * min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
-        if self._energy > 0.0:
+        if self.energy > 0.0:
             stored = _STORED * self._device.share * self._model.energy_at(probe)
-            self._energy = min(self._energy, max(stored, 0.0)) if wrench.any() else 0.0
+            self.energy = min(self.energy, max(stored, 0.0)) if wrench.any() else 0.0
         self._felt = self._limited(self._unilateral(self._passive(felt)))
         return self._felt.copy()
 
@@ -257,13 +262,16 @@ class HapticRendering:
 
     def _doubted(self, doubt: str) -> NDArray[np.float64]:
         """Zero, and begin anew with the next model."""
+        if not self.doubt:
+            self.stopped = doubt
+            self.stops += 1
         self.doubt = doubt
         self._begun = None
         self._model = None
         self._left_over, self._since = np.zeros(6), 0
         self._felt = np.zeros(6)
         self._ways.clear()
-        self._energy = min(self._energy, 0.0)  # what was given away is still owed
+        self.energy = min(self.energy, 0.0)  # what was given away is still owed
         return np.zeros(6)
 
     def _left(self, now: int) -> NDArray[np.float64]:
@@ -294,7 +302,7 @@ class HapticRendering:
         """The wrench, less what along the handle's way would give more than there is."""
         way = np.mean(self._ways, axis=0)
         given = float(felt @ way)
-        left = self._energy
+        left = self.energy
         allowed = left / _RESERVE if left > 0.0 else left
         if given <= allowed:
             return felt

@@ -1,0 +1,188 @@
+"""The haptic node: what a wall gives back, zero at any doubt, and the whole way from the tissue."""
+
+import numpy as np
+import pytest
+from bench import pose_at
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.time import Time
+from std_msgs.msg import Bool, Float64MultiArray
+
+from us_sim.errors import SceneError, TrackingError
+from us_sim.nodes.conversions import contact_model_from, contact_model_message, pose_from
+from us_sim.nodes.haptic_renderer import HapticRenderer
+from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.pose import Pose
+from us_sim.tracking.contact_model import ContactModel
+
+TRACKER = "tracker: {source: haptic, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s"
+SPRING = 200.0  # N/m
+
+
+@pytest.fixture
+def scene(small_scene, tmp_path):
+    file = tmp_path / "haptic.yaml"
+    file.write_text(f"{small_scene.read_text()}\n{TRACKER}, pose_timeout: 1 s}}}}\n")
+    return file
+
+
+@pytest.fixture
+def arm(bench, scene):
+    """The node, the wrenches it publishes, and a handle that presses a wall."""
+    node = bench.make(HapticRenderer, scene=str(scene))
+    wrenches = bench.collect(WrenchStamped, "haptic/wrench")
+    return node, wrenches, Handle(bench)
+
+
+class Handle:
+    def __init__(self, bench):
+        self._bench = bench
+        self.poses = bench.publisher(PoseStamped, "haptic/pose")
+        self.models = bench.publisher(Float64MultiArray, "tissue/contact_model")
+        self.clutch = bench.publisher(Bool, "haptic/clutch")
+        self._nanoseconds = 1_000_000_000
+
+    def move(self, depth, *, model=True):
+        """To a depth; the tissue's model at that pose follows."""
+        self._nanoseconds += 1_000_000
+        message = pose_at(depth, 0, frame="arm")
+        message.header.stamp = Time(nanoseconds=self._nanoseconds).to_msg()
+        self.poses.publish(message)
+        if model:
+            self._bench.spin_for(2)
+            wrench = np.array([0.0, 0.0, -SPRING * max(depth, 0.0), 0.0, 0.0, 0.0])
+            stiffness = np.diag([0.0, 0.0, SPRING * (depth > 0), 0.0, 0.0, 0.0])
+            pressed = ContactModel(self._nanoseconds, pose_from(message), wrench, stiffness)
+            self.models.publish(contact_model_message(pressed))
+
+    def press(self, depth):
+        """Slowly down to a depth."""
+        for part in np.linspace(-0.001, depth, 20):
+            self.move(part)
+            self._bench.spin_for(1)
+
+
+def felt(wrenches):
+    return wrenches[-1].wrench.force.z if wrenches else np.nan
+
+
+def test_a_wall_pushes_back_with_its_stiffness_times_the_depth(bench, arm):
+    node, wrenches, handle = arm
+    bench.spin_until(lambda: wrenches)
+    assert felt(wrenches) == 0.0
+    handle.press(0.005)
+    bench.spin_until(lambda: felt(wrenches) == pytest.approx(-SPRING * 0.005, rel=1e-6))
+    assert wrenches[-1].header.frame_id == "arm"
+    assert wrenches[-1].header.stamp == Time(nanoseconds=1_020_000_000).to_msg()
+    bench.spin_until(lambda: node.health.state == "rendering")
+    handle.move(0.006, model=False)  # the tissue's answer is not awaited
+    bench.spin_until(lambda: felt(wrenches) == pytest.approx(-SPRING * 0.006, rel=1e-6))
+
+
+@pytest.mark.parametrize(
+    ("doubt", "kind", "reason"),
+    [
+        ("nan", "pose", "not finite"),
+        ("unstamped", "stamp", "has no stamp"),
+        ("jump", "", "has jumped by 55.0 mm"),
+        ("clutch", "", "the clutch is held"),
+        ("model", "model", "51 finite numbers in all, not 3"),
+    ],
+)
+def test_any_doubt_makes_it_zero_until_there_is_none(bench, arm, doubt, kind, reason):
+    node, wrenches, handle = arm
+    handle.press(0.005)
+    bench.spin_until(lambda: felt(wrenches) < -0.99)
+    if doubt == "nan":
+        handle.poses.publish(pose_at(float("nan"), 2))
+    elif doubt == "unstamped":
+        handle.poses.publish(pose_at(0.005, 0))
+    elif doubt == "jump":
+        handle.move(0.06, model=False)
+    elif doubt == "clutch":
+        handle.clutch.publish(Bool(data=True))
+    else:
+        handle.models.publish(Float64MultiArray(data=[1.0, 2.0, 3.0]))
+    bench.spin_until(lambda: felt(wrenches) == 0.0)
+    bench.spin_until(lambda: reason in node.health.values["stopped"])
+    assert node.health.problems("doubt") == 1
+    assert not kind or node.health.problems(kind) == 1
+    if doubt == "clutch":
+        handle.clutch.publish(Bool(data=False))
+        bench.spin_for(10)
+    handle.press(0.004)
+    bench.spin_until(lambda: felt(wrenches) == pytest.approx(-SPRING * 0.004, rel=1e-6))
+
+
+def test_poses_that_stay_away_make_it_zero(bench, arm):
+    node, wrenches, handle = arm
+    handle.press(0.005)
+    bench.spin_until(lambda: felt(wrenches) < -0.99)
+    bench.spin_until(lambda: felt(wrenches) == 0.0)
+    bench.spin_until(lambda: "no pose of the handle for" in node.health.state)
+
+
+def test_from_the_tissue_to_the_hand(bench, scene):
+    """Without friction and registration the hand feels the solver's own wrench."""
+    bench.make(TissueDeformer, scene=str(scene))
+    bench.make(HapticRenderer, scene=str(scene))
+    felt_at_probe = bench.collect(WrenchStamped, "probe/wrench")
+    wrenches = bench.collect(WrenchStamped, "haptic/wrench")
+    handle = bench.publisher(PoseStamped, "haptic/pose")
+    probe = bench.publisher(PoseStamped, "probe/pose")
+    second = 0
+
+    def press(depth):
+        nonlocal second
+        second += 1
+        message = pose_at(depth, 0)
+        message.header.stamp = Time(nanoseconds=1_000_000_000 + 5_000_000 * second).to_msg()
+        handle.publish(message)
+        probe.publish(message)
+        bench.spin_for(10)
+
+    for depth in np.linspace(-0.002, 0.003, 40):
+        press(depth)
+
+    def agrees():
+        press(0.003)
+        expected = felt(felt_at_probe)
+        return expected < -0.05 and felt(wrenches) == pytest.approx(expected, rel=1e-3)
+
+    bench.spin_until(agrees)
+
+
+def test_a_model_survives_its_message():
+    random = np.random.default_rng(3)
+    stiffness = random.normal(size=(6, 6))
+    pose = Pose(random.normal(size=3), random.normal(size=4))
+    model = ContactModel(
+        1_234_567_890_123_456_789, pose, random.normal(size=6), stiffness + stiffness.T
+    )
+    message = contact_model_message(model)
+    assert [dimension.label for dimension in message.layout.dim] == [
+        "stamp",
+        "pose",
+        "wrench",
+        "stiffness",
+    ]
+    back = contact_model_from(message)
+    assert back.stamp == model.stamp
+    np.testing.assert_allclose(back.pose.matrix, pose.matrix, atol=1e-15)
+    np.testing.assert_array_equal(back.wrench, model.wrench)
+    np.testing.assert_array_equal(back.stiffness, model.stiffness)
+    message.data[20] = float("nan")
+    with pytest.raises(TrackingError, match="51 finite numbers"):
+        contact_model_from(message)
+    message.data[20] = 7.0
+    with pytest.raises(TrackingError, match="not symmetric"):
+        contact_model_from(message)
+
+
+def test_a_scene_without_tissue_is_refused(bench, tmp_path):
+    file = tmp_path / "bare.yaml"
+    file.write_text(
+        "name: bare\nvolume: {phantom: upper_arm, voxel_size: 1 mm}\n"
+        "probe: {aperture: 40 mm, depth: 40 mm}\n"
+    )
+    with pytest.raises(SceneError, match="nothing can be felt"):
+        bench.make(HapticRenderer, scene=str(file))

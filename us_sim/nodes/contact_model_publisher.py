@@ -1,0 +1,52 @@
+"""Publishes what the tissue answers near the probe, for those who need it more often than it is
+solved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from rclpy.time import Time
+from std_msgs.msg import Float64MultiArray
+
+from us_sim.nodes.conversions import contact_model_message
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.pose import Pose
+from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.switching import SwitchableTissue
+from us_sim.tracking.contact_model import ContactModel, SecantStiffness
+
+__all__ = ["ContactModelPublisher"]
+
+
+class ContactModelPublisher:
+    """``tissue/contact_model``: the wrench at a pose of the probe and how it changes from there.
+
+    Args:
+        node: that publishes it.
+    """
+
+    def __init__(self, node: SceneNode) -> None:
+        self._node = node
+        self._publisher = node.stream(Float64MultiArray, "tissue/contact_model")
+        self._secant = SecantStiffness()
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes."""
+        return bool(self._publisher.get_subscription_count())
+
+    def publish(
+        self, tissue: SwitchableTissue, pose: Pose, deformation: Deformation, stamp: TimeMessage
+    ) -> None:
+        """Publish the model at a pose, just solved for, under its stamp."""
+        turn = pose.rotation
+        wrench = np.concatenate([turn @ deformation.force, turn @ deformation.torque])
+        try:
+            stiffness = tissue.contact_stiffness()
+        except np.linalg.LinAlgError:
+            stiffness = None
+        stiffness = self._secant.mended(pose, wrench, stiffness)
+        model = ContactModel(Time.from_msg(stamp).nanoseconds, pose, wrench, stiffness)
+        self._publisher.publish(contact_model_message(model))
+        self._node.health.published("tissue/contact_model")

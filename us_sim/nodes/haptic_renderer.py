@@ -1,0 +1,135 @@
+"""Gives a haptic arm what the probe feels, between the tissue's solutions."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
+from rclpy.time import Time
+from std_msgs.msg import Bool, Float64MultiArray
+
+from us_sim.assembly import haptic_rendering_of
+from us_sim.errors import SceneError, UsSimError
+from us_sim.nodes.conversions import contact_model_from, pose_from, wrench_message
+from us_sim.nodes.periodic_thread import PeriodicThread
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import FOREIGN
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.tracking.haptic_settings import HapticSettings
+
+__all__ = ["HapticRenderer", "main"]
+
+REPORTS = 5.0
+"""Times a second that diagnostics are told how it goes."""
+
+_SWITCH = 1e-4
+"""s: how long the executor may keep the interpreter from the thread that renders."""
+
+
+class HapticRenderer(SceneNode):
+    """``haptic/pose``, ``haptic/clutch`` and ``tissue/contact_model`` in; ``haptic/wrench`` out.
+
+    The wrench on the handle goes out at ``tracker.haptic.rate``, about the handle's origin along
+    the axes of the pose's frame, with the newest pose's stamp. It is zero at any doubt, which the
+    state tells, and grows slowly after it, as it does for whoever subscribes first.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("haptic_renderer", **kwargs)
+        if self.scene.tissue is None:
+            raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can be felt")
+        settings = self.scene.tracker.haptic or HapticSettings()
+        self._rendering = haptic_rendering_of(self.scene)
+        self._frame = ""
+        self._is_taken = False
+        self._stops = 0
+        self._wrenches = self.stream(WrenchStamped, "haptic/wrench")
+        self.listen(PoseStamped, "haptic/pose", self._take_pose, FOREIGN)
+        self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
+        self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
+        self._thread = PeriodicThread(settings.rate, self._render)
+        self._report()
+        self.create_timer(1.0 / REPORTS, self._report)
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """End with a zero wrench."""
+        self._thread.stop()
+        self._publish(np.zeros(6))
+        super().destroy_node()
+
+    def _take_pose(self, message: PoseStamped) -> None:
+        now = time.monotonic_ns()
+        self.health.received += 1
+        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        try:
+            pose = pose_from(message)
+        except UsSimError as error:
+            self._refuse("pose", f"haptic/pose: {error}; nothing is felt")
+            return
+        if stamp == 0:
+            self._refuse(
+                "stamp", "haptic/pose has no stamp, so nothing is felt: let its driver set it"
+            )
+            return
+        self._frame = message.header.frame_id
+        self._rendering.pose(stamp, pose, now)
+
+    def _take_clutch(self, message: Bool) -> None:
+        self._rendering.clutch(message.data)
+
+    def _take_model(self, message: Float64MultiArray) -> None:
+        try:
+            model = contact_model_from(message)
+        except UsSimError as error:
+            self._refuse("model", f"tissue/contact_model: {error}; nothing is felt")
+            return
+        self._rendering.model(model, time.monotonic_ns())
+
+    def _refuse(self, kind: str, sentence: str) -> None:
+        self.health.problem(kind, sentence)
+        self._rendering.distrust(sentence)
+
+    def _render(self, now: int) -> None:
+        """One tick, in the thread of its own."""
+        if not self._is_taken:
+            self._rendering.distrust("nobody takes the wrench")
+        wrench = self._rendering.render(now)
+        if self._is_taken:
+            self._publish(wrench)
+
+    def _publish(self, wrench: NDArray[np.float64]) -> None:
+        newest = self._rendering.stamp
+        now = Time(nanoseconds=newest) if newest is not None else self.get_clock().now()
+        self._wrenches.publish(wrench_message(wrench[:3], wrench[3:], now.to_msg(), self._frame))
+        self.health.published("haptic/wrench")
+
+    def _report(self) -> None:
+        """Tell diagnostics, and see who listens."""
+        self._is_taken = self._wrenches.get_subscription_count() > 0
+        doubt, stops = self._rendering.doubt, self._rendering.stops
+        if stops > self._stops:
+            self.health.problem("doubt", f"nothing is felt: {self._rendering.stopped}")
+        self._stops = stops
+        self.health.state = f"zero: {doubt}" if doubt else "rendering"
+        self.health.values = {
+            "stops": str(stops),
+            "stopped": self._rendering.stopped,
+            "jitter_p99_ms": f"{1e3 * self._thread.jitter:.3f}",
+            "skipped": str(self._thread.skipped),
+            "energy_mJ": f"{1e3 * self._rendering.energy:.3f}",
+        }
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is interrupted."""
+    sys.setswitchinterval(_SWITCH)
+    return run_node(HapticRenderer, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
