@@ -23,6 +23,7 @@ def add_calibrate(commands: Any) -> None:
     _add_camera(kinds)
     _add_pivot(kinds)
     _add_landmarks(kinds)
+    _add_probe(kinds)
     _add_time(kinds)
 
 
@@ -76,6 +77,45 @@ def _add_landmarks(kinds: Any) -> None:
     parser.set_defaults(command=_landmarks)
 
 
+def _add_probe(kinds: Any) -> None:
+    parser = kinds.add_parser("probe", help="where the image lies on the probe, from a phantom")
+    parser.add_argument(
+        "sightings",
+        type=Path,
+        help="CSV: feature,column,row,x,y,z,qx,qy,qz,qw with the body's poses, or "
+        "feature,column,row,time with --recording",
+    )
+    parser.add_argument(
+        "--phantom",
+        type=Path,
+        metavar="FILE",
+        help="CSV name,x,y,z of points or name,x1,y1,z1,x2,y2,z2 of wires, or Plus' XML; without "
+        "it features are points at unknown places",
+    )
+    parser.add_argument("--recording", type=Path, metavar="FILE", help="the body's poses over time")
+    parser.add_argument(
+        "--registration", type=Path, metavar="FILE", help="from the poses' frame to the phantom's"
+    )
+    parser.add_argument(
+        "--origin",
+        nargs=2,
+        type=float,
+        required=True,
+        metavar=("COLUMN", "ROW"),
+        help="pixel at the middle of the transducer's face",
+    )
+    parser.add_argument(
+        "--pixel",
+        nargs=2,
+        type=_quantity(_LENGTH),
+        metavar=("WIDTH", "HEIGHT"),
+        help="size of a pixel, where known: '0.2 mm' '0.2 mm'",
+    )
+    _add_pose(parser)
+    _add_out(parser, "calibration.yaml", "the calibration")
+    parser.set_defaults(command=_probe)
+
+
 def _add_time(kinds: Any) -> None:
     parser = kinds.add_parser("time", help="offset of a tracker's clock from one motion")
     parser.add_argument("moving", type=Path, help="recording whose stamps are to be mended")
@@ -87,7 +127,7 @@ def _add_time(kinds: Any) -> None:
         type=_quantity(_TIME),
         default=0.5,
         metavar="S",
-        help="offsets up to which are tried (%(default)s s)",
+        help="largest offset to believe (%(default)s s)",
     )
     parser.add_argument(
         "--images", action="store_true", help="the fixed recording's images, though it has poses"
@@ -155,6 +195,24 @@ def _landmarks(args: argparse.Namespace) -> int:
     print(
         calibrate_registration(
             args.known, args.measured, args.tip, args.pose, args.to, _new(args.out)
+        )
+    )
+    return 0
+
+
+def _probe(args: argparse.Namespace) -> int:
+    from us_sim.tracking.calibration.probe_command import calibrate_image
+
+    print(
+        calibrate_image(
+            args.sightings,
+            args.phantom,
+            args.recording,
+            args.pose,
+            args.registration,
+            (args.origin[0], args.origin[1]),
+            None if args.pixel is None else (args.pixel[0], args.pixel[1]),
+            _new(args.out),
         )
     )
     return 0

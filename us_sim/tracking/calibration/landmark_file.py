@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,7 @@ def read_landmarks(path: str | Path) -> dict[str, NDArray[np.float64]]:
             for element in _document(path).iter("Landmark")
         ]
     else:
-        rows = read_table(path, ("x", "y", "z"), label="name")
+        rows = read_table(path, dict.fromkeys(("x", "y", "z"), "length"), label="name")
         found = [(name, np.array(values)) for name, values in rows]
     return _named(path, found, "landmark")
 
@@ -69,20 +69,27 @@ def read_wires(path: str | Path) -> dict[str, NDArray[np.float64]]:
             for element in _document(path).iter("Wire")
         ]
     else:
-        rows = read_table(path, ("x1", "y1", "z1", "x2", "y2", "z2"), label="name")
+        ends = ("x1", "y1", "z1", "x2", "y2", "z2")
+        rows = read_table(path, dict.fromkeys(ends, "length"), label="name")
         found = [(name, np.array(values).reshape(2, 3)) for name, values in rows]
     return _named(path, found, "wire")
 
 
 def read_table(
-    path: str | Path, columns: Sequence[str], *, label: str, dimension: str = "length"
+    path: str | Path, columns: Mapping[str, str], *, label: str
 ) -> list[tuple[str, list[float]]]:
     """Rows of a CSV whose header names at least these columns: the label's text, and numbers.
+
+    Args:
+        path: of the file.
+        columns: their names, and what they hold (length, number, time).
+        label: name of the column with a text.
 
     Raises:
         CalibrationError: it cannot be read, or lacks a column, or a cell is no such quantity.
     """
-    path, quantity = Path(path), Quantity(dimension)
+    path = Path(path)
+    quantities = {name: Quantity(dimension) for name, dimension in columns.items()}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -97,7 +104,7 @@ def read_table(
             rows = []
             for row in reader:
                 values = []
-                for name in columns:
+                for name, quantity in quantities.items():
                     try:
                         values.append(quantity.parse(row[name] or ""))
                     except ValueError as error:

@@ -135,7 +135,7 @@ def calibrate_clock(
         moving_file: recording of the device.
         fixed_file: recording of what is right: poses, or images of a line.
         name: of the poses.
-        largest: s, offsets up to which are tried.
+        largest: s, the largest offset to believe.
         out: file to write; a picture goes beside it.
         images: take the fixed recording's images even where it has poses.
 

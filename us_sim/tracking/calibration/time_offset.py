@@ -59,7 +59,8 @@ def find_time_offset(
     Args:
         moving: of the device whose stamps are to be mended.
         fixed: of the device whose stamps are right.
-        largest: s, offsets up to which are tried.
+        largest: s, the largest offset to believe; twice as far is looked, since an offset
+            outside may fit half a stroke away too.
 
     Raises:
         CalibrationError: they overlap too little, do not move alike, or move so regularly that
@@ -73,19 +74,19 @@ def find_time_offset(
     # The denser signal is interpolated at the other's times.
     moving_is_dense = _interval(moving) <= _interval(fixed)
     dense, sparse = (moving, fixed) if moving_is_dense else (fixed, moving)
-    times, values = _compared(dense, sparse, largest)
+    times, values = _compared(dense, sparse, 2.0 * largest)
     match = _Match(CubicSpline(dense.times, dense.values), times, values)
     step = min(_LARGEST_STEP, 0.5 * _interval(dense))
-    tried = np.linspace(-largest, largest, 2 * round(largest / step) + 1)
+    tried = np.linspace(-2.0 * largest, 2.0 * largest, 4 * round(largest / step) + 1)
     correlations = np.array([match.correlation(shift) for shift in tried])
     best = int(np.abs(correlations).argmax())
-    _check(tried, correlations, best, largest)
+    # The dense signal at t + shift is the sparse one at t.
+    sign = -1.0 if moving_is_dense else 1.0
+    _check(sign * tried, correlations, best, largest)
     shift = match.refined(tried[best], step)
     correlation = match.correlation(shift)
     without = [match.without(block).refined(shift, 10 * step) for block in _blocks(len(times))]
     spread = np.asarray(without) - np.mean(without)
-    # The dense signal at t + shift is the sparse one at t.
-    sign = -1.0 if moving_is_dense else 1.0
     return TimeOffset(
         sign * shift,
         float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum())),
@@ -133,17 +134,17 @@ def _blocks(count: int) -> list[NDArray[np.intp]]:
 
 
 def _compared(
-    dense: PositionSignal, sparse: PositionSignal, largest: float
+    dense: PositionSignal, sparse: PositionSignal, furthest: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The sparse signal's samples that the dense one covers at every offset."""
-    inside = (sparse.times - largest >= dense.times[0]) & (
-        sparse.times + largest <= dense.times[-1]
+    inside = (sparse.times - furthest >= dense.times[0]) & (
+        sparse.times + furthest <= dense.times[-1]
     )
     times, values = sparse.times[inside], sparse.values[inside]
     if len(times) < _FEWEST_SAMPLES or np.ptp(times) < _SHORTEST:
         raise CalibrationError(
             f"the two recordings overlap too little ({len(times)} samples that stay inside at "
-            f"offsets up to {largest:g} s): record both at once for 20 seconds"
+            f"offsets up to {furthest:g} s): record both at once for 20 seconds"
         )
     if np.ptp(values) == 0.0 or np.ptp(dense.values) == 0.0:
         raise CalibrationError("a signal does not move at all: move the probe while recording")
@@ -159,9 +160,10 @@ def _check(
             f"the two signals do not move alike (correlation {highest:.2f} at best): record one "
             f"motion with both, or try larger offsets than {largest:g} s"
         )
-    if best in (0, len(tried) - 1):
+    if abs(float(tried[best])) > largest:
         raise CalibrationError(
-            f"the signals agree best at the largest tried offset, {largest:g} s: try larger ones"
+            f"the signals agree best at an offset of {tried[best]:.2f} s, beyond the largest to "
+            f"believe, {largest:g} s: allow a larger one if it can be"
         )
     heights = np.abs(correlations)
     peaks = 1 + np.flatnonzero((heights[1:-1] >= heights[:-2]) & (heights[1:-1] >= heights[2:]))

@@ -1,0 +1,155 @@
+"""The offset of two clocks: known shifts, error statistics, Plus' water tank, and refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import CalibrationError
+from us_sim.tracking.calibration.position_signal import (
+    PositionSignal,
+    line_row,
+    signal_of_images,
+    signal_of_positions,
+)
+from us_sim.tracking.calibration.recorded_motion import read_signal
+from us_sim.tracking.calibration.time_offset import find_time_offset
+from us_sim.volume.sweep import read_sweep
+
+
+def strokes(times):
+    """m, uneven strokes of about a second, as a hand makes them."""
+    return 0.01 * (np.sin(5.9 * times + np.sin(0.7 * times)) + 0.4 * np.sin(2.3 * times))
+
+
+def recorded(rate, seconds, offset=0.0, noise=0.0, seed=0, start=0.0):
+    rng = np.random.default_rng(seed)
+    times = start + np.arange(0.0, seconds, 1.0 / rate)
+    return PositionSignal(times + offset, strokes(times) + noise * rng.standard_normal(len(times)))
+
+
+@settings(max_examples=20, deadline=None)
+@given(offset=st.floats(-0.4, 0.4), scale=st.sampled_from([-400.0, 0.3, 7.0]))
+def test_a_shift_is_found_whatever_the_scale_and_direction(offset, scale):
+    moving = recorded(50, 22, offset=-offset)
+    clean = recorded(12, 20, start=1.0)
+    fixed = PositionSignal(clean.times, scale * clean.values + 3.0)
+    found = find_time_offset(moving, fixed)
+    assert found.offset == pytest.approx(offset, abs=1e-4)
+    assert np.sign(found.correlation) == np.sign(scale)
+    assert find_time_offset(fixed, moving).offset == pytest.approx(-offset, abs=1e-4)
+
+
+def test_errors_are_as_large_as_the_deviation_says():
+    errors, deviations = [], []
+    for seed in range(40):
+        moving = recorded(50, 22, offset=-0.07)
+        fixed = recorded(12, 20, start=1.0, noise=2e-3, seed=seed)
+        found = find_time_offset(moving, fixed)
+        errors.append(found.offset - 0.07)
+        deviations.append(found.deviation)
+    # Forty errors scatter by 11 %, a jackknife of ten blocks by 24 % each.
+    scatter = np.sqrt(np.mean(np.square(errors)))
+    assert np.sqrt(np.mean(np.square(deviations))) == pytest.approx(scatter, rel=0.3)
+    assert scatter < 3e-3
+
+
+def test_the_direction_that_moved_most_is_the_signal():
+    times = np.linspace(0, 5, 100)
+    along = np.array([2.0, -1.0, 2.0]) / 3.0
+    path = np.outer(strokes(times), along) + np.outer(1e-4 * np.cos(9 * times), [1, 2, 0])
+    signal = signal_of_positions(times, path)
+    assert abs(np.corrcoef(signal.values, strokes(times))[0, 1]) > 0.9998
+
+
+@settings(max_examples=15, deadline=None)
+@given(height=st.floats(40.0, 160.0), slope=st.floats(-0.3, 0.3), seed=st.integers(0, 100))
+def test_a_tilted_line_is_found_to_a_part_of_a_row(height, slope, seed):
+    rng = np.random.default_rng(seed)
+    columns, rows = np.arange(301), np.arange(220)[:, None]
+    line = height + slope * (columns - 150)
+    image = 200.0 * np.exp(-0.5 * ((rows - line) / 1.5) ** 2) + rng.uniform(0, 8, (220, 301))
+    image[180:, 40:90] = 230.0  # another echo, below a part of the line
+    assert line_row(image.astype(np.uint8)) == pytest.approx(height, abs=0.15)
+
+
+def test_an_image_without_a_line_has_none():
+    assert np.isnan(line_row(np.zeros((50, 60), np.uint8)))
+    noise = np.random.default_rng(0).integers(0, 12, (50, 60)).astype(np.uint8)
+    assert np.isnan(line_row(noise))
+    with pytest.raises(CalibrationError, match="only 0 of 4 images show a bright line"):
+        signal_of_images(np.arange(4.0), [noise] * 4)
+
+
+def test_the_water_tanks_lines_are_where_plus_found_them(shared_data):
+    # The first eight of LineSegmentationResultsBaseline.xml of PlusLibData: a point of the line
+    # and its direction, in pixels.
+    published = [
+        (381.688, 230.524, 0.971201, -0.238262),
+        (419.882, 265.827, 0.968913, -0.247402),
+        (431.941, 314.042, 0.967061, -0.254543),
+        (506.500, 345.490, 0.969446, -0.245305),
+        (382.875, 403.882, 0.986982, -0.160830),
+        (339.188, 399.697, 0.999157, -0.041046),
+        (447.125, 285.936, 0.999988, 0.004842),
+        (358.067, 241.475, 0.998175, -0.060383),
+    ]
+    recording = shared_data / "plus-tracker-recordings" / "WaterTankBottomTranslationVideoBuffer"
+    sweep = read_sweep(recording.with_suffix(".igs.mha"), tracked=False)
+    middle = 0.5 * (sweep.columns - 1)
+    expected = [y + (middle - x) * down / across for x, y, across, down in published]
+    found = [line_row(image) for image in sweep.images(range(8))]
+    np.testing.assert_allclose(found, expected, atol=2.5)
+
+
+def test_the_water_tanks_offset_is_the_one_that_plus_published(shared_data):
+    folder = shared_data / "plus-tracker-recordings"
+    tracker = read_signal(
+        folder / "WaterTankBottomTranslationTrackerBuffer-trimmed.igs.mha", "ProbeToReference"
+    )
+    video = read_signal(folder / "WaterTankBottomTranslationVideoBuffer.igs.mha", None)
+    assert (len(tracker), len(video), video.left_out) == (801, 200, 1)
+    found = find_time_offset(tracker, video)
+    # TemporalCalibrationResultsBaseline.xml of PlusLibData says that the tracker lags by
+    # -0.0648266 s: its stamps are early.
+    assert found.offset == pytest.approx(0.0648266, abs=2e-3)
+    assert 2e-3 < found.deviation < 15e-3
+    assert found.correlation < -0.98
+
+
+@pytest.mark.parametrize(
+    ("moving", "fixed", "largest", "problem"),
+    [
+        (recorded(50, 0.5), recorded(12, 20), 0.5, "at least 30 samples of each signal, not 25"),
+        (recorded(50, 20), recorded(12, 20, start=19.0), 0.5, "overlap too little"),
+        (
+            recorded(50, 22, offset=0.4),
+            recorded(12, 20, start=1.0),
+            0.2,
+            "best at an offset of -0.40 s, beyond",
+        ),
+        (
+            recorded(50, 22),
+            PositionSignal(np.arange(1, 21, 0.1), np.zeros(200)),
+            0.5,
+            "does not move at all",
+        ),
+        (
+            recorded(50, 22),
+            PositionSignal(np.arange(1, 21, 0.1), np.random.default_rng(0).standard_normal(200)),
+            0.5,
+            "do not move alike",
+        ),
+    ],
+)
+def test_recordings_that_cannot_tell_are_refused(moving, fixed, largest, problem):
+    with pytest.raises(CalibrationError, match=problem):
+        find_time_offset(moving, fixed, largest=largest)
+
+
+def test_strokes_as_regular_as_a_pendulum_are_refused():
+    times = np.arange(0, 30, 0.02)
+    noise = 0.02 * np.random.default_rng(1).standard_normal((2, len(times)))
+    pendulum = np.sin(2 * np.pi * 2.0 * times) + noise
+    with pytest.raises(CalibrationError, match=r"so regular that offsets of .* fit alike"):
+        find_time_offset(PositionSignal(times, pendulum[0]), PositionSignal(times, pendulum[1]))

@@ -1,0 +1,157 @@
+"""`us-sim calibrate probe`: sightings of a phantom in, the image's place on the probe out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError, PoseError
+from us_sim.pose import Pose
+from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
+from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
+from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
+from us_sim.tracking.se3 import interpolate
+from us_sim.tracking.transform_file import read_transform, write_transform
+
+__all__ = ["calibrate_image"]
+
+_PIXEL = {"column": "number", "row": "number"}
+_POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "qz", "qw"), "number")
+_LONGEST_GAP = 0.2  # s, between poses that are interpolated
+
+
+def calibrate_image(
+    sightings_file: Path,
+    phantom_file: Path | None,
+    recording: Path | None,
+    name: str | None,
+    registration: Path | None,
+    origin: tuple[float, float],
+    spacing: tuple[float, float] | None,
+    out: Path,
+) -> str:
+    """Find where the image lies on the probe and write it; returns a sentence with the result.
+
+    Args:
+        sightings_file: CSV with feature, column, row, and the body's pose (x, y, z, qx, qy, qz,
+            qw) or, with a recording, the time in s.
+        phantom_file: its points or wires; without it every feature is a point at an unknown place.
+        recording: of the body's poses.
+        name: of the body's poses in it.
+        registration: from the poses' frame to the phantom's.
+        origin: column and row of the pixel at the middle of the transducer's face.
+        spacing: m, between columns and between rows, where known.
+        out: file to write.
+
+    Raises:
+        UsSimError: the files cannot be read or do not determine the image's place.
+    """
+    to_phantom = read_transform(registration) if registration else Pose()
+    if recording is None:
+        seen = _with_poses(sightings_file, to_phantom)
+    else:
+        seen = _with_times(sightings_file, recording, name, to_phantom)
+    phantom = _features(phantom_file) if phantom_file else {}
+    unknown = sorted({sighting.feature for sighting in seen} - set(phantom))
+    if phantom and unknown:
+        raise CalibrationError(
+            f"{phantom_file}: has no {unknown[0]}, which {sightings_file} shows; its features are "
+            f"{', '.join(phantom)}"
+        )
+    found = calibrate_probe(seen, phantom, spacing=None if spacing is None else np.array(spacing))
+    deviations = np.sqrt(np.diag(found.covariance))
+    rejected = int((~found.inliers).sum())
+    write_transform(
+        out,
+        found.probe_pose(*origin),
+        from_frame="probe",
+        to_frame="body",
+        method=f"probe calibration, {sightings_file.name}",
+        residuals={
+            "rms": found.rms,  # m
+            "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
+            "sightings": len(seen),
+            "rejected": rejected,
+        },
+        more={
+            "pixel_spacing": found.spacing,  # m, between columns and between rows
+            "origin_pixel": list(origin),  # column, row
+            "image_to_body": found.image_to_body,  # m, from (column, row, 0, 1)
+            "standard_deviations": {
+                "position": deviations[:3],  # m, of pixel (0, 0)
+                "rotation": deviations[3:6],  # rad, about the body's axes
+                "pixel_spacing": deviations[6:],  # m
+            },
+            **({"points": found.points} if found.points else {}),  # m
+        },
+    )
+    return (
+        f"{out}: pixels of {1e3 * found.spacing[0]:.4f} × {1e3 * found.spacing[1]:.4f} mm, RMS "
+        f"{1e3 * found.rms:.2f} mm over {len(seen) - rejected} sightings, {rejected} left out, "
+        f"± {1e3 * float(np.linalg.norm(deviations[:3])):.2f} mm and "
+        f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°"
+    )
+
+
+def _features(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Wires (2, 3) m, or where the file has none points (1, 3) m, by name."""
+    if path.suffix.lower() == ".xml" or _has_ends(path):
+        return read_wires(path)
+    return {name: point[None] for name, point in read_landmarks(path).items()}
+
+
+def _has_ends(path: Path) -> bool:
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return "x2" in file.readline()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: cannot be read: {error}") from error
+
+
+def _with_poses(path: Path, to_phantom: Pose) -> list[PixelSighting]:
+    seen: list[PixelSighting] = []
+    for feature, numbers in read_table(path, _PIXEL | _POSE, label="feature"):
+        try:
+            pose = to_phantom @ Pose(np.array(numbers[2:5]), np.array(numbers[5:]))
+        except PoseError as error:
+            raise CalibrationError(f"{path}: sighting {len(seen) + 1}: {error}") from error
+        seen.append(PixelSighting(feature, numbers[0], numbers[1], pose))
+    return seen
+
+
+def _with_times(
+    path: Path, recording: Path, name: str | None, to_phantom: Pose
+) -> list[PixelSighting]:
+    motion = read_motion(recording, name)
+    stamps, first = np.unique(seconds_of(motion), return_index=True)
+    seen: list[PixelSighting] = []
+    for feature, (column, row, time) in read_table(
+        path, _PIXEL | {"time": "time"}, label="feature"
+    ):
+        after = int(np.searchsorted(stamps, time))
+        if not 0 < after < len(stamps) or stamps[after] - stamps[after - 1] > _LONGEST_GAP:
+            raise CalibrationError(
+                f"{path}: sighting {len(seen) + 1}: {recording.name} has no pose around "
+                f"{time:.3f} s; it goes from {stamps[0]:.3f} to {stamps[-1]:.3f} s"
+            )
+        before, behind = (
+            Pose(motion.positions[first[k]], motion.orientations[first[k]])
+            for k in (after - 1, after)
+        )
+        share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        pose = to_phantom @ interpolate(before, behind, share)
+        seen.append(PixelSighting(feature, column, row, pose))
+    return seen
+
+
+def _by_feature(
+    seen: Sequence[PixelSighting], residuals: NDArray[np.float64], used: NDArray[np.bool_]
+) -> dict[str, float]:
+    names = np.array([sighting.feature for sighting in seen])
+    return {
+        str(name): float(np.sqrt((residuals[(names == name) & used] ** 2).mean()))
+        for name in np.unique(names[used])
+    }
