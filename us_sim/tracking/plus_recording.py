@@ -43,7 +43,7 @@ from us_sim.volume.stored_size import metaimage_header
 __all__ = ["TrackerRecording", "Way", "is_tracker_recording", "read_tracker_recording"]
 
 _METRES = 1e-3  # the format holds millimetres
-_RIGID = 1e-3  # how far the columns of a rotation may be from orthonormal, as `Pose` takes it
+_RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
 
 
 @dataclass(frozen=True)
@@ -283,14 +283,16 @@ def _count(path: Path, header: Mapping[str, str]) -> int:
 
 
 def _rigid(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The transform in metres.
+    """The transform in metres, with the rotation that is nearest to what trackers round.
 
     Raises:
         ValueError: it scales, shears or mirrors.
     """
-    rotation = matrix[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
+    left, scales, right = np.linalg.svd(matrix[:3, :3])
+    rotation = left @ right
+    if np.abs(scales - 1.0).max() > _RIGID or np.linalg.det(rotation) < 0:
         raise ValueError("a transform that is not rigid")
+    matrix[:3, :3] = rotation
     matrix[:3, 3] *= _METRES
     return matrix
 
