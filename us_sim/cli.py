@@ -1,4 +1,4 @@
-"""The command `us-sim`: demo, run, render, play, bag info, calibrate, evaluate."""
+"""The command `us-sim`: demo, run, render, play, bag info, calibrate, print-marker, evaluate."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from us_sim import __version__
 from us_sim.calibrate import add_calibrate
 from us_sim.errors import UsSimError
+from us_sim.print_marker import add_print_marker
 from us_sim.share import find_bag
 
 __all__ = ["main"]
@@ -97,6 +98,7 @@ def _parser() -> argparse.ArgumentParser:
     info.set_defaults(command=_bag_info)
 
     add_calibrate(commands)
+    add_print_marker(commands)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
     subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice")
