@@ -7,6 +7,7 @@ from setuptools import find_packages, setup
 
 NODES = [
     "haptic_renderer",
+    "openigtlink_bridge",
     "path_player",
     "probe_tracker",
     "session_player",
@@ -76,6 +77,7 @@ setup(
             "hypothesis>=6.100",
             "meshio>=5.3",
             "mypy>=1.10",
+            "pyigtl>=0.3.1",
             "pytest>=7.4",
             "pytest-timeout>=2.2",
             "ruff>=0.12",

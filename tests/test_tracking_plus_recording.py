@@ -38,8 +38,8 @@ def sample(time=0.0, **transforms):
 def test_millimetres_become_metres_and_the_recorders_clock_stays(tmp_path):
     recording = read_tracker_recording(write(tmp_path, [sample(7.25, ProbeToTracker=MOVED)]))
     assert recording.times == [7.25]
-    expected = [[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]]
-    np.testing.assert_allclose(recording.transforms["ProbeToTracker"], [expected])
+    expected = np.array([[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]])
+    np.testing.assert_allclose(recording.transforms["ProbeToTracker"][0], expected)
     path = recording.probe_path("Probe")
     assert path.stamps == [7_250_000_000]
     assert (path.frame_id, path.rejected, path.note) == ("Tracker", 0, "")

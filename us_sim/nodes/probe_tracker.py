@@ -56,6 +56,13 @@ class ProbeTracker(SceneNode):
         if not self.lockstep:
             self.create_timer(1.0 / CHECKS, self._check)
 
+    def destroy_node(self) -> None:
+        """Let go of the device, where it is held by more than subscriptions."""
+        close = getattr(self._input, "close", None)
+        if close is not None:
+            close()
+        super().destroy_node()
+
     def listen_to_device(
         self, message_type: Any, topic: str, callback: Callable[[Any], None]
     ) -> None:

@@ -53,11 +53,6 @@ class OpenIGTLinkSettings:
     interval: float = given(
         Quantity("time", 1e-3, 10.0), default=0.01, description="s between two TDATA, if asked for"
     )
-    silence: float = given(
-        Quantity("time", 0.1, 3600.0),
-        default=5.0,
-        description="s without any message after which the connection is made anew",
-    )
 
     def __post_init__(self) -> None:
         require_given(self, "openigtlink", TrackingError)

@@ -1,0 +1,150 @@
+"""Shows 3D Slicer, or whatever else speaks OpenIGTLink, the image and the probe as they move."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
+from rclpy.time import Time
+from sensor_msgs.msg import Image
+from std_msgs.msg import Float64MultiArray
+
+from us_sim.errors import SceneError, UsSimError
+from us_sim.nodes.conversions import affine_from, pixels_from, pose_from
+from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.pose import Pose
+from us_sim.tracking.openigtlink_message import image_message, transform_message
+from us_sim.tracking.openigtlink_server import OpenIGTLinkServer
+
+__all__ = ["OpenIGTLinkBridge", "main"]
+
+REMEMBERED = 256
+"""Poses kept for the images that carry their stamps."""
+LOOK_S = 0.5
+"""How often it is looked who is connected."""
+
+
+class OpenIGTLinkBridge(SceneNode):
+    """``probe/pose`` and ``ultrasound/image`` in; an OpenIGTLink server out.
+
+    It sends the image ``Image_Reference``, which lies in the reference by itself, and the
+    transforms ``ImageToReference`` and ``ProbeToReference``. Parameters beside those of every
+    scene's node: ``host`` (address to listen at), ``port``, ``reference`` (``volume``: the own
+    frame of the scene's volume, so that the volume's file loaded in Slicer fits; or ``patient``),
+    ``world`` (``ras``, as Slicer takes it, or ``lps``).
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("openigtlink_bridge", **kwargs)
+        host = fixed_parameter(self, "host", "localhost", "address to listen at; empty: all")
+        port = fixed_parameter(self, "port", 18944, "TCP port")
+        reference = fixed_parameter(self, "reference", "volume", "volume or patient")
+        self._world = fixed_parameter(self, "world", "ras", "ras or lps")
+        for name, value, choices in (
+            ("reference", reference, ("volume", "patient")),
+            ("world", self._world, ("ras", "lps")),
+        ):
+            if value not in choices:
+                raise SceneError(f"{name} is '{value}'; it must be {' or '.join(choices)}")
+        if not 0 <= port <= 65535:
+            raise SceneError(f"port is {port}; it must be from 0 (any that is free) to 65535")
+        place = self.scene.volume.pose
+        volume = Pose(np.array(place.position), np.array(place.orientation))
+        # Volumes are read in LPS; RAS has x and y turned round.
+        self._from_patient = np.diag([-1.0, -1.0, 1.0, 1.0] if self._world == "ras" else np.ones(4))
+        if reference == "volume":
+            self._from_patient = self._from_patient @ volume.inverse().matrix
+        self._image_to_probe: NDArray[np.float64] | None = None
+        self._poses: dict[int, NDArray[np.float64]] = {}
+        self._image: Image | None = None
+        self._connected = -1
+        self._server = OpenIGTLinkServer(host, port)
+        self.listen(Float64MultiArray, "ultrasound/image_to_probe", self._take_place, LATCHED)
+        self.listen(PoseStamped, "probe/pose", self._take_pose)
+        self.newest(Image, "ultrasound/image", self._take_image)
+        self.create_timer(LOOK_S, self._look)
+        self.get_logger().info(f"serving OpenIGTLink on port {self.port}")
+
+    @property
+    def port(self) -> int:
+        """Where the server listens."""
+        return self._server.port
+
+    def destroy_node(self) -> None:
+        """Disconnect all."""
+        self._server.close()
+        super().destroy_node()
+
+    def _look(self) -> None:
+        clients = self._server.clients
+        if clients != self._connected:
+            self._connected = clients
+            self.health.state = f"{clients} connected" if clients else "waiting for a client"
+            self.get_logger().info(self.health.state)
+
+    def _take_place(self, message: Float64MultiArray) -> None:
+        try:
+            matrix = affine_from(message)
+        except UsSimError as error:
+            self.health.problem("matrix", f"ultrasound/image_to_probe: {error}")
+            return
+        # As thick as a pixel is wide: the simulation's own matrix has a slice a metre thick.
+        normal, step = np.linalg.norm(matrix[:3, 2]), np.linalg.norm(matrix[:3, 0])
+        matrix[:3, 2] *= step / normal
+        self._image_to_probe = matrix
+
+    def _take_pose(self, message: PoseStamped) -> None:
+        try:
+            pose = pose_from(message)
+        except UsSimError as error:
+            self.health.problem("pose", f"probe/pose: {error}; it is not sent")
+            return
+        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        matrix = self._from_patient @ pose.matrix
+        self._poses[stamp] = matrix
+        while len(self._poses) > REMEMBERED:
+            del self._poses[next(iter(self._poses))]
+        self._send_transform("ProbeToReference", stamp, matrix)
+        if self._image is not None:
+            self._take_image(self._image)
+
+    def _take_image(self, message: Image) -> None:
+        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        self._image = None
+        if self._image_to_probe is None or not self._server.clients:
+            return
+        if stamp not in self._poses:
+            self._image = message  # its pose may come after it, over another connection
+            return
+        try:
+            pixels = pixels_from(message)
+        except UsSimError as error:
+            self.health.problem("image", f"ultrasound/image: {error}; it is not sent")
+            return
+        matrix = self._poses[stamp] @ self._image_to_probe
+        name = "Image_Reference"
+        self._server.send(name, image_message(name, stamp, pixels, matrix, self._world))
+        self.health.published(name, message.header.stamp)
+        self._send_transform("ImageToReference", stamp, matrix, per_pixel=True)
+
+    def _send_transform(
+        self, name: str, stamp: int, matrix: NDArray[np.float64], *, per_pixel: bool = False
+    ) -> None:
+        if self._server.clients:
+            self._server.send(name, transform_message(name, stamp, matrix, per_pixel=per_pixel))
+            self.health.published(name)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is interrupted."""
+    return run_node(OpenIGTLinkBridge, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""An OpenIGTLink server's poses: Plus, 3D Slicer, or a tracker that speaks it itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from typing import TYPE_CHECKING
+
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.openigtlink_client import OpenIGTLinkClient
+from us_sim.tracking.openigtlink_settings import OpenIGTLinkSettings
+
+if TYPE_CHECKING:
+    from us_sim.nodes.probe_tracker import ProbeTracker
+
+__all__ = ["OpenIGTLinkInput"]
+
+
+class OpenIGTLinkInput:
+    """The device ``tracker.body`` of the server ``tracker.openigtlink``; the newest pose wins."""
+
+    def __init__(self, node: ProbeTracker) -> None:
+        self._node = node
+        tracker = node.scene.tracker
+        settings = tracker.openigtlink or OpenIGTLinkSettings()
+        self._by_arrival = settings.clock == "arrival"
+        self._lock = threading.Lock()
+        self._newest: Measurement | None = None
+        self._problems: dict[str, str] = {}
+        self._guard = node.create_guard_condition(self._work)
+        self._client = OpenIGTLinkClient(settings, tracker.body, self._came, self._went_wrong)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._client.close()
+
+    def _came(self, measurement: Measurement) -> None:
+        """In the client's thread: keep the newest, and let the node's thread do the rest."""
+        if self._by_arrival or measurement.stamp == 0:
+            now = self._node.get_clock().now().nanoseconds
+            measurement = dataclasses.replace(measurement, stamp=now)
+        with self._lock:
+            self._node.health.received += 1
+            self._node.health.dropped += self._newest is not None
+            self._newest = measurement
+        self._guard.trigger()
+
+    def _went_wrong(self, kind: str, sentence: str) -> None:
+        with self._lock:
+            self._problems[kind] = sentence
+        self._guard.trigger()
+
+    def _work(self) -> None:
+        with self._lock:
+            measurement, self._newest = self._newest, None
+            problems, self._problems = self._problems, {}
+        for kind, sentence in problems.items():
+            self._node.refuse(kind, sentence)
+        if measurement is not None:
+            self._node.take(measurement)
