@@ -89,6 +89,25 @@ def test_the_charuco_photos_give_the_published_camera(shared_data):
     assert "beyond 44 % of the way" in found.note
 
 
+def test_a_photo_with_wrong_corners_is_left_out():
+    rng = np.random.default_rng(3)
+    views = good_views(rng)
+    wrong = views[4].pixels + np.float32(6.0) * rng.standard_normal((63, 2)).astype(np.float32)
+    views[4] = BoardView(views[4].points, wrong)
+    found = calibrate_camera(views, 640, 480)
+    assert (found.used == (np.arange(12) != 4)).all()
+    assert found.rms < 0.4
+    assert len(found.residuals) == 11
+
+
+def test_another_board_than_was_described_is_refused():
+    views = good_views(np.random.default_rng(3))
+    # Its corners lie as on no plane board whose camera is a pinhole.
+    stretched = [BoardView(np.float32([1, 1.4, 1]) * view.points**2, view.pixels) for view in views]
+    with pytest.raises(CalibrationError, match="no camera fits the photos"):
+        calibrate_camera(stretched, 640, 480)
+
+
 def test_boards_that_are_all_parallel_are_refused():
     rng = np.random.default_rng(1)
     views = [

@@ -40,6 +40,10 @@ _SMALLEST_REACH = 0.3  # of the way from the middle to the image's corners
 _GOOD_REACH = 0.7
 _LARGEST_DEVIATION = 0.05  # of the focal lengths
 _GOOD_DEVIATION = 0.01
+_LARGEST_RMS = 5.0  # pixels, above which the board is not the one that was described
+_GOOD_RMS = 1.0
+_FAR_OFF = 3.0  # times the median residual of all views, for one that misleads
+_MOST_LEFT_OUT = 0.25  # of the views
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,8 @@ class CameraCalibration:
 
     camera: CameraModel
     rms: float  # pixels, root mean square distance of all corners from where they should be
-    residuals: NDArray[np.float64]  # (K,) pixels, the same of each view
+    residuals: NDArray[np.float64]  # (K,) pixels, the same of each view that was used
+    used: NDArray[np.bool_]  # (N,) which of the given views; the others fit far worse
     deviations: NDArray[np.float64]  # (9,) standard deviations of INTRINSICS
     tilt: float  # rad, the largest angle between two boards
     reach: float  # how far the corners go from the middle (0) to the image's corners (1)
@@ -57,6 +62,11 @@ class CameraCalibration:
     def note(self) -> str:
         """What the photos leave open, in a sentence; empty when nothing."""
         notes = []
+        if self.rms > _GOOD_RMS:
+            notes.append(
+                f"an RMS of {self.rms:.1f} pixels is large: hold the camera and the board still, "
+                f"and the print flat"
+            )
         if self.focal_deviation > _GOOD_DEVIATION:
             notes.append(
                 f"the focal length is known to {100 * self.focal_deviation:.1f} % only: tilt the "
@@ -97,10 +107,47 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
             f"the board is always in the middle of the image ({100 * reach:.0f} % of the way to "
             f"its corners), so the lens cannot be told: take photos with the board near each edge"
         )
+    used = np.ones(len(views), dtype=np.bool_)
+    found = _solve(views, width, height)
+    # A blurred photo or a wrong corner stands out; more than a few are the rule.
+    off = found.residuals > np.maximum(_FAR_OFF * np.median(found.residuals), _GOOD_RMS)
+    if off.any() and off.sum() <= min(_MOST_LEFT_OUT * len(views), len(views) - _FEWEST_VIEWS):
+        used = ~off
+        found = _solve([view for view, use in zip(views, used, strict=True) if use], width, height)
+    if found.rms > _LARGEST_RMS:
+        raise CalibrationError(
+            f"no camera fits the photos (RMS {found.rms:.1f} pixels): check the board's kind, size "
+            f"and lengths"
+        )
+    deviations, tilt = found.deviations, _largest_tilt(found.rotations)
+    _check(found.matrix, deviations, tilt)
+    return CameraCalibration(
+        CameraModel(width, height, found.matrix, found.lens),
+        found.rms,
+        found.residuals,
+        used,
+        deviations,
+        tilt,
+        reach,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """What OpenCV finds."""
+
+    rms: float
+    matrix: NDArray[np.float64]  # (3, 3)
+    lens: NDArray[np.float64]  # (5,)
+    rotations: list[NDArray[np.float64]]  # (3, 3) of each view
+    deviations: NDArray[np.float64]  # (9,)
+    residuals: NDArray[np.float64]  # (K,)
+
+
+def _solve(views: Sequence[BoardView], width: int, height: int) -> _Solution:
+    start: Any = None  # no camera to start from, which OpenCV's type hints do not know
     try:
-        # No camera to start from, which OpenCV's type hints do not know.
-        start: Any = None
-        rms, found, lens, turns, _, deviations, _, residuals = cv2.calibrateCameraExtended(
+        rms, matrix, lens, turns, _, deviations, _, residuals = cv2.calibrateCameraExtended(
             [view.points for view in views],
             [view.pixels for view in views],
             (width, height),
@@ -109,19 +156,15 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
         )
     except cv2.error as error:
         raise CalibrationError(
-            "no camera fits the photos: check the board's size, squares and dictionary"
+            "no camera fits the photos: check the board's kind, size and lengths"
         ) from error
-    matrix: NDArray[np.float64] = np.array(found, np.float64)
-    tilt = _largest_tilt([np.asarray(cv2.Rodrigues(turn)[0]) for turn in turns])
-    deviations = np.asarray(deviations, np.float64).ravel()[: len(INTRINSICS)]
-    _check(matrix, deviations, tilt)
-    return CameraCalibration(
-        CameraModel(width, height, matrix, np.array(lens, np.float64).ravel()[:5]),
+    return _Solution(
         float(rms),
-        np.asarray(residuals, np.float64).ravel(),
-        deviations,
-        tilt,
-        reach,
+        np.array(matrix, np.float64),
+        np.array(lens, np.float64).ravel()[:5],
+        [np.asarray(cv2.Rodrigues(turn)[0], np.float64) for turn in turns],
+        np.array(deviations, np.float64).ravel()[: len(INTRINSICS)],
+        np.array(residuals, np.float64).ravel(),
     )
 
 

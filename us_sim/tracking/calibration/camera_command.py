@@ -47,13 +47,23 @@ def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -
             f"--dictionary"
         )
     found = calibrate_camera(views, *size)
-    write_camera_info(out, found.camera, name, _notes(found, board, names, views, blank))
+    far_off = [name for name, used in zip(names, found.used, strict=True) if not used]
+    names = [name for name, used in zip(names, found.used, strict=True) if used]
+    views = [view for view, used in zip(views, found.used, strict=True) if used]
+    notes = _notes(found, board, names, views) | {
+        "photos_without_board": blank,
+        "photos_left_out": far_off,
+    }
+    write_camera_info(out, found.camera, name, notes)
     draw_coverage(picture, found, views, names)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
     left_out = f"; {len(blank)} without the board: {', '.join(blank)}" if blank else ""
+    left_out += (
+        f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}" if far_off else ""
+    )
     note = f"; {found.note}" if found.note else ""
     return (
         f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {len(views)} photos, coverage in "
@@ -133,7 +143,6 @@ def _notes(
     board: Board,
     names: Sequence[str],
     views: Sequence[BoardView],
-    blank: Sequence[str],
 ) -> dict[str, object]:
     """What the file says besides the camera; ROS' readers pass it over."""
     return {
@@ -146,6 +155,5 @@ def _notes(
         "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
         "largest_tilt": found.tilt,  # rad, between two boards
         "reach": found.reach,  # of the way from the image's middle to its corners
-        "photos_without_board": list(blank),
         "note": found.note,
     }
