@@ -252,7 +252,6 @@ class Scene:
             _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
             Part("slice_interpolator", True, self._imaged()),
             *self._felt(),
-            *self._felt(),
         ]
 
     def _felt(self) -> list[Part]:
@@ -260,13 +259,6 @@ class Scene:
         if self.tracker.source != "haptic":
             return []
         return [_part("haptic_renderer", self.tissue, "tissue", "nothing can be felt")]
-
-    def _felt(self) -> list[Part]:
-        """What makes the tissue be felt, where there is a hand to feel it."""
-        if self.tracker.source != "haptic":
-            return []
-        reason = "the haptic arm feels the tissue" if self.tissue else "nothing is there to feel"
-        return [Part("haptic_renderer", self.tissue is not None, reason)]
 
     def _imaged(self) -> str:
         """How images are made, for a person."""
