@@ -138,6 +138,31 @@ def test_it_errs_as_much_as_it_says():
         assert low < total < high
 
 
+def test_errors_go_on_as_the_predicted_pose_says_by_differences():
+    """Turning by 1.5 rad within the step, where the rotation's errors turn too."""
+    rng = np.random.default_rng(9)
+    quiet = FilterSettings("kalman", acceleration=1e-6, angular_acceleration=1e-6)
+    stamp, later, step = 10**9, 13 * 10**8, 1e-6
+    place = (rng.normal(size=3), Pose(orientation=rng.normal(size=4)).orientation)
+    velocity = np.array([0.1, -0.2, 0.3, 3.0, -3.5, 2.0])
+    root = rng.normal(size=(12, 12))
+
+    def predicted(error):
+        kalman = ConstantVelocityKalman(quiet)
+        kalman._stamp, kalman._velocity = stamp, velocity + error[6:]
+        moved = displaced(Pose(*place), error[:6])
+        kalman._place, kalman._covariance = (moved.position, moved.orientation), root @ root.T
+        there, covariance = kalman.predicted(later)
+        return Pose(*there), covariance
+
+    transition = np.eye(12)
+    for k, error in enumerate(step * np.eye(12)):
+        behind, ahead = (predicted(sign * error)[0] for sign in (-1, 1))
+        transition[:6, k] = difference(behind, ahead) / (2 * step)
+    expected = transition @ root @ root.T @ transition.T
+    np.testing.assert_allclose(predicted(np.zeros(12))[1], expected, atol=1e-7)
+
+
 def test_before_the_first_measurement_it_predicts_nothing():
     with pytest.raises(TrackingError, match="predicts nothing before its first measurement"):
         ConstantVelocityKalman(SETTINGS).predicted(5)

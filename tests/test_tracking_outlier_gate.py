@@ -73,6 +73,13 @@ def test_refused_poses_that_agree_are_the_new_place():
     assert gate.judge(seen(70, 0.0)) is REFUSED
 
 
+def test_a_new_place_is_left_as_hardly_as_the_old_one():
+    gate = settled()
+    there = [seen(10 * k, 0.5) for k in range(1, 5)]
+    back = [seen(10 * k, 0.0) for k in range(5, 9)]
+    assert verdicts(gate, *there, *back) == ([REFUSED] * 3 + [NEW_PLACE]) * 2
+
+
 def test_refused_poses_that_do_not_agree_are_no_place():
     """However long they come: for 10 s, in which a probe may go anywhere, but does not so."""
     gate = settled()
@@ -125,13 +132,12 @@ def test_with_covariances_right_poses_are_refused_as_rarely_as_was_asked():
     rng = np.random.default_rng(7)
     gate = OutlierGate(GateSettings(confidence=0.95))
     refused, pairs = 0, 4000
-    root = np.linalg.cholesky(COVARIANCE)
     for _ in range(pairs):
         gate.reset()
-        for k in range(2):
-            noise = root @ rng.normal(size=6)
+        for k, covariance in enumerate((COVARIANCE, 9 * COVARIANCE)):
+            noise = np.linalg.cholesky(covariance) @ rng.normal(size=6)
             pose = Pose(noise[:3], rotation_exp(noise[3:]))
-            verdict = gate.judge(Measurement(1 + 1000 * k, pose, COVARIANCE))
+            verdict = gate.judge(Measurement(1 + 1000 * k, pose, covariance))
         refused += verdict is REFUSED
     assert abs(refused - 0.05 * pairs) < 3.3 * np.sqrt(0.05 * 0.95 * pairs)  # 99.9 per cent
 

@@ -183,6 +183,21 @@ def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
     assert answers[4].pose.position[0] == 0.3
 
 
+@pytest.mark.parametrize("method", FILTER_METHODS)
+def test_after_nonsense_the_filter_starts_where_the_probe_is_found(method):
+    rng = np.random.default_rng(8)
+    tracked = tracking(method, GateSettings())
+    take(tracked, *(at(20 * k, 0.001 * k) for k in range(10)))
+    take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(100) + 1)))
+    found = take(tracked, at(2200, 0.02))[0]
+    assert found.pose.position[0] == 0.02
+    assert tracked.restarts == {"gap": 1}
+
+
+def test_zeros_for_a_covariance_mean_that_nothing_is_known():
+    assert take(tracking(), at(0, covariance=np.zeros((6, 6))))[0].covariance is None
+
+
 def test_after_a_reset_it_waits():
     tracked = tracking("kalman", GateSettings())
     take(tracked, at(0))
