@@ -44,6 +44,7 @@ def test_examples(name):
         "us_sim.recording.writer",
         "us_sim.recording.path",
         "us_sim.scene_file",
+        "us_sim.tracking.probe_tracking",
     ],
 )
 def test_main_parts_show_how_they_are_used_without_ros(name):
