@@ -73,13 +73,15 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
 
 
 def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
-    """The probe path in a bag, in the frame that the scene's tracker has.
+    """The probe path in a bag or a recording, in the frame that the scene's tracker has.
 
     Raises:
         BagError: it cannot be read, or is in another frame.
     """
     from us_sim.recording.path import read_path
 
+    if scene.tracker.source == "path":
+        topic = topic or scene.tracker.body
     path = read_path(file, topic)
     if path.frame_id != scene.tracker.frame:
         raise BagError(

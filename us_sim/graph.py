@@ -57,8 +57,15 @@ class NodeProcess:
         return command
 
 
-def simulation_nodes(scene: Scene, parameters: Parameters | None = None) -> list[NodeProcess]:
-    """The nodes that ``scene`` needs; ``parameters`` gives extra ones by node, as YAML texts.
+def simulation_nodes(
+    scene: Scene, parameters: Parameters | None = None, *, played: bool = False
+) -> list[NodeProcess]:
+    """The nodes that ``scene`` needs.
+
+    Args:
+        scene: what they work on.
+        parameters: extra ones by node, as YAML texts.
+        played: a path is played on ``tracker/pose``, whatever the scene's tracker is.
 
     Raises:
         UsSimError: a parameter is for a node that this scene does not run.
@@ -68,7 +75,11 @@ def simulation_nodes(scene: Scene, parameters: Parameters | None = None) -> list
     if scene.volume.file:
         common["volume"] = scene.volume.file
     nodes = [
-        NodeProcess(part.node, common, given.pop(part.node, {}))
+        NodeProcess(
+            part.node,
+            common | ({"source": "pose"} if played and part.node == "probe_tracker" else {}),
+            given.pop(part.node, {}),
+        )
         for part in scene.parts()
         if part.needed
     ]
@@ -87,6 +98,7 @@ def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, ob
     topics += ["skin/nodes"] if scene.skin else []
     return {
         "path": str(path.expanduser().resolve()),
+        "topic": (scene.tracker.body or "") if scene.tracker.source == "path" else "",
         "await_topics": topics,
         "await_subscriber": "session_recorder" if recorded else "",
     }

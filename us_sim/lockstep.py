@@ -95,7 +95,7 @@ def render(
         for module, name, settings in _nodes(scene, path, out, parameters or {}):
             nodes.append(_created(module, name, settings, context))
             executor.add_node(nodes[-1])
-        for process in simulation_nodes(scene, parameters):
+        for process in simulation_nodes(scene, parameters, played=True):
             (node,) = (node for node in nodes if node.get_name() == process.node)
             refuse_unknown(process, node.list_parameters([], 0).names)
         return _spin(executor, nodes, progress)
@@ -123,7 +123,7 @@ def _nodes(
         ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
         *(
             (process.node, _class_name(process.node), {**common, **_values(process)})
-            for process in simulation_nodes(scene, parameters)
+            for process in simulation_nodes(scene, parameters, played=True)
         ),
         ("path_player", "PathPlayer", player),
     ]

@@ -66,7 +66,7 @@ def plan_of(
             NodeProcess("session_recorder", settings, parameters.pop("session_recorder", {}))
         )
     player = parameters.pop("path_player", {}) if path is not None else {}
-    processes += simulation_nodes(scene, parameters)
+    processes += simulation_nodes(scene, parameters, played=path is not None)
     poses = None
     if path is not None:
         poses = len(path_of(scene, path, player.get("topic")))

@@ -14,11 +14,13 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from us_sim.assembly import tracking_of
+from us_sim.errors import SceneError
 from us_sim.nodes.conversions import pose_message, transform_message
+from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.tracker_inputs import create_input
+from us_sim.nodes.tracker_inputs import INPUTS, create_input
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.tracking_state import TrackingState
 
@@ -38,19 +40,24 @@ LEVELS = {
 class ProbeTracker(SceneNode):
     """A source's measurements in; ``probe/pose``, ``tf`` and ``probe/status`` out.
 
-    What it listens to is up to ``tracker.source`` of the scene, see `tracker_inputs`. A pose goes
+    What it listens to is up to ``tracker.source`` of the scene, or the parameter ``source``, see
+    `tracker_inputs`. A pose goes
     out once, with the stamp of its measurement. ``probe/status``, latched, says whether the probe
     is ``tracked``, ``coasting`` or ``lost``, each time that changes.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
+        self._source = fixed_parameter(self, "source", "", "replaces tracker.source of the scene")
+        self._source = self._source or self.scene.tracker.source
+        if self._source not in INPUTS:
+            raise SceneError(f"source is '{self._source}'; it must be one of {', '.join(INPUTS)}")
         self._tracking = tracking_of(self.scene)
         self._state = TrackingState.WAITING
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
         self._status = self.latched(DiagnosticStatus, "probe/status")
-        self._input = create_input(self.scene.tracker.source, self)
+        self._input = create_input(self._source, self)
         self.health.state = "waiting for poses"
         self._say_status()
         if not self.lockstep:
@@ -151,7 +158,7 @@ class ProbeTracker(SceneNode):
             level=LEVELS[self._state],
             name="probe",
             message=self._state.value,
-            hardware_id=self.scene.tracker.source,
+            hardware_id=self._source,
         )
         refused = self._tracking.refused
         status.values = [KeyValue(key=f"refused {k}", value=str(n)) for k, n in refused.items()]

@@ -72,24 +72,35 @@ class ProbePath:
 
 
 def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
-    """Reads the poses of a bag.
+    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``).
 
     Poses that are not finite or have no orientation are left out and counted.
 
     Args:
-        path: any bag that ``read_bag`` reads.
+        path: any bag that ``read_bag`` reads, or a recording.
         topic: its name, with or without the leading slash; when not given, the bag's only
-            PoseStamped topic, or among several the one named ``tracker/pose``.
+            PoseStamped topic, or among several the one named ``tracker/pose``. In a recording, a
+            transform (``ProbeToReference``).
 
     Raises:
         BagError: there is no such bag or topic, several come into question, the topic is of
             another type or encoding, its poses are of several frames, or none is usable.
+        TrackingError: the same of a recording.
     """
+    if is_tracker_recording(path):
+        from us_sim.tracking.plus_recording import read_tracker_recording
+
+        return read_tracker_recording(path).probe_path(topic)
     bag = read_bag(path)
     chosen = _pose_topic(bag, topic)
     if chosen.message_count == 0:
         raise BagError(f"{bag.path} holds no pose on {chosen.name}; {bag.note or 'it is silent'}")
     return _extract(bag, chosen, list(bag.messages([chosen.name])))
+
+
+def is_tracker_recording(path: str | Path) -> bool:
+    """Whether a file's name is that of a sequence of Plus."""
+    return Path(path).suffix.lower() in (".mha", ".mhd")
 
 
 def write_path(

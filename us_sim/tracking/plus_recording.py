@@ -40,7 +40,7 @@ from us_sim.recording.path import ProbePath
 from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
 from us_sim.volume.stored_size import metaimage_header
 
-__all__ = ["TrackerRecording", "Way", "is_tracker_recording", "read_tracker_recording"]
+__all__ = ["TrackerRecording", "Way", "read_tracker_recording"]
 
 _METRES = 1e-3  # the format holds millimetres
 _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
@@ -72,13 +72,16 @@ class TrackerRecording:
         """From a body to a reference frame, by the fewest transforms.
 
         Args:
-            name: of a transform (``StylusToTracker``), or of a body (``Stylus``).
+            name: of a transform (``StylusToTracker``), also one that others make up
+                (``StylusToReference``), or of a body (``Stylus``).
             reference: a frame (``Reference``); not given, that of the body's own transform.
 
         Raises:
             TrackingError: the recording has no such transform, or no way to the reference.
         """
-        body = _ends(name)[0] if name in self.transforms else name
+        body, end = _ends(name)
+        if reference is None and end and name not in self.transforms:
+            reference = end
         own = [key for key in self.transforms if _ends(key)[0] == body]
         if reference is None and name in self.transforms:
             own = [name]
@@ -172,11 +175,6 @@ class TrackerRecording:
             steps.setdefault(start, []).append((end, key, True))
             steps.setdefault(end, []).append((start, key, False))
         return steps
-
-
-def is_tracker_recording(path: str | Path) -> bool:
-    """Whether a file's name is that of a sequence of Plus."""
-    return str(path).lower().endswith((".mha", ".mhd"))
 
 
 def read_tracker_recording(path: str | Path) -> TrackerRecording:

@@ -1,0 +1,71 @@
+"""A recorded path in place of a tracker: a bag, or a tracker recording of Plus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from us_sim.assembly import path_of
+from us_sim.errors import SceneError
+from us_sim.pose import Pose
+from us_sim.tracking.measurement import Measurement
+
+if TYPE_CHECKING:
+    from us_sim.nodes.probe_tracker import ProbeTracker
+
+__all__ = ["PathInput"]
+
+SHORTEST_S, LONGEST_S = 1e-3, 0.02
+"""How often it is looked whether a pose is due, at most and at least."""
+
+
+class PathInput:
+    """The poses of ``tracker.file``, once, as fast as they were recorded.
+
+    It begins when somebody listens to ``probe/pose``; stamps are the present's.
+    """
+
+    def __init__(self, node: ProbeTracker) -> None:
+        scene = node.scene
+        if scene.tracker.file is None:
+            raise SceneError(
+                f"{scene.origin}: tracker.file: is missing; name the bag or recording to play"
+            )
+        if node.lockstep:
+            raise SceneError(
+                f"{scene.origin}: tracker.source: `path` keeps its own time, so it cannot wait for "
+                f"images; give the recording with --path"
+            )
+        self._node = node
+        self._path = path_of(scene, Path(scene.tracker.file))
+        if self._path.note:
+            node.get_logger().warning(self._path.note)
+        # A recorder's clock may have been set back; what was recorded before is sent before.
+        self._due = np.maximum.accumulate(self._path.log_times - self._path.log_times[0])
+        self._next = 0
+        self._begun: int | None = None
+        steps = np.diff(self._due)
+        period = 0.5e-9 * float(np.median(steps)) if len(steps) else LONGEST_S
+        self._timer = node.create_timer(float(np.clip(period, SHORTEST_S, LONGEST_S)), self._tick)
+
+    def _tick(self) -> None:
+        """Hand on each pose whose time has come."""
+        now = self._node.get_clock().now().nanoseconds
+        if self._begun is None:
+            if not self._node.count_subscribers("probe/pose"):
+                return
+            self._begun = now
+            self._node.get_logger().info(f"playing {len(self._path)} poses of {self._path.topic}")
+        while self._next < len(self._path) and self._due[self._next] <= now - self._begun:
+            self._send(self._begun + int(self._due[self._next]))
+            self._next += 1
+        if self._next == len(self._path):
+            self._timer.cancel()
+            self._node.get_logger().info("the path is at its end")
+
+    def _send(self, stamp: int) -> None:
+        self._node.health.received += 1
+        pose = Pose(self._path.positions[self._next], self._path.orientations[self._next])
+        self._node.take(Measurement(stamp, pose))
