@@ -1,9 +1,12 @@
 """What the gate refuses: by known speeds, by chi-square's own shares, and never for good."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
 from us_sim.pose import Pose
 from us_sim.tracking.filter_settings import GateSettings
@@ -140,6 +143,19 @@ def test_with_covariances_right_poses_are_refused_as_rarely_as_was_asked():
             verdict = gate.judge(Measurement(1 + 1000 * k, pose, covariance))
         refused += verdict is REFUSED
     assert abs(refused - 0.05 * pairs) < 3.3 * np.sqrt(0.05 * 0.95 * pairs)  # 99.9 per cent
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.9999, 0.999999, 1 - 1e-12])
+def test_with_covariances_the_limit_is_chi_squares(confidence):
+    """A way of its root in deviations, in a nanosecond."""
+    limit = math.sqrt(chi2.isf(1 - confidence, 6))
+    deviation = 1e-3
+    covariance = np.diag([deviation**2 / 2] * 6)
+    for part, verdict in ((0.9999, BELIEVED), (1.0001, REFUSED)):
+        gate = OutlierGate(GateSettings(confidence=confidence))
+        way = part * limit * deviation
+        gate.judge(Measurement(0, Pose(), covariance))
+        assert gate.judge(Measurement(1, Pose([0, way, 0]), covariance)) is verdict
 
 
 def test_with_covariances_the_fastest_motion_is_at_the_limit():

@@ -13,11 +13,10 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import degrees, sqrt
+from math import degrees, exp, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from us_sim.tracking.filter_settings import GateSettings
 from us_sim.tracking.measurement import Measurement
@@ -56,7 +55,7 @@ class OutlierGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self._settings = settings
-        self._limit = float(chdtri(6, 1.0 - settings.confidence))
+        self._limit = _chi_square_limit(settings.confidence)
         self.reset()
 
     def reset(self) -> None:
@@ -146,3 +145,17 @@ class OutlierGate:
 
 def _norm(vector: NDArray[np.float64]) -> float:
     return sqrt(float(vector @ vector))
+
+
+def _chi_square_limit(confidence: float) -> float:
+    """Below it is that share of chi-square with six degrees of freedom.
+
+    The share above x is exp(-y) (1 + y + y² / 2), y = x / 2 (Abramowitz and Stegun, 26.4.21). SciPy
+    knows it too, but takes half a second to import.
+    """
+    low, high = 0.0, 100.0
+    for _ in range(60):
+        y = 0.5 * (low + high)
+        above = exp(-y) * (1.0 + y + 0.5 * y * y)
+        low, high = (y, high) if above > 1.0 - confidence else (low, y)
+    return low + high
