@@ -39,7 +39,7 @@ def test_corners_are_where_opencv_projects_them(camera, turn):
     )
     expected = expected.reshape(-1, 2)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    found = cv2.cornerSubPix(image, np.float32(expected), (3, 3), (-1, -1), stop)
+    found = cv2.cornerSubPix(image, np.float32(expected), (8, 8), (-1, -1), stop)
     assert len(found) == 12
     np.testing.assert_allclose(found, expected, atol=0.05)
     assert np.abs((found - expected).mean(axis=0)).max() < 0.01
