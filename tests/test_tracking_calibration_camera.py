@@ -85,7 +85,7 @@ def test_the_charuco_photos_give_the_published_camera(shared_data):
     published = np.array([452.511, 456.767, 317.703, 277.752])
     error = found.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]] - published
     assert (np.abs(error) < found.deviations[:4]).all()
-    assert "known to 3.5 % only" in found.note
+    assert "the focal length is known to 3." in found.note
     assert "beyond 44 % of the way" in found.note
 
 

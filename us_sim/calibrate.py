@@ -133,6 +133,9 @@ def _add_time(kinds: Any) -> None:
         "--images", action="store_true", help="the fixed recording's images, though it has poses"
     )
     _add_pose(parser)
+    parser.add_argument(
+        "--fixed-pose", metavar="NAME", help="the same of the fixed recording, where it differs"
+    )
     _add_out(parser, "time.yaml", "the offset; a picture of both signals beside it")
     parser.set_defaults(command=_time)
 
@@ -221,11 +224,9 @@ def _probe(args: argparse.Namespace) -> int:
 def _time(args: argparse.Namespace) -> int:
     from us_sim.tracking.calibration.recording_commands import calibrate_clock
 
-    print(
-        calibrate_clock(
-            args.moving, args.fixed, args.pose, args.largest, _new(args.out), images=args.images
-        )
-    )
+    names = (args.pose, args.fixed_pose or args.pose)
+    out = _new(args.out)
+    print(calibrate_clock(args.moving, args.fixed, names, args.largest, out, images=args.images))
     return 0
 
 

@@ -151,7 +151,9 @@ class Board:
 
     @cached_property
     def _charuco_detector(self) -> cv2.aruco.CharucoDetector:
-        return cv2.aruco.CharucoDetector(self._printed)
+        settings = cv2.aruco.CharucoParameters()
+        settings.tryRefineMarkers = True  # a marker missed at first is looked for where it must be
+        return cv2.aruco.CharucoDetector(self._printed, settings)
 
 
 def _pixels(found: Any) -> NDArray[np.float32]:

@@ -50,7 +50,7 @@ def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
             "swing": found.swing,  # rad, of the direction that turned least
         },
     )
-    said = ", ".join(f"{1e3 * number:.2f}" for number in found.tip)
+    said = ", ".join(f"{1e3 * number:z.2f}" for number in found.tip)
     largest = 1e3 * float(found.deviations.max())
     return (
         f"{out}: tip at {said} mm (± {largest:.2f}), RMS {1e3 * found.rms:.2f} mm over "
@@ -123,7 +123,7 @@ def calibrate_registration(
 def calibrate_clock(
     moving_file: Path,
     fixed_file: Path,
-    name: str | None,
+    names: tuple[str | None, str | None],
     largest: float,
     out: Path,
     *,
@@ -134,7 +134,7 @@ def calibrate_clock(
     Args:
         moving_file: recording of the device.
         fixed_file: recording of what is right: poses, or images of a line.
-        name: of the poses.
+        names: of the poses in both.
         largest: s, the largest offset to believe.
         out: file to write; a picture goes beside it.
         images: take the fixed recording's images even where it has poses.
@@ -145,8 +145,8 @@ def calibrate_clock(
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    moving = read_signal(moving_file, name)
-    fixed = read_signal(fixed_file, name, images=images)
+    moving = read_signal(moving_file, names[0])
+    fixed = read_signal(fixed_file, names[1], images=images)
     found = find_time_offset(moving, fixed, largest=largest)
     write_calibration(
         out,
@@ -164,7 +164,7 @@ def calibrate_clock(
     )
     draw_offset(picture, found, moving, fixed)
     return (
-        f"{out}: time_offset {1e3 * found.offset:.1f} ms ± {1e3 * found.deviation:.1f} ms, "
+        f"{out}: time_offset {1e3 * found.offset:z.1f} ms ± {1e3 * found.deviation:.1f} ms, "
         f"correlation {found.correlation:.3f} over {found.seconds:.0f} s, signals in {picture}"
     )
 
