@@ -50,6 +50,15 @@ def test_what_is_no_pose_is_refused_counted_and_survived(bench, tracker, bad, ki
     assert node.health.problems(kind) == 1
 
 
+def test_a_quaternion_that_is_not_of_unit_length_is_taken_and_said(bench, tracker):
+    node, poses, publisher = tracker
+    publisher.publish(pose_at(0.001, 7, w=1.004))
+    publisher.publish(pose_at(0.001, 8, w=3.0))
+    bench.spin_until(lambda: len(poses) == 2)
+    assert poses[1].pose.orientation.w == 1.0
+    assert node.health.problems("quaternion") == 1
+
+
 def test_a_source_that_starts_again_is_followed(bench, tracker):
     _, poses, publisher = tracker
     publisher.publish(pose_at(0.001, 100))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -14,19 +15,22 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from us_sim.assembly import tracking_of
-from us_sim.errors import SceneError
-from us_sim.nodes.conversions import pose_message, transform_message
+from us_sim.errors import PoseError, SceneError
+from us_sim.nodes.conversions import pose_from, pose_message, transform_message
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.tracker_inputs import INPUTS, create_input
+from us_sim.pose import Pose
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.tracking_state import TrackingState
 
 __all__ = ["ProbeTracker", "main"]
 
 PATIENT = "patient"
+ROUNDED = 1e-2
+"""How far from 1 a quaternion's length may be by rounding."""
 CHECKS = 20.0
 """Times a second that the state is looked at when nothing comes."""
 LEVELS = {
@@ -106,8 +110,26 @@ class ProbeTracker(SceneNode):
             stamp = self._now()
         return stamp
 
+    def pose_in(self, message: PoseStamped, topic: str) -> Pose | None:
+        """A device's pose, if it is one and in the frame that the scene says; said when not."""
+        if not self.is_in_frame(message.header, topic):
+            return None
+        try:
+            pose = pose_from(message)
+        except PoseError as error:
+            self.refuse("pose", f"{topic}: {error}; it is not used")
+            return None
+        q = message.pose.orientation
+        length = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+        if abs(length - 1.0) > ROUNDED:
+            self.health.problem(
+                "quaternion", f"{topic}: the quaternion's length is {length:.4g}, taken as 1"
+            )
+        return pose
+
     def refuse(self, kind: str, sentence: str) -> None:
         """Count and say, now and then, why a device's message is not used."""
+        self._tracking.refuse(kind, sentence)
         self.health.problem(kind, sentence)
 
     def take(self, measurement: Measurement) -> None:
@@ -115,10 +137,12 @@ class ProbeTracker(SceneNode):
         restarts = self._tracking.restarts.total()
         probe = self._tracking.take(measurement, self._now())
         if self._tracking.restarts.total() > restarts:
-            self.get_logger().info("the tracker's poses start anew, and so does the filter")
+            self.get_logger().info(
+                "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0
+            )
         if probe is None:
             tracking = self._tracking
-            self.refuse(tracking.last_refused, f"{tracking.last_problem}; it is not used")
+            self.health.problem(tracking.last_refused, f"{tracking.last_problem}; it is not used")
             self._check()
             return
         stamp = Time(nanoseconds=max(probe.stamp, 0)).to_msg()

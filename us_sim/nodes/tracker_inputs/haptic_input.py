@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Bool
 
-from us_sim.errors import PoseError
-from us_sim.nodes.conversions import pose_from
 from us_sim.tracking.haptic_device import HapticDevice
 from us_sim.tracking.haptic_settings import HapticSettings
 
@@ -28,12 +26,8 @@ class HapticInput:
         node.listen_to_device(Bool, "haptic/clutch", self._clutch)
 
     def _take(self, message: PoseStamped) -> None:
-        if not self._node.is_in_frame(message.header, "haptic/pose"):
-            return
-        try:
-            pose = pose_from(message)
-        except PoseError as error:
-            self._node.refuse("pose", f"haptic/pose: {error}; it is not used")
+        pose = self._node.pose_in(message, "haptic/pose")
+        if pose is None:
             return
         stamp = self._node.stamp_of(message.header, "haptic/pose")
         self._node.take(self._device.take(pose, stamp))

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import PoseArray, PoseStamped
 
-from us_sim.errors import PoseError
-from us_sim.nodes.conversions import pose_from
 from us_sim.tracking.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -25,8 +23,6 @@ class PoseArrayInput:
         node.listen_to_device(PoseArray, "tracker/poses", self._take)
 
     def _take(self, message: PoseArray) -> None:
-        if not self._node.is_in_frame(message.header, "tracker/poses"):
-            return
         if self._entry >= len(message.poses):
             self._node.refuse(
                 "entry",
@@ -34,9 +30,7 @@ class PoseArrayInput:
                 f"(from 0): set tracker.entry in the scene",
             )
             return
-        try:
-            pose = pose_from(PoseStamped(pose=message.poses[self._entry]))
-        except PoseError as error:
-            self._node.refuse("pose", f"tracker/poses[{self._entry}]: {error}; it is not used")
-            return
-        self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/poses"), pose))
+        entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
+        pose = self._node.pose_in(entry, "tracker/poses")
+        if pose is not None:
+            self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/poses"), pose))

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import PoseStamped
 
-from us_sim.errors import PoseError
-from us_sim.nodes.conversions import pose_from
 from us_sim.tracking.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -24,11 +22,6 @@ class PoseInput:
         node.listen_to_device(PoseStamped, "tracker/pose", self._take)
 
     def _take(self, message: PoseStamped) -> None:
-        if not self._node.is_in_frame(message.header, "tracker/pose"):
-            return
-        try:
-            pose = pose_from(message)
-        except PoseError as error:
-            self._node.refuse("pose", f"tracker/pose: {error}; it is not used")
-            return
-        self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/pose"), pose))
+        pose = self._node.pose_in(message, "tracker/pose")
+        if pose is not None:
+            self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/pose"), pose))
