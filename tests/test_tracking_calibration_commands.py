@@ -85,6 +85,7 @@ def test_landmarks_are_matched_by_name(tmp_path, capsys):
     measured = {
         name: pose.inverse().apply(np.array([point]))[0] for name, point in reversed(POINTS.items())
     }
+    measured["elbow"] = [0, 0, 0]
     known = table(tmp_path / "known.csv", POINTS)
     out = tmp_path / "registration.yaml"
     assert calibrate("landmarks", known, table(tmp_path / "m.csv", measured), "--out", out) == 0
@@ -92,7 +93,9 @@ def test_landmarks_are_matched_by_name(tmp_path, capsys):
     found = read_transform_file(out)
     assert (found.from_frame, found.to_frame) == ("tracker", "patient")
     assert set(found.residuals["landmarks"]) == set(POINTS)
-    assert "FRE 0.00 mm over 4 landmarks" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "FRE 0.00 mm over 4 landmarks" in said
+    assert "in one file only: elbow" in said
 
 
 def test_landmarks_are_touched_in_a_recording(tmp_path):

@@ -54,6 +54,16 @@ def test_errors_are_as_large_as_the_deviation_says():
     assert scatter < 3e-3
 
 
+def test_what_lies_in_a_gap_is_not_made_up():
+    moving = recorded(50, 22, offset=-0.07)
+    seen = (moving.times < 6) | (moving.times > 8.3)
+    found = find_time_offset(
+        PositionSignal(moving.times[seen], moving.values[seen]), recorded(12, 20, start=1.0)
+    )
+    assert found.offset == pytest.approx(0.07, abs=1e-4)
+    assert found.correlation > 0.9999
+
+
 def test_the_direction_that_moved_most_is_the_signal():
     times = np.linspace(0, 5, 100)
     along = np.array([2.0, -1.0, 2.0]) / 3.0

@@ -114,9 +114,11 @@ def calibrate_registration(
     )
     worst = int(found.residuals.argmax())
     tre = "" if math.isnan(found.tre) else f", leave-one-out TRE {1e3 * found.tre:.2f} mm"
+    alone = sorted(set(known) ^ set(measured))
+    unused = f"; in one file only: {', '.join(alone)}" if alone else ""
     return (
         f"{out}: FRE {1e3 * found.fre:.2f} mm over {len(names)} landmarks (worst "
-        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){tre}"
+        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){tre}{unused}"
     )
 
 

@@ -36,6 +36,7 @@ _SHORTEST = 3.0  # s, of both recordings together
 _LEAST_CORRELATION = 0.7
 _CLEAREST = 1.5  # times the best's squared error that any other offset's must have
 _BLOCKS = 10
+_GAP = 5.0  # times the usual interval, between samples that nothing is interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ def find_time_offset(
     moving_is_dense = _interval(moving) <= _interval(fixed)
     dense, sparse = (moving, fixed) if moving_is_dense else (fixed, moving)
     times, values = _compared(dense, sparse, 2.0 * largest)
-    match = _Match(CubicSpline(dense.times, dense.values), times, values)
+    match = _Match(CubicSpline(dense.times, dense.values), _gaps(dense), times, values)
     step = min(_LARGEST_STEP, 0.5 * _interval(dense))
     tried = np.linspace(-2.0 * largest, 2.0 * largest, 4 * round(largest / step) + 1)
     correlations = np.array([match.correlation(shift) for shift in tried])
@@ -103,12 +104,19 @@ class _Match:
     """A curve and the samples that it is compared with."""
 
     curve: CubicSpline
+    gaps: NDArray[np.float64]  # (G, 2) s, where the curve is a guess
     times: NDArray[np.float64]
     values: NDArray[np.float64]
 
     def correlation(self, shift: float) -> float:
-        """Of the samples with the curve so much later."""
-        return float(np.corrcoef(self.curve(self.times + shift), self.values)[0, 1])
+        """Of the samples with the curve so much later; 0 where gaps leave too few."""
+        times, values = self.times + shift, self.values
+        if len(self.gaps):
+            known = ~((times > self.gaps[:, :1]) & (times < self.gaps[:, 1:])).any(axis=0)
+            if known.sum() < max(0.5 * len(times), 3.0):
+                return 0.0
+            times, values = times[known], values[known]
+        return float(np.corrcoef(self.curve(times), values)[0, 1])
 
     def refined(self, shift: float, step: float) -> float:
         """The best shift within a step of one."""
@@ -122,11 +130,18 @@ class _Match:
 
     def without(self, block: NDArray[np.intp]) -> _Match:
         """Less some of the samples."""
-        return _Match(self.curve, np.delete(self.times, block), np.delete(self.values, block))
+        times, values = (np.delete(array, block) for array in (self.times, self.values))
+        return _Match(self.curve, self.gaps, times, values)
 
 
 def _interval(signal: PositionSignal) -> float:
     return float(np.median(np.diff(signal.times)))
+
+
+def _gaps(signal: PositionSignal) -> NDArray[np.float64]:
+    """(G, 2) s, from the last sample before to the first after each."""
+    before = np.flatnonzero(np.diff(signal.times) > _GAP * _interval(signal))
+    return np.stack([signal.times[before], signal.times[before + 1]], axis=1)
 
 
 def _blocks(count: int) -> list[NDArray[np.intp]]:
