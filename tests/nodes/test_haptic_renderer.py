@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 from bench import pose_at
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, TrackingError
-from us_sim.nodes.conversions import contact_model_from, contact_model_message, pose_from
+from us_sim.nodes.conversions import (
+    contact_model_from,
+    contact_model_message,
+    pose_from,
+    wrench_message,
+    wrench_serialized,
+)
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.pose import Pose
@@ -176,6 +183,16 @@ def test_a_model_survives_its_message():
     message.data[20] = 7.0
     with pytest.raises(TrackingError, match="not symmetric"):
         contact_model_from(message)
+
+
+@pytest.mark.parametrize("frame", ["", "arm", "base_link", "a_longer_name_of_a_frame"])
+def test_a_wrench_written_by_hand_is_the_message(frame):
+    wrench = np.array([1.0, -2.0, 3.5, 1e-9, 0.0, -7.25])
+    written = wrench_serialized(wrench, 1_234_567_890_123_456_789, frame)
+    stamp = Time(nanoseconds=1_234_567_890_123_456_789).to_msg()
+    message = wrench_message(wrench[:3], wrench[3:], stamp, frame)
+    assert deserialize_message(written, WrenchStamped) == message
+    assert written == serialize_message(message)
 
 
 def test_a_scene_without_tissue_is_refused(bench, tmp_path):

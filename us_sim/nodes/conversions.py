@@ -27,6 +27,7 @@ from us_sim.tracking.contact_model import ContactModel
 __all__ = [
     "affine_from",
     "affine_message",
+    "bgr_image_message",
     "cloud_message",
     "colour_image_message",
     "contact_model_from",
@@ -44,6 +45,7 @@ __all__ = [
     "transform_message",
     "vectors_from",
     "wrench_message",
+    "wrench_serialized",
 ]
 
 Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], NDArray[np.integer]]
@@ -114,6 +116,16 @@ def wrench_message(
     return message
 
 
+def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
+    """Force and torque (6,) N, N m about the origin of ``frame`` at ns, as a WrenchStamped.
+
+    Written here it takes a tenth of the time, for those who send a thousand a second.
+    """
+    name = frame.encode() + b"\0"
+    head = struct.pack(f"@iII{len(name)}s0d", *divmod(stamp, 1_000_000_000), len(name), name)
+    return _CDR_LITTLE_ENDIAN + head + wrench.astype("<f8").tobytes()
+
+
 def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
     """A ``mono8`` image of (rows, columns) pixels."""
     return _image(pixels, "mono8", 1, stamp, frame)
@@ -122,6 +134,11 @@ def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
 def colour_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
     """An ``rgb8`` image of (rows, columns, 3) pixels: red, green, blue."""
     return _image(pixels, "rgb8", 3, stamp, frame)
+
+
+def bgr_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """A ``bgr8`` image of (rows, columns, 3) pixels, as OpenCV has them."""
+    return _image(pixels, "bgr8", 3, stamp, frame)
 
 
 def _image(pixels: NDArray[np.uint8], encoding: str, size: int, stamp: Time, frame: str) -> Image:

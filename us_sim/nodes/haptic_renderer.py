@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from typing import Any
@@ -14,8 +15,8 @@ from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.assembly import haptic_rendering_of
 from us_sim.errors import SceneError, UsSimError
-from us_sim.nodes.conversions import contact_model_from, pose_from, wrench_message
-from us_sim.nodes.periodic_thread import PeriodicThread
+from us_sim.nodes.conversions import contact_model_from, pose_from, wrench_serialized
+from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
@@ -26,8 +27,8 @@ __all__ = ["HapticRenderer", "main"]
 REPORTS = 5.0
 """Times a second that diagnostics are told how it goes."""
 
-_SWITCH = 1e-4
-"""s: how long the executor may keep the interpreter from the thread that renders."""
+_PRIORITY = 10
+"""Of the executor, among real-time threads: below the one that renders."""
 
 
 class HapticRenderer(SceneNode):
@@ -104,8 +105,14 @@ class HapticRenderer(SceneNode):
 
     def _publish(self, wrench: NDArray[np.float64]) -> None:
         newest = self._rendering.stamp
-        now = Time(nanoseconds=newest) if newest is not None else self.get_clock().now()
-        self._wrenches.publish(wrench_message(wrench[:3], wrench[3:], now.to_msg(), self._frame))
+        stamp = self.get_clock().now().nanoseconds if newest is None else newest
+        message = wrench_serialized(wrench, stamp, self._frame)
+        try:
+            self._wrenches.publish(message)
+        except Exception:
+            if self.context.ok():
+                raise
+            return  # rclpy was shut down meanwhile, as by a signal
         self.health.published("haptic/wrench")
 
     def _report(self) -> None:
@@ -127,8 +134,20 @@ class HapticRenderer(SceneNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is interrupted."""
-    sys.setswitchinterval(_SWITCH)
-    return run_node(HapticRenderer, args)
+    # The thread that renders waits for the interpreter: who has it must not be kept waiting either.
+    be_punctual(_PRIORITY)
+    return run_node(_prepared, args)
+
+
+def _prepared() -> HapticRenderer:
+    """The node, with all that was needed to make it put aside for good.
+
+    Looking through it for what nobody uses any more would take tens of milliseconds, now and then.
+    """
+    node = HapticRenderer()
+    gc.collect()
+    gc.freeze()
+    return node
 
 
 if __name__ == "__main__":

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["PeriodicThread"]
+__all__ = ["PeriodicThread", "be_punctual"]
 
 _MEASURED = 2000
 """Ticks of which the jitter is told."""
 
 _PRIORITY = 20
-"""Among real-time threads, where the system lets us be one."""
+"""Among real-time threads: ordinary ones are at 0, the kernel's at 50."""
 
 
 class PeriodicThread:
@@ -54,7 +54,7 @@ class PeriodicThread:
         return 1e-9 * float(np.percentile(np.abs(np.diff(late)), 99)) if len(late) > 1 else 0.0
 
     def _run(self) -> None:
-        _be_punctual()
+        be_punctual()
         due = time.monotonic_ns()
         while not self._ending.is_set():
             due += self._period
@@ -69,7 +69,7 @@ class PeriodicThread:
             self._late.append(time.monotonic_ns() - due)
 
 
-def _be_punctual() -> None:
-    """Run before other threads of the machine, where that is allowed."""
+def be_punctual(priority: int = _PRIORITY) -> None:
+    """Let this thread run before the machine's other ones, where the system allows that."""
     with contextlib.suppress(AttributeError, OSError):
-        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(priority))

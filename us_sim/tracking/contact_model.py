@@ -106,18 +106,22 @@ class ContactModel:
 
     def energy_at(self, pose: Pose) -> float:
         """J, what the tissue gives back until the probe is let go, as far as the model tells."""
-        return self._answer(self.displacement(pose))[0]
+        return self.answer(self.displacement(pose))[0]
 
     def wrench_at(self, pose: Pose) -> NDArray[np.float64]:
         """(6,) N, N m on the probe at another pose, about its origin there, axes of ``patient``."""
-        displacement = self.displacement(pose)
-        _, slope = self._answer(displacement)
-        turn = displacement[3:]
-        # The energy falls along rotation vectors; the torque is what works on angular velocities.
-        slope[3:] = np.linalg.solve(se3.left_jacobian(turn).T, slope[3:])
-        return slope
+        return self.answer(self.displacement(pose))[1]
 
-    def _answer(self, d: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def answer(self, displacement: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
+        energy, wrench = self._slope(displacement)
+        turn = displacement[3:]
+        if wrench[3:].any() and turn.any():
+            # The energy falls along rotation vectors; a torque works on angular velocities.
+            wrench[3:] = np.linalg.solve(se3.left_jacobian(turn).T, wrench[3:])
+        return energy, wrench
+
+    def _slope(self, d: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """The energy (J) at a displacement (6,), and how it falls with that (6,)."""
         direction, force, slope, wrench, stiffness = self._split
         if force == 0.0:

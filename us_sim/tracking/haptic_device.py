@@ -90,37 +90,51 @@ class HapticDevice:
             se3.product(pose.orientation, self._regrip),
         )
 
-    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> Pose:
-        """Where the probe is now that the handle has moved; whatever the clutch did earlier.
+    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:
+        """How the probe moves with the handle, whatever the clutch did earlier.
 
         Args:
             probe: in ``patient``, when the handle was at ``before``.
             before, now: of the handle in the arm's frame.
+
+        Returns:
+            (6,) m, rad: the way of its origin, and its rotation vector, axes of ``patient``.
         """
-        turn = self._turn @ se3.rotation_between(before.orientation, now.orientation)
-        orientation = se3.product(se3.rotation_exp(turn), probe.orientation)
-        way = self._turn @ (self._scale * (now.position - before.position))
-        moved = Pose(probe.position, orientation)
-        swing = (moved.rotation - probe.rotation) @ self._lever
-        return Pose(probe.position + way + swing, orientation)
+        moved = np.empty(6)
+        moved[:3] = self._turn @ (self._scale * (now.position - before.position))
+        moved[3:] = self._turn @ se3.rotation_between(before.orientation, now.orientation)
+        if self._lever.any():
+            arm = probe.rotation @ self._lever
+            moved[:3] += _turned(arm, moved[3:]) - arm
+        return moved
+
+    def on_handle(
+        self, probe: Pose, turn: NDArray[np.float64], wrench: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
+
+        It does the work of the wrench on the probe, times `share`: so what takes no energy there
+        takes none here.
+
+        Args:
+            probe: in ``patient``, before it has turned.
+            turn: (3,) rad, its rotation vector since.
+            wrench: (6,) N, N m, on the probe about its origin, axes of ``patient``.
+        """
+        force, torque = wrench[:3], wrench[3:]
+        if self._lever.any():
+            arm = _turned(probe.rotation @ self._lever, turn)
+            torque = torque + se3.cross_matrix(arm) @ force
+        felt = np.empty(6)
+        felt[:3] = self._force_scale * (force @ self._turn)
+        felt[3:] = self.share * (torque @ self._turn)
+        return felt
 
     def direction_on_handle(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
         """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
         return direction @ self._turn
 
-    def on_handle(self, probe: Pose, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
 
-        It does the work of the wrench on the probe, times the force scale over the scale: so what
-        takes no energy there takes none here.
-
-        Args:
-            probe: in ``patient``.
-            wrench: (6,) N, N m, on the probe about its origin, axes of ``patient``.
-        """
-        force, torque = wrench[:3], wrench[3:]
-        arm = probe.rotation @ self._lever
-        felt = np.empty(6)
-        felt[:3] = self._force_scale * (force @ self._turn)
-        felt[3:] = self.share * ((torque + np.cross(arm, force)) @ self._turn)
-        return felt
+def _turned(vector: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A vector (3,), turned by a rotation vector (3,) rad."""
+    return Pose(orientation=se3.rotation_exp(turn)).rotation @ vector

@@ -23,6 +23,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import deque
 
@@ -105,6 +106,7 @@ class HapticRendering:
         self._begun: int | None = None  # ns, when the ramp began
         self._left_over, self._since = np.zeros(6), 0  # of the models before, and from when on, ns
         self._felt = np.zeros(6)
+        self._way = np.zeros(6)  # of the handle since the last tick
         self._ways: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
         #: J, taken from the handle since contact began, less what it was given.
         self.energy = 0.0
@@ -141,13 +143,9 @@ class HapticRendering:
         Args:
             now: ns, of the clock of `pose` and `model`.
         """
-        here = self._poses[-1] if self._poses else None
         doubt = self._take_poses(now)
-        way = np.zeros(6)
-        if here is not None:
-            way = _way(here, self._poses[-1])
-        self.energy -= float(self._felt @ way)
-        self._ways.append(way)
+        self.energy -= float(self._felt @ self._way)
+        self._ways.append(self._way)
         if doubt:
             # Only what is found from here on is believed.
             self._not_before = self._stamps[-1] if self._stamps else None
@@ -156,26 +154,28 @@ class HapticRendering:
         if doubt:
             return self._doubted(doubt)
         assert self._model is not None
-        handle = self._poses[-1]
-        probe = self._device.probe_moved(self._model.pose, self._anchor, handle)
-        doubt = self._far(probe)
+        moved = self._device.probe_moved(self._model.pose, self._anchor, self._poses[-1])
+        doubt = self._far(moved)
         if doubt:
             return self._doubted(doubt)
         self.doubt = ""
         if self._begun is None:
             self._begun = now
-        wrench = self._model.wrench_at(probe) + self._left(now)
-        felt = self._unilateral(self._device.on_handle(probe, wrench))
-        felt = self._limited(felt) * min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
+        stored, wrench = self._model.answer(moved)
+        wrench += self._left(now)
+        felt = self._device.on_handle(self._model.pose, moved[3:], wrench)
+        felt = self._limited(self._unilateral(felt))
+        felt *= min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
         if self.energy > 0.0:
-            stored = _STORED * self._device.share * self._model.energy_at(probe)
-            self.energy = min(self.energy, max(stored, 0.0)) if wrench.any() else 0.0
-        self._felt = self._limited(self._unilateral(self._passive(felt)))
+            most = max(_STORED * self._device.share * stored, 0.0) if wrench.any() else 0.0
+            self.energy = min(self.energy, most)
+        self._felt = self._passive(felt)
         return self._felt.copy()
 
     def _take_poses(self, now: int) -> str:
         """Take what arrived; a doubt about the handle, if any."""
         doubt, self._distrusted = self._distrusted, ""
+        self._way = np.zeros(6)
         while self._arrived:
             stamp, pose, time = self._arrived.popleft()
             step = stamp - self._stamps[-1] if self._stamps else 1
@@ -187,11 +187,12 @@ class HapticRendering:
                 continue  # repeated or late: the handle is where the newest says
             if self._poses:
                 way = _way(self._poses[-1], pose)
-                if np.linalg.norm(way[:3]) > self._settings.jump:
-                    doubt = f"the handle has jumped by {1e3 * np.linalg.norm(way[:3]):.1f} mm"
-                elif np.linalg.norm(way[3:]) > self._settings.rotation_jump:
-                    turn = np.degrees(np.linalg.norm(way[3:]))
-                    doubt = f"the handle has jumped by {turn:.0f} degrees"
+                self._way = self._way + way
+                far, turn = _lengths(way)
+                if far > self._settings.jump:
+                    doubt = f"the handle has jumped by {1e3 * far:.1f} mm"
+                elif turn > self._settings.rotation_jump:
+                    doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
             self._stamps.append(stamp)
             self._poses.append(pose)
             self._pose_time = time
@@ -228,10 +229,9 @@ class HapticRendering:
         if before is not None and not self.doubt:
             # What is felt now goes over into the new model's.
             handle = self._poses[-1]
-            old = self._device.probe_moved(before.pose, self._anchor, handle)
-            new = self._device.probe_moved(model.pose, anchor, handle)
-            left = self._left(time)
-            self._left_over = before.wrench_at(old) + left - model.wrench_at(new)
+            _, old = before.answer(self._device.probe_moved(before.pose, self._anchor, handle))
+            _, new = model.answer(self._device.probe_moved(model.pose, anchor, handle))
+            self._left_over = old + self._left(time) - new
             self._since = time
         self._model, self._anchor, self._model_time = model, anchor, time
         self._not_before = stamp
@@ -249,15 +249,13 @@ class HapticRendering:
         share = (stamp - first) / (second - first)
         return se3.interpolate(self._poses[place - 1], self._poses[place], share)
 
-    def _far(self, probe: Pose) -> str:
-        """A doubt about a model made elsewhere."""
-        assert self._model is not None
-        away = self._model.displacement(probe)
-        way, turn = np.linalg.norm(away[:3]), np.linalg.norm(away[3:])
-        if way > self._settings.model_reach:
-            return f"the probe is {1e3 * way:.1f} mm from where the contact is known"
+    def _far(self, moved: NDArray[np.float64]) -> str:
+        """A doubt about a model made elsewhere, so far away (6,) m, rad."""
+        far, turn = _lengths(moved)
+        if far > self._settings.model_reach:
+            return f"the probe is {1e3 * far:.1f} mm from where the contact is known"
         if turn > self._settings.model_rotation_reach:
-            return f"the probe is turned {np.degrees(turn):.0f}° from where the contact is known"
+            return f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
         return ""
 
     def _doubted(self, doubt: str) -> NDArray[np.float64]:
@@ -283,24 +281,23 @@ class HapticRendering:
         """The wrench, less a force that would pull the handle against the tissue's push."""
         assert self._model is not None
         push = self._device.direction_on_handle(self._model.push)
-        pulled = min(float(felt[:3] @ push), 0.0)
-        return np.concatenate([felt[:3] - pulled * push, felt[3:]])
+        pulled = float(felt[:3] @ push)
+        if pulled < 0.0:
+            felt[:3] -= pulled * push
+        return felt
 
     def _limited(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
         """At most what the arm may give."""
-        limited = felt.copy()
-        for part, limit in (
-            (slice(0, 3), self._settings.force_limit),
-            (slice(3, 6), self._settings.torque_limit),
-        ):
-            size = float(np.linalg.norm(felt[part]))
-            if size > limit:
-                limited[part] *= limit / size
-        return limited
+        force, torque = _lengths(felt)
+        if force > self._settings.force_limit:
+            felt[:3] *= self._settings.force_limit / force
+        if torque > self._settings.torque_limit:
+            felt[3:] *= self._settings.torque_limit / torque
+        return felt
 
     def _passive(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
         """The wrench, less what along the handle's way would give more than there is."""
-        way = np.mean(self._ways, axis=0)
+        way = sum(self._ways) / len(self._ways)
         given = float(felt @ way)
         left = self.energy
         allowed = left / _RESERVE if left > 0.0 else left
@@ -313,10 +310,16 @@ class HapticRendering:
         # Along the way no more is taken off than is there, and than damping gives back.
         most = max(given, 0.0) + _DAMPING * self._settings.rate * square
         off = min(given - allowed, most) / square
-        return felt - off * self._metric * direction
+        return self._limited(self._unilateral(felt - off * self._metric * direction))
 
 
 def _way(first: Pose, second: Pose) -> NDArray[np.float64]:
     """(6,) m, rad, from one pose of the handle to another, along the axes of the arm."""
     turn = se3.rotation_between(first.orientation, second.orientation)
     return np.concatenate([second.position - first.position, turn])
+
+
+def _lengths(pair: NDArray[np.float64]) -> tuple[float, float]:
+    """Of the first and of the last three numbers."""
+    a, b, c, d, e, f = pair.tolist()
+    return math.sqrt(a * a + b * b + c * c), math.sqrt(d * d + e * e + f * f)
