@@ -150,6 +150,29 @@ def test_half_a_chessboard_is_not_a_board_but_half_a_charuco_is():
     assert plain.find(np.zeros((100, 100), np.uint8)) is None
 
 
+def test_old_charuco_boards_need_to_be_called_that():
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    old = cv2.aruco.CharucoBoard((5, 6), 0.03, 0.02, markers)
+    old.setLegacyPattern(True)
+    photo = cv2.copyMakeBorder(old.generateImage((400, 480)), 60, 60, 60, 60, 0, value=255)
+    arguments = ("charuco", 5, 6, 0.03, 0.02, 0.0, "4X4_50")
+    assert Board(*arguments).find(photo) is None
+    assert len(Board(*arguments, legacy=True).find(photo)) == 20
+
+
+def test_a_large_chessboard_is_found_as_exactly_as_a_small_one():
+    squares = np.add.outer(np.arange(7), np.arange(9)) % 2 * 255
+    photo = np.kron(squares, np.ones((240, 240))).astype(np.uint8)
+    photo = cv2.copyMakeBorder(photo, 400, 400, 400, 400, 0, value=200)
+    found = Board("chessboard", 9, 7, 0.02).find(photo)
+    # Corners lie between pixels; their middle is the board's.
+    np.testing.assert_allclose(
+        found.pixels.mean(axis=0), [399.5 + 4.5 * 240, 399.5 + 3.5 * 240], atol=0.05
+    )
+    steps = np.linalg.norm(np.diff(found.pixels.reshape(6, 8, 2), axis=1), axis=2)
+    np.testing.assert_allclose(steps, 240.0, atol=0.2)
+
+
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [

@@ -47,6 +47,9 @@ def _add_camera(kinds: Any) -> None:
             f"--{name}", type=_quantity(_LENGTH), default=0.0, metavar="M", help=f"{what}: '40 mm'"
         )
     parser.add_argument("--dictionary", default="", help="of the markers: 6X6_250")
+    parser.add_argument(
+        "--legacy", action="store_true", help="the ChArUco board is as OpenCV before 4.6 drew it"
+    )
     parser.add_argument("--name", default="camera", help="the camera's name in the file")
     _add_out(parser, "camera.yaml", "camera info; a picture of the coverage beside it")
     parser.set_defaults(command=_camera)
@@ -180,6 +183,7 @@ def _camera(args: argparse.Namespace) -> int:
         args.marker,
         args.separation,
         args.dictionary,
+        args.legacy,
     )
     print(calibrate_photos(args.photos, board, _new(args.out), args.name))
     return 0

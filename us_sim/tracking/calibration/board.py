@@ -28,6 +28,7 @@ __all__ = ["BOARDS", "Board", "BoardView"]
 
 BOARDS = ("charuco", "grid", "chessboard")
 
+_SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
 _FEWEST_CORNERS = 6  # of a view: fewer do not determine the board's pose and an error
 
 
@@ -57,6 +58,7 @@ class Board:
     marker: float = 0.0  # m, of a grid and ChArUco
     separation: float = 0.0  # m, between the markers of a grid
     dictionary: str = ""  # of the markers, e.g. 6X6_250
+    legacy: bool = False  # white upper left square where the rows are even, as before OpenCV 4.6
 
     def __post_init__(self) -> None:
         if self.kind not in BOARDS:
@@ -108,11 +110,25 @@ class Board:
         self, image: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         size = (self.columns - 1, self.rows - 1)
+        # A large photo is searched at a smaller size, since that takes its pixels' time.
+        shrink = min(1.0, _SEARCHED / max(image.shape))
+        searched = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         found, pixels = cv2.findChessboardCornersSB(
-            image, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+            searched if shrink < 1.0 else image,
+            size,
+            flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY,
         )
         if not found:
             return np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
+        if shrink < 1.0:
+            window = 2 + round(2.0 / shrink)
+            pixels = cv2.cornerSubPix(
+                image,
+                ((_pixels(pixels) + 0.5) / shrink - 0.5).astype(np.float32),
+                (window, window),
+                (-1, -1),
+                (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3),
+            )
         rows, columns = np.indices(size[::-1])
         points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
         return np.float32(self.square) * points.astype(np.float32), _pixels(pixels)
@@ -140,7 +156,9 @@ class Board:
         size = (self.columns, self.rows)
         markers = dictionary(self.dictionary)
         if self.kind == "charuco":
-            return cv2.aruco.CharucoBoard(size, self.square, self.marker, markers)
+            board = cv2.aruco.CharucoBoard(size, self.square, self.marker, markers)
+            board.setLegacyPattern(self.legacy)
+            return board
         return cv2.aruco.GridBoard(size, self.marker, self.separation, markers)
 
     @cached_property

@@ -41,7 +41,8 @@ _GOOD_REACH = 0.7
 _LARGEST_DEVIATION = 0.05  # of the focal lengths
 _GOOD_DEVIATION = 0.01
 _LARGEST_RMS = 5.0  # pixels, above which the board is not the one that was described
-_GOOD_RMS = 1.0
+_GOOD_RMS = 1.0  # pixels; of images wider than this, more
+_USUAL_WIDTH = 1280
 _FAR_OFF = 3.0  # times the median residual of all views, for one that misleads
 _MOST_LEFT_OUT = 0.25  # of the views
 
@@ -62,7 +63,7 @@ class CameraCalibration:
     def note(self) -> str:
         """What the photos leave open, in a sentence; empty when nothing."""
         notes = []
-        if self.rms > _GOOD_RMS:
+        if self.rms > _GOOD_RMS * _scale(self.camera.width):
             notes.append(
                 f"an RMS of {self.rms:.1f} pixels is large: hold the camera and the board still, "
                 f"and the print flat"
@@ -110,11 +111,11 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
     used = np.ones(len(views), dtype=np.bool_)
     found = _solve(views, width, height)
     # A blurred photo or a wrong corner stands out; more than a few are the rule.
-    off = found.residuals > np.maximum(_FAR_OFF * np.median(found.residuals), _GOOD_RMS)
+    off = found.residuals > max(_FAR_OFF * float(np.median(found.residuals)), _GOOD_RMS)
     if off.any() and off.sum() <= min(_MOST_LEFT_OUT * len(views), len(views) - _FEWEST_VIEWS):
         used = ~off
         found = _solve([view for view, use in zip(views, used, strict=True) if use], width, height)
-    if found.rms > _LARGEST_RMS:
+    if found.rms > _LARGEST_RMS * _scale(width):
         raise CalibrationError(
             f"no camera fits the photos (RMS {found.rms:.1f} pixels): check the board's kind, size "
             f"and lengths"
@@ -185,6 +186,10 @@ def _check(matrix: NDArray[np.float64], deviations: NDArray[np.float64], tilt: f
         f"the photos leave the focal length open by {100 * relative:.0f} % (standard deviation): "
         f"take more, nearer, and tilted to all sides by 30° or more"
     )
+
+
+def _scale(width: int) -> float:
+    return max(1.0, width / _USUAL_WIDTH)
 
 
 def _reach(views: Sequence[BoardView], width: int, height: int) -> float:

@@ -44,7 +44,7 @@ def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -
     if not views:
         raise CalibrationError(
             f"none of the {len(photos)} photos shows the board: check --board, --size and "
-            f"--dictionary"
+            f"--dictionary, and try --legacy with an old ChArUco board"
         )
     found = calibrate_camera(views, *size)
     far_off = [name for name, used in zip(names, found.used, strict=True) if not used]
