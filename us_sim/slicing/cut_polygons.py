@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.slicing.barycentric import adjugate, is_solid
 from us_sim.slicing.clusters import ON_PLANE
 
 __all__ = [
@@ -33,8 +34,6 @@ __all__ = [
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
 
-# Share of its rest volume below which a tetrahedron is flat: it has no interior to show.
-_FLAT = 1e-6
 # Voxels a pixel beyond which a map is so steep that rounding may lead it out of the volume.
 _STEEP = 1e3
 # Pixels by which a cut may lie outside the image and still be looked at.
@@ -209,44 +208,21 @@ def _is_on_image(place, polygon, sides, columns, rows):
 @njit(inline="always", error_model="numpy")
 def _map_to_rest(place, corners, pixel_volume, rest_determinant, rest_index, form):
     """Fills the (3, 3) map of a tetrahedron; returns whether it is neither inverted nor flat."""
-    x0 = place[0, 0]
-    y0 = place[0, 1]
-    z0 = place[0, 2]
-    ax = place[1, 0] - x0
-    ay = place[1, 1] - y0
-    az = place[1, 2] - z0
-    bx = place[2, 0] - x0
-    by = place[2, 1] - y0
-    bz = place[2, 2] - z0
-    cx = place[3, 0] - x0
-    cy = place[3, 1] - y0
-    cz = place[3, 2] - z0
-    # Rows of the inverse of the matrix with columns a, b, c are b×c, c×a and a×b over a·(b×c).
-    ux = by * cz - bz * cy
-    uy = bz * cx - bx * cz
-    uz = bx * cy - by * cx
-    vx = cy * az - cz * ay
-    vy = cz * ax - cx * az
-    vz = cx * ay - cy * ax
-    wx = ay * bz - az * by
-    wy = az * bx - ax * bz
-    wz = ax * by - ay * bx
-    determinant = ax * ux + ay * uy + az * uz
-    size = determinant * pixel_volume * np.sign(rest_determinant)
-    if not size > _FLAT * abs(rest_determinant):
+    determinant, to_1, to_2, to_3 = adjugate(place, 0, 1, 2, 3)
+    if not is_solid(determinant, pixel_volume, rest_determinant):
         return False
     r = 1.0 / determinant
-    b0 = -r * (ux * x0 + uy * y0 + uz * z0)
-    c0 = -r * (vx * x0 + vy * y0 + vz * z0)
-    d0 = -r * (wx * x0 + wy * y0 + wz * z0)
+    b0 = r * to_1[0]
+    c0 = r * to_2[0]
+    d0 = r * to_3[0]
     for a in range(3):
         at = rest_index[np.uint32(corners[0]), a]
         to_b = rest_index[np.uint32(corners[1]), a] - at
         to_c = rest_index[np.uint32(corners[2]), a] - at
         to_d = rest_index[np.uint32(corners[3]), a] - at
         form[a, 0] = at + b0 * to_b + c0 * to_c + d0 * to_d
-        form[a, 1] = r * (ux * to_b + vx * to_c + wx * to_d)
-        form[a, 2] = r * (uy * to_b + vy * to_c + wy * to_d)
+        form[a, 1] = r * (to_1[1] * to_b + to_2[1] * to_c + to_3[1] * to_d)
+        form[a, 2] = r * (to_1[2] * to_b + to_2[2] * to_c + to_3[2] * to_d)
     return True
 
 

@@ -26,6 +26,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
+from us_sim.slicing.barycentric import adjugate, is_solid
 from us_sim.slicing.plane import SlicePlane
 
 __all__ = ["INSIDE", "RestMesh", "Section", "finite_nodes", "row_span"]
@@ -35,8 +36,6 @@ INSIDE = -1e-9
 
 # Pixels that a node may lie off the plane and still be taken as on it: rounding of its position.
 _ON_PLANE = 1e-9
-# Share of its rest volume below which a tetrahedron is flat: it has no interior to show.
-_FLAT = 1e-6
 
 
 class Section(NamedTuple):
@@ -186,8 +185,7 @@ def _cut(nodes, tetrahedra, rest_index, determinants, to_pixel, pixel_volume, co
         if box[1] < 0.0 or box[0] > columns - 1 or box[3] < 0.0 or box[2] > rows - 1:
             continue
         determinant = _invert(pixel, tetrahedra, e, barycentric[count])
-        size = determinant * pixel_volume * np.sign(determinants[e])
-        if not size > _FLAT * abs(determinants[e]):
+        if not is_solid(determinant, pixel_volume, determinants[e]):
             skipped += 1
             continue
         for a in range(3):
@@ -236,43 +234,14 @@ def _bounding_box(pixel, tetrahedra, e):
 @njit(inline="always", error_model="numpy")
 def _invert(pixel, tetrahedra, e, form):
     """Fills the (4, 3) barycentric map of a tetrahedron on the plane; returns its determinant."""
-    n0 = tetrahedra[e, 0]
-    n1 = tetrahedra[e, 1]
-    n2 = tetrahedra[e, 2]
-    n3 = tetrahedra[e, 3]
-    x0 = pixel[n0, 0]
-    y0 = pixel[n0, 1]
-    z0 = pixel[n0, 2]
-    ax = pixel[n1, 0] - x0
-    ay = pixel[n1, 1] - y0
-    az = pixel[n1, 2] - z0
-    bx = pixel[n2, 0] - x0
-    by = pixel[n2, 1] - y0
-    bz = pixel[n2, 2] - z0
-    cx = pixel[n3, 0] - x0
-    cy = pixel[n3, 1] - y0
-    cz = pixel[n3, 2] - z0
-    # Rows of the inverse of the matrix with columns a, b, c are b×c, c×a and a×b over a·(b×c).
-    ux = by * cz - bz * cy
-    uy = bz * cx - bx * cz
-    uz = bx * cy - by * cx
-    vx = cy * az - cz * ay
-    vy = cz * ax - cx * az
-    vz = cx * ay - cy * ax
-    wx = ay * bz - az * by
-    wy = az * bx - ax * bz
-    wz = ax * by - ay * bx
-    determinant = ax * ux + ay * uy + az * uz
+    determinant, to_1, to_2, to_3 = adjugate(
+        pixel, tetrahedra[e, 0], tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
+    )
     r = 1.0 / determinant
-    form[1, 1] = r * ux
-    form[1, 2] = r * uy
-    form[1, 0] = -r * (ux * x0 + uy * y0 + uz * z0)
-    form[2, 1] = r * vx
-    form[2, 2] = r * vy
-    form[2, 0] = -r * (vx * x0 + vy * y0 + vz * z0)
-    form[3, 1] = r * wx
-    form[3, 2] = r * wy
-    form[3, 0] = -r * (wx * x0 + wy * y0 + wz * z0)
+    for term in range(3):
+        form[1, term] = r * to_1[term]
+        form[2, term] = r * to_2[term]
+        form[3, term] = r * to_3[term]
     form[0, 0] = 1.0 - form[1, 0] - form[2, 0] - form[3, 0]
     form[0, 1] = -form[1, 1] - form[2, 1] - form[3, 1]
     form[0, 2] = -form[1, 2] - form[2, 2] - form[3, 2]
