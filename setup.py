@@ -6,6 +6,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NODES = [
+    "camera_driver",
     "haptic_renderer",
     "openigtlink_bridge",
     "path_player",
@@ -14,6 +15,7 @@ NODES = [
     "session_recorder",
     "skin_deformer",
     "slice_interpolator",
+    "space_mouse_driver",
     "tissue_deformer",
 ]
 FOLDER = Path(__file__).resolve().parent
@@ -73,6 +75,7 @@ setup(
     extras_require={
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
+        "space_mouse": ["hidapi>=0.14"],
         "test": [
             "hypothesis>=6.100",
             "meshio>=5.3",

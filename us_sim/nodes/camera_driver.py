@@ -1,0 +1,227 @@
+"""A camera without ROS's own drivers: OpenCV's images with the calibration that belongs to them."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.task import Future
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image
+
+from us_sim.errors import TrackingError
+from us_sim.nodes.conversions import bgr_image_message, image_message
+from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import STREAM, overridable
+from us_sim.tracking.camera_info import read_camera_info
+from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.video_source import VideoSource
+
+__all__ = ["CameraDriver", "main"]
+
+RETRY_S = 1.0
+"""How long a camera that is not there is left alone."""
+CHECK_S, CHECKS = 0.05, 6
+"""How often, and how often in a row, somebody must listen before a file begins.
+
+A best-effort subscriber may find this publisher a little later than it is found itself.
+"""
+
+
+class CameraDriver(Node):
+    """``camera/image_raw`` and, with the same stamp, ``camera/camera_info`` of each image.
+
+    Parameters: ``source`` (a camera's number, a stream's address or a video file),
+    ``camera_info`` (the YAML file of `us-sim calibrate camera`; its size is asked of the camera),
+    ``frame_id``, ``encoding`` (mono8 or bgr8), ``rate`` (images a second: asked of a camera, that
+    of a file), ``loop`` (a file starts again at its end, else the node ends), ``latency`` (s from
+    the middle of the exposure to the image's arrival; the stamp is so much earlier).
+
+    A file begins when somebody subscribes.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("camera_driver", **kwargs)
+        source = fixed_parameter(self, "source", "0", "camera's number, stream or video file")
+        info = fixed_parameter(self, "camera_info", "", "YAML file of the camera's calibration")
+        self._frame = fixed_parameter(self, "frame_id", "camera_optical", "frame of the images")
+        encoding = fixed_parameter(self, "encoding", "mono8", "mono8 or bgr8")
+        rate = fixed_parameter(self, "rate", 0.0, "images a second; 0: as it is", within=(0.0, 1e3))
+        self._loop = fixed_parameter(self, "loop", False, "start a file again at its end")
+        latency = fixed_parameter(
+            self, "latency", 0.0, "s from exposure to arrival", within=(-1.0, 10.0)
+        )
+        if encoding not in ("mono8", "bgr8"):
+            raise TrackingError(f"encoding is '{encoding}'; it must be mono8 or bgr8")
+        self._grey = encoding == "mono8"
+        self._latency = round(1e9 * latency)
+        self._camera = read_camera_info(Path(info).expanduser()) if info else None
+        size = (self._camera.width, self._camera.height) if self._camera else None
+        self._video = VideoSource(source, size=size, rate=rate)
+        self.finished = Future()
+        self.health = Health(self, source)
+        self._images = self._publisher(Image, "camera/image_raw")
+        self._infos = self._publisher(CameraInfo, "camera/camera_info")
+        if self._camera is None:
+            self.get_logger().warning(
+                "images without a calibration: no pose can be measured in them; make one with "
+                "us-sim calibrate camera and name it with the parameter camera_info"
+            )
+        self._lock = threading.Lock()
+        self._newest: tuple[int, NDArray[np.uint8]] | None = None
+        self._problem = ""
+        self._state = "opening"
+        self._ended = False
+        self._closing = threading.Event()
+        self._guard = self.create_guard_condition(self._work)
+        if self._video.is_file and not self._video.open():
+            raise TrackingError(f"{source}: is no video that OpenCV can read; convert it to MP4")
+        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Let go of the camera."""
+        self._closing.set()
+        self._thread.join()
+        self._video.close()
+        super().destroy_node()
+
+    def _publisher(self, message_type: Any, topic: str) -> Any:
+        return self.create_publisher(
+            message_type, topic, STREAM, qos_overriding_options=overridable()
+        )
+
+    # In the camera's thread.
+
+    def _run(self) -> None:
+        if self._video.is_file:
+            self._play()
+        else:
+            self._follow()
+
+    def _follow(self) -> None:
+        """A camera or stream, each time that it is there."""
+        while not self._closing.is_set():
+            if self._video.open():
+                while not self._closing.is_set():
+                    age = self._video.grab()
+                    if age is None or not self._keep(age):
+                        break
+            self._video.close()
+            if not self._closing.is_set():
+                self._tell(
+                    "no camera",
+                    f"camera {self._video.name} gives no images: plug it in, or set the parameter "
+                    f"source; it is tried again",
+                )
+                self._closing.wait(RETRY_S)
+
+    def _play(self) -> None:
+        """A file, as fast as it was recorded."""
+        self._tell("waiting for a subscriber")
+        checks = 0
+        while checks < CHECKS:
+            if self._closing.wait(CHECK_S):
+                return
+            checks = checks + 1 if self._images.get_subscription_count() else 0
+        begun, number = self.get_clock().now().nanoseconds, 0
+        shown = True
+        while not self._closing.is_set():
+            due = begun + round(1e9 * number * self._video.interval)
+            now = self.get_clock().now().nanoseconds
+            if self._closing.wait(max(due - now, 0) * 1e-9):
+                return
+            if self._video.grab() is None or not (shown := self._keep(0.0)):
+                # A file that holds nothing at all would be begun again without end.
+                if not (self._loop and number and shown and self._video.open()):
+                    break
+                begun, number = due, 0
+                continue
+            number += 1
+        self._ended = True
+        self._guard.trigger()
+
+    def _keep(self, age: float) -> bool:
+        """Decode what was grabbed just now, for the node's thread to publish."""
+        stamp = self.get_clock().now().nanoseconds - round(1e9 * age) - self._latency
+        pixels = self._video.pixels(grey=self._grey)
+        if pixels is None:
+            return False
+        with self._lock:
+            self.health.received += 1
+            self.health.dropped += self._newest is not None
+            self._newest = stamp, pixels
+            self._state = "publishing"
+        self._guard.trigger()
+        return True
+
+    def _tell(self, state: str, problem: str = "") -> None:
+        with self._lock:
+            self._state, self._problem = state, problem
+        self._guard.trigger()
+
+    # In the node's thread.
+
+    def _work(self) -> None:
+        with self._lock:
+            newest, self._newest = self._newest, None
+            problem, self._problem = self._problem, ""
+            self.health.state = self._state
+        if problem:
+            self.health.problem("camera", problem)
+        if newest is not None:
+            self._publish(*newest)
+        if self._ended and not self.finished.done():
+            self.health.state = "finished"
+            self.get_logger().info("the video is at its end")
+            self.finished.set_result(None)
+
+    def _publish(self, nanoseconds: int, pixels: NDArray[np.uint8]) -> None:
+        stamp = Time(nanoseconds=max(nanoseconds, 0)).to_msg()
+        rows, columns = pixels.shape[:2]
+        camera = self._camera
+        if camera is not None and (columns, rows) != (camera.width, camera.height):
+            self.health.problem(
+                "size",
+                f"the images are {columns} × {rows} pixels, but the camera was calibrated at "
+                f"{camera.width} × {camera.height}: calibrate it at the size it is used at",
+            )
+        make = image_message if self._grey else bgr_image_message
+        self._infos.publish(_info(camera, (columns, rows), stamp, self._frame))
+        self._images.publish(make(pixels, stamp, self._frame))
+        self.health.published("camera/image_raw", stamp)
+
+
+def _info(
+    camera: CameraModel | None, size: tuple[int, int], stamp: TimeMessage, frame: str
+) -> CameraInfo:
+    """The camera as ROS describes it: all zeros but the size where it is not calibrated."""
+    message = CameraInfo()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.width, message.height = size
+    if camera is not None:
+        message.width, message.height = camera.width, camera.height
+        message.distortion_model = camera.distortion_model
+        message.d = camera.distortion.tolist()
+        message.k = camera.matrix.ravel().tolist()
+        message.r = np.eye(3).ravel().tolist()
+        message.p = np.hstack([camera.matrix, np.zeros((3, 1))]).ravel().tolist()
+    return message
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is interrupted, or the video ends."""
+    return run_node(CameraDriver, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

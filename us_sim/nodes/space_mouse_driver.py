@@ -1,0 +1,108 @@
+"""A SpaceMouse without ROS's own driver, on the topic and with the axes of `spacenav_node`."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.time import Time
+from sensor_msgs.msg import Joy
+
+from us_sim.errors import TrackingError
+from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import STREAM, overridable
+from us_sim.tracking.space_mouse import SpaceMouse
+
+__all__ = ["SpaceMouseDriver", "main"]
+
+RETRY_S = 1.0
+"""How long a device that is not there is left alone."""
+
+
+class SpaceMouseDriver(Node):
+    """``spacenav/joy``: six axes in ±1 and the buttons, at each change and while nothing changes.
+
+    Parameters: ``frame_id``, ``rate`` (messages a second while nothing changes: the device itself
+    is silent then, and so it is when it is unplugged).
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("space_mouse_driver", **kwargs)
+        self._frame = fixed_parameter(self, "frame_id", "spacenav", "frame of the messages")
+        rate = fixed_parameter(
+            self, "rate", 100.0, "messages a second at rest", within=(1.0, 1000.0)
+        )
+        self._patience = 1.0 / rate
+        self.health = Health(self, "SpaceMouse")
+        self.health.state = "opening"
+        self._joys = self.create_publisher(
+            Joy, "spacenav/joy", STREAM, qos_overriding_options=overridable()
+        )
+        self._lock = threading.Lock()
+        self._newest: tuple[int, list[float], list[int]] | None = None
+        self._problem, self._name = "", ""
+        self._closing = threading.Event()
+        self._guard = self.create_guard_condition(self._work)
+        self._thread = threading.Thread(target=self._run, name="space mouse", daemon=True)
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Let go of the device."""
+        self._closing.set()
+        self._thread.join()
+        super().destroy_node()
+
+    def _run(self) -> None:
+        """In the device's thread: read it, each time that it is there."""
+        while not self._closing.is_set():
+            try:
+                mouse = SpaceMouse()
+                try:
+                    self._follow(mouse)
+                finally:
+                    mouse.close()
+            except TrackingError as error:
+                with self._lock:
+                    self._problem = f"{error}; it is tried again"
+                self._guard.trigger()
+                self._closing.wait(RETRY_S)
+
+    def _follow(self, mouse: SpaceMouse) -> None:
+        """Until it is gone; raises TrackingError then."""
+        while not self._closing.is_set():
+            mouse.wait(self._patience)
+            now = self.get_clock().now().nanoseconds
+            with self._lock:
+                self._name = mouse.name
+                self._newest = now, mouse.axes, mouse.buttons
+            self._guard.trigger()
+
+    def _work(self) -> None:
+        """In the node's thread: pass on the newest."""
+        with self._lock:
+            newest, self._newest = self._newest, None
+            problem, self._problem = self._problem, ""
+        if newest is not None:
+            stamp, axes, buttons = newest
+            message = Joy(axes=axes, buttons=buttons)
+            message.header.stamp = Time(nanoseconds=stamp).to_msg()
+            message.header.frame_id = self._frame
+            self._joys.publish(message)
+            self.health.published("spacenav/joy", message.header.stamp)
+            self.health.state = self._name
+        if problem:
+            self.health.state = "no device"
+            self.health.problem("device", problem)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is interrupted."""
+    return run_node(SpaceMouseDriver, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
