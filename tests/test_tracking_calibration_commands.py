@@ -96,6 +96,12 @@ def test_landmarks_are_matched_by_name(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "FRE 0.00 mm over 4 landmarks" in said
     assert "in one file only: elbow" in said
+    inverse = tmp_path / "calibration.yaml"
+    options = ("--invert", "--to", "probe", "--out", inverse)
+    assert calibrate("landmarks", known, tmp_path / "m.csv", *options) == 0
+    found = read_transform_file(inverse)
+    np.testing.assert_allclose(found.pose.matrix, pose.inverse().matrix, atol=1e-9)
+    assert (found.from_frame, found.to_frame) == ("probe", "tracker")
 
 
 def test_landmarks_are_touched_in_a_recording(tmp_path):

@@ -64,7 +64,9 @@ def _add_pivot(kinds: Any) -> None:
 
 
 def _add_landmarks(kinds: Any) -> None:
-    parser = kinds.add_parser("landmarks", help="where the tracker is, from points touched")
+    parser = kinds.add_parser(
+        "landmarks", help="where the tracker or the probe is, from points touched"
+    )
     parser.add_argument(
         "known", type=Path, help="landmarks in the patient's frame: CSV name,x,y,z or Plus' XML"
     )
@@ -75,6 +77,12 @@ def _add_landmarks(kinds: Any) -> None:
     )
     parser.add_argument("--tip", type=Path, metavar="FILE", help="the stylus' tip, of a recording")
     parser.add_argument("--to", default="patient", help="frame of the known ones (%(default)s)")
+    parser.add_argument(
+        "--invert",
+        action="store_true",
+        help="the known frame in the measured one: a calibration, from points of the probe's face "
+        "(--to probe) measured in its marker's frame",
+    )
     _add_pose(parser)
     _add_out(parser, "registration.yaml", "the registration")
     parser.set_defaults(command=_landmarks)
@@ -201,7 +209,13 @@ def _landmarks(args: argparse.Namespace) -> int:
 
     print(
         calibrate_registration(
-            args.known, args.measured, args.tip, args.pose, args.to, _new(args.out)
+            args.known,
+            args.measured,
+            args.tip,
+            args.pose,
+            args.to,
+            _new(args.out),
+            invert=args.invert,
         )
     )
     return 0

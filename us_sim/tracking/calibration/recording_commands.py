@@ -59,9 +59,19 @@ def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
 
 
 def calibrate_registration(
-    known_file: Path, measured_file: Path, tip: Path | None, name: str | None, to: str, out: Path
+    known_file: Path,
+    measured_file: Path,
+    tip: Path | None,
+    name: str | None,
+    to: str,
+    out: Path,
+    *,
+    invert: bool = False,
 ) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
+
+    Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
+    in the same way when inverted.
 
     Args:
         known_file: CSV or Plus' XML.
@@ -71,6 +81,7 @@ def calibrate_registration(
         name: of the stylus' poses in it.
         to: name of the known landmarks' frame.
         out: file to write.
+        invert: write the pose of the known landmarks' frame in the measured ones'.
 
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
@@ -87,11 +98,11 @@ def calibrate_registration(
     else:
         measured, frame = _touched(list(known), measured_file, tip, name)
         names = list(known)
-    found = register_landmarks(
-        np.array([measured[landmark] for landmark in names]),
-        np.array([known[landmark] for landmark in names]),
-        names,
-    )
+    theirs = np.array([measured[landmark] for landmark in names])
+    ours = np.array([known[landmark] for landmark in names])
+    found = register_landmarks(theirs, ours, names)
+    if invert:
+        found, frame, to = register_landmarks(ours, theirs, names), to, frame
     left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
     write_transform(
         out,
