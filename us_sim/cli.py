@@ -101,17 +101,19 @@ def _parser() -> argparse.ArgumentParser:
     add_print_marker(commands)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
-    subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice")
+    subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice|tracking")
     for subject, text, command in (
         ("tissue", "error of every tissue solver against its run time", _evaluate_tissue),
         ("stability", "what every tissue solver does with extreme cases", _evaluate_stability),
         ("slice", "error of every slicing method against its run time", _evaluate_slice),
+        ("tracking", "error of tracked poses against their run time", _evaluate_tracking),
     ):
         measured = subjects.add_parser(subject, help=text)
+        minutes = "two" if subject in ("slice", "tracking") else "three"
         measured.add_argument(
             "--quick",
             action="store_true",
-            help=f"a part of it, in less than {'two' if subject == 'slice' else 'three'} minutes",
+            help=f"a part of it, in less than {minutes} minutes",
         )
         measured.add_argument(
             "--out",
@@ -225,6 +227,12 @@ def _evaluate_slice(args: argparse.Namespace) -> int:
     from us_sim.evaluation.slice import evaluate_slice
 
     return evaluate_slice(args.out, args.quick, args.volume, args.sweep)
+
+
+def _evaluate_tracking(args: argparse.Namespace) -> int:
+    from us_sim.evaluation.tracking import evaluate_tracking
+
+    return evaluate_tracking(args.out, args.quick)
 
 
 def _parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -102,15 +102,17 @@ class RenderedView:
         conditions: Conditions | None = None,
         seed: int = 0,
         motion: NDArray[np.float64] | None = None,
+        frame: int = 0,
     ) -> NDArray[np.uint8]:
         """The image (rows, columns), grey.
 
         Args:
             pose: of the body in ``camera_optical``, in the middle of the exposure.
             conditions: what makes the image worse.
-            seed: of the noise, the hand and the light's direction.
+            seed: of the hand and the light's direction, and with the frame of the noise.
             motion: (6,) m and rad, shift and rotation about the camera's axes from the beginning
                 to the end of the exposure.
+            frame: of a sequence in which the hand and the light stay as they are.
         """
         conditions = conditions or Conditions()
         random = np.random.default_rng(seed)
@@ -128,7 +130,7 @@ class RenderedView:
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), conditions.defocus))
         if conditions.gradient > 0:
             light *= self._gradient(conditions.gradient, random)
-        noise = random.standard_normal(light.shape, dtype=np.float32)
+        noise = np.random.default_rng([seed, frame]).standard_normal(light.shape, np.float32)
         image8 = np.empty(light.shape, dtype=np.uint8)
         _expose(light, noise, conditions.read_noise**2, conditions.shot_noise, image8)
         return image8
