@@ -10,12 +10,12 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rendered_markers import render
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import SceneError
+from us_sim.evaluation.rendered_views import SHARP, RenderedView
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.pose import Pose
 from us_sim.tracking.camera_model import CameraModel
@@ -174,7 +174,7 @@ def image(pixels, encoding, second):
 
 @pytest.fixture(scope="module")
 def view():
-    return render(CAMERA, RigidBody.single("6X6_250", 3, 0.04), SEEN)
+    return RenderedView(CAMERA, RigidBody.single("6X6_250", 3, 0.04)).render(SEEN, SHARP)
 
 
 SECTION = "{source: camera, camera: {dictionary: 6X6_250, marker: 3, size: 40 mm}}"
