@@ -119,7 +119,7 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
     monkeypatch.setattr("us_sim.tracking.video_source.cv2.VideoCapture", PaperCamera)
     monkeypatch.setattr("us_sim.nodes.camera_driver.RETRY_S", 0.02)
     PaperCamera.left = 0
-    node = bench.make(CameraDriver, source="7", camera_info=str(calibration))
+    node = bench.make(CameraDriver, source=7, camera_info=str(calibration))
     images = bench.collect(Image, "camera/image_raw")
     reports = bench.collect(DiagnosticArray, "diagnostics")
     bench.spin_until(lambda: node.health.problems("camera") > 1)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
@@ -50,7 +51,7 @@ class CameraDriver(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("camera_driver", **kwargs)
-        source = fixed_parameter(self, "source", "0", "camera's number, stream or video file")
+        source = self._source()
         info = fixed_parameter(self, "camera_info", "", "YAML file of the camera's calibration")
         self._frame = fixed_parameter(self, "frame_id", "camera_optical", "frame of the images")
         encoding = fixed_parameter(self, "encoding", "mono8", "mono8 or bgr8")
@@ -94,6 +95,13 @@ class CameraDriver(Node):
         self._video.close()
         super().destroy_node()
 
+    def _source(self) -> str:
+        """A camera's number may be written as one."""
+        descriptor = ParameterDescriptor(
+            description="camera's number, stream or video file", read_only=True, dynamic_typing=True
+        )
+        return str(self.declare_parameter("source", "0", descriptor).value)
+
     def _publisher(self, message_type: Any, topic: str) -> Any:
         return self.create_publisher(
             message_type, topic, STREAM, qos_overriding_options=overridable()
@@ -119,8 +127,8 @@ class CameraDriver(Node):
             if not self._closing.is_set():
                 self._tell(
                     "no camera",
-                    f"camera {self._video.name} gives no images: plug it in, or set the parameter "
-                    f"source; it is tried again",
+                    f"camera {self._video.name} gives no images: see that it is there and that "
+                    f"nothing else uses it, or set the parameter source; it is tried again",
                 )
                 self._closing.wait(RETRY_S)
 

@@ -62,6 +62,7 @@ class VideoSource:
     def open(self) -> bool:
         """Begin, or begin again, with the first image; whether there is something to begin with."""
         self.close()
+        _hush()
         if self.name.isdigit():
             capture = cv2.VideoCapture(int(self.name))
         elif "://" in self.name:
@@ -122,3 +123,9 @@ class VideoSource:
         elif not grey and image.ndim == 2:
             image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
         return np.asarray(image, dtype=np.uint8)
+
+
+def _hush() -> None:
+    """What OpenCV and FFmpeg print when nothing is there, the caller says in a sentence."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
