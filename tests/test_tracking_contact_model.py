@@ -99,6 +99,8 @@ def test_without_contact_nothing_is_felt_anywhere():
         (np.zeros(6), np.zeros((3, 3)), "a 6 by 6 stiffness"),
         (np.full(6, np.nan), np.zeros((6, 6)), "not finite"),
         (np.zeros(6), np.full((6, 6), np.inf), "not finite"),
+        (np.full(6, 1e9), np.zeros((6, 6)), "a wrench of 1e\\+09 N"),
+        (np.zeros(6), 1e12 * np.eye(6), "a stiffness of 1e\\+12 N/m: no tissue is so"),
         (np.zeros(6), np.triu(np.ones((6, 6))), "not symmetric"),
     ],
 )

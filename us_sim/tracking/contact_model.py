@@ -27,6 +27,9 @@ from us_sim.tracking import se3
 
 __all__ = ["ContactModel", "SecantStiffness"]
 
+_HEAVIEST, _STIFFEST = 1e5, 1e9
+"""N and N/m beyond which a model is not believed."""
+
 _FADING = 0.5
 """Part of the push at the model's pose below which all but the push along it fades."""
 
@@ -51,7 +54,8 @@ class ContactModel:
     no work is done.
 
     Raises:
-        TrackingError: a number is not finite, a shape is wrong, or the stiffness is not symmetric.
+        TrackingError: a number is not finite or absurd, a shape is wrong, or the stiffness is not
+            symmetric.
     """
 
     stamp: int  # ns, of the pose
@@ -69,6 +73,11 @@ class ContactModel:
             )
         if not (np.isfinite(wrench).all() and np.isfinite(stiffness).all()):
             raise TrackingError("the model of the contact is not finite")
+        if np.abs(wrench).max() > _HEAVIEST or np.abs(stiffness).max() > _STIFFEST:
+            raise TrackingError(
+                f"the model of the contact has a wrench of {np.abs(wrench).max():.3g} N or a "
+                f"stiffness of {np.abs(stiffness).max():.3g} N/m: no tissue is so"
+            )
         if not np.allclose(stiffness, stiffness.T, rtol=1e-6, atol=1e-9):
             raise TrackingError("the stiffness of the contact is not symmetric")
         object.__setattr__(self, "wrench", wrench)

@@ -93,8 +93,8 @@ class HapticRendering:
         self._time_offset = round(1e9 * time_offset)
         self._metric = np.array([1.0, 1.0, 1.0, _LEVER, _LEVER, _LEVER])
         self._arrived: deque[tuple[int, Pose, int]] = deque(maxlen=_REMEMBERED)
-        self._arrived_model: tuple[ContactModel, int] | None = None
-        self._distrusted = ""
+        self._arrived_model: deque[tuple[ContactModel, int]] = deque(maxlen=1)
+        self._distrusted: deque[str] = deque(maxlen=1)
         self._is_clutched = False
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
@@ -127,7 +127,7 @@ class HapticRendering:
 
     def model(self, model: ContactModel, now: int) -> None:
         """Take a model of the contact; time of arrival in ns."""
-        self._arrived_model = (model, now)
+        self._arrived_model.append((model, now))
 
     def clutch(self, held: bool) -> None:
         """While the clutch is held nothing is felt."""
@@ -135,7 +135,7 @@ class HapticRendering:
 
     def distrust(self, why: str) -> None:
         """What came in cannot be used."""
-        self._distrusted = why
+        self._distrusted.append(why)
 
     def render(self, now: int) -> NDArray[np.float64]:
         """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
@@ -174,7 +174,7 @@ class HapticRendering:
 
     def _take_poses(self, now: int) -> str:
         """Take what arrived; a doubt about the handle, if any."""
-        doubt, self._distrusted = self._distrusted, ""
+        doubt = self._distrusted.popleft() if self._distrusted else ""
         self._way = np.zeros(6)
         while self._arrived:
             stamp, pose, time = self._arrived.popleft()
@@ -187,12 +187,13 @@ class HapticRendering:
                 continue  # repeated or late: the handle is where the newest says
             if self._poses:
                 way = _way(self._poses[-1], pose)
-                self._way = self._way + way
                 far, turn = _lengths(way)
                 if far > self._settings.jump:
                     doubt = f"the handle has jumped by {1e3 * far:.1f} mm"
                 elif turn > self._settings.rotation_jump:
                     doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
+                else:
+                    self._way = self._way + way
             self._stamps.append(stamp)
             self._poses.append(pose)
             self._pose_time = time
@@ -208,9 +209,8 @@ class HapticRendering:
 
     def _take_model(self, now: int) -> str:
         """Take the newest model, if it belongs to a pose; a doubt about what there is, if any."""
-        arrived, self._arrived_model = self._arrived_model, None
-        if arrived is not None:
-            self._adopt(*arrived)
+        if self._arrived_model:
+            self._adopt(*self._arrived_model.popleft())
         if self._model is None:
             return "no model of the contact yet"
         if now - self._model_time > 1e9 * self._settings.model_timeout:
@@ -275,7 +275,7 @@ class HapticRendering:
     def _left(self, now: int) -> NDArray[np.float64]:
         """(6,), what is still felt of the models before."""
         share = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
-        return self._left_over * max(share, 0.0)
+        return self._left_over * min(max(share, 0.0), 1.0)
 
     def _unilateral(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
         """The wrench, less a force that would pull the handle against the tissue's push."""
