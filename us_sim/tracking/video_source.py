@@ -25,6 +25,7 @@ __all__ = ["VideoSource"]
 
 _PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
 _USUAL_RATE = 30.0  # Hz, of a file that does not say
+_ERRORS_ONLY = 2  # of OpenCV's levels
 _OLDEST_S = 1.0  # a camera's own time stamp is believed up to this age
 
 
@@ -127,5 +128,7 @@ class VideoSource:
 
 def _hush() -> None:
     """What OpenCV and FFmpeg print when nothing is there, the caller says in a sentence."""
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    # OpenCV 5 has moved it.
+    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    set_level(_ERRORS_ONLY)
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
