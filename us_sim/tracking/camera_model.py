@@ -54,17 +54,17 @@ class CameraModel:
         if matrix.size != 9:
             raise TrackingError(f"the camera matrix has {matrix.size} numbers; it needs 3 × 3")
         matrix = matrix.reshape(3, 3)
+        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
+            raise TrackingError(
+                "the camera is not calibrated: its focal length is zero; calibrate it with "
+                "us-sim calibrate camera"
+            )
         for name, size in (("width", self.width), ("height", self.height)):
             if size != int(size) or not 0 < size <= _LARGEST_IMAGE:
                 raise TrackingError(
                     f"the camera's image {name} is {size}: it must be 1 to {_LARGEST_IMAGE} pixels"
                 )
             object.__setattr__(self, name, int(size))
-        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
-            raise TrackingError(
-                "the camera is not calibrated: its focal length is zero; calibrate it with "
-                "us-sim calibrate camera"
-            )
         if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0.0, 0.0, 0.0, 1.0]):
             raise TrackingError(
                 f"the camera matrix {matrix.tolist()} must be [[fx, skew, cx], [0, fy, cy], "
@@ -139,7 +139,7 @@ class CameraModel:
                 f"the image has {image.shape[1]} × {image.shape[0]} pixels, but the camera info "
                 f"is of {self.width} × {self.height}: calibrate the camera at the size it runs at"
             )
-        return image
+        return np.ascontiguousarray(image)
 
 
 def _numbers(values: Any, what: str) -> NDArray[np.float64]:

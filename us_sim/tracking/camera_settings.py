@@ -29,7 +29,7 @@ DICTIONARIES = (
 )
 """The marker dictionaries, by OpenCV's names without ``DICT_``."""
 
-MARKER_SIZE = Quantity("length", 1e-3, 1.0)
+MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ class CameraSource:
     ) -> BodyPose | None:
         points, pixels, owners = detection.correspondences(self.body)
         if not len(points):
-            self.last_problem = self.last_problem or self._nothing(image)
+            self.last_problem = self.last_problem or self._nothing(image, detection)
             return None
         least = self.settings.minimum_markers
         refusal = ""
@@ -196,7 +196,7 @@ class CameraSource:
         if steep.any():
             worst = int(np.argmax(angles))
             return markers[steep], (
-                f"marker {self.body.ids[markers[worst]]} is seen at "
+                f"{self._name(markers[worst])} is seen at "
                 f"{math.degrees(angles[worst]):.0f}° from its normal, beyond the "
                 f"{math.degrees(limit):.0f}° of camera.view_angle_limit: it is not used"
             )
@@ -207,7 +207,7 @@ class CameraSource:
         worst = int(np.argmax(errors))
         if len(markers) > 2:
             return markers[[worst]], (
-                f"marker {self.body.ids[markers[worst]]} is {errors[worst]:.1f} pixels from where "
+                f"{self._name(markers[worst])} is {errors[worst]:.1f} pixels from where "
                 f"the others say: it is not used; check its place in the body's file"
             )
         return markers, (
@@ -215,6 +215,9 @@ class CameraSource:
             f"{self.settings.reprojection_limit:g} of camera.reprojection_limit: check the "
             f"marker's size, the body's file and the camera info"
         )
+
+    def _name(self, row: int) -> str:
+        return "the board" if self.body.chessboard is not None else f"marker {self.body.ids[row]}"
 
     def _view_angles(self, pose: Pose, markers: NDArray[np.int64]) -> NDArray[np.float64]:
         """rad, of each marker's normal to the line from it to the camera."""
@@ -251,7 +254,12 @@ class CameraSource:
         before = self._last[1].pose
         return rotation_angle(pose.pose, before) > rotation_angle(other.pose, before)
 
-    def _nothing(self, image: NDArray[np.uint8]) -> str:
+    def _nothing(self, image: NDArray[np.uint8], detection: Detection) -> str:
+        if detection.unclear:
+            return (
+                f"of marker {detection.unclear[0]} an edge is covered, cut off or blurred: it is "
+                f"not used"
+            )
         start = f"no marker of {self.body.dictionary} is in the image"
         if int(image.max()) <= _BLACK:
             return f"{start}, which is black: uncover the lens or add light"

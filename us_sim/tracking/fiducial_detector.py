@@ -37,6 +37,7 @@ class Detection:
     chessboard_ids: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     chessboard_corners: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
     doubled: tuple[int, ...] = ()  # markers of which the image has more than one: not used
+    unclear: tuple[int, ...] = ()  # markers of which an edge is covered, cut or blurred: not used
 
     def correspondences(
         self, body: RigidBody
@@ -112,8 +113,11 @@ class FiducialDetector:
         refused = tuple(doubled.tolist())
         if self._chessboard_detector is not None:
             return self._with_chessboard(image, numbers, places, refused)
-        refined = np.array([_refine(image, each, self._cells) for each in places])
-        return Detection(numbers, refined.reshape(-1, 4, 2), doubled=refused)
+        refined = [_refine(image, each, self._cells) for each in places]
+        sure = [i for i, each in enumerate(refined) if each is not None]
+        kept = np.array([refined[i] for i in sure], dtype=np.float64).reshape(-1, 4, 2)
+        unclear = tuple(np.delete(numbers, sure).tolist())
+        return Detection(numbers[sure], kept, doubled=refused, unclear=unclear)
 
     def _with_chessboard(
         self,
@@ -142,12 +146,10 @@ class FiducialDetector:
 
 def _refine(
     image: NDArray[np.uint8], corners: NDArray[np.float32], cells: int
-) -> NDArray[np.float64]:
-    """Corners (4, 2) of one marker where its edges really meet."""
+) -> NDArray[np.float64] | None:
+    """Corners (4, 2) of one marker where its edges really meet; None where those are not seen."""
     edge = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
     half = int(np.clip(edge / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    moved = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
-    near: NDArray[np.float64] = np.array(moved, dtype=np.float64)
-    refined = refined_corners(image, near, cells)
-    return near if refined is None else refined
+    near = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
+    return refined_corners(image, np.array(near, dtype=np.float64), cells)

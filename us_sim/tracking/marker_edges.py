@@ -19,6 +19,7 @@ array([[24. , 19.5],
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numba import njit
@@ -29,6 +30,7 @@ from us_sim.tracking.definite_system import solve_definite
 __all__ = ["refined_corners"]
 
 _WIDEST = 4.0  # pixels on either side of an edge that are looked at
+_NARROWEST = 1.2  # pixels
 _LONGEST = 150  # pixels along an edge, evenly spread, that are looked at
 _ROUNDS = 3
 _STEPS = 6
@@ -36,6 +38,7 @@ _LOGISTIC = 1.702  # so steep is the logistic function that is nearest to the no
 _STEADY = 3e-3  # pixels, a step after which no other is worth its time
 _SETTLED = 0.1  # pixels, of a round: the next would look at the same pixels
 _LEAST_CONTRAST = 5.0  # grey
+_LIKENESS = 0.2  # of the contrast: what may be left over, root mean square, of an edge
 
 
 def refined_corners(
@@ -57,7 +60,34 @@ def refined_corners(
     """
     refined = np.empty((4, 2))
     start = np.ascontiguousarray(corners, dtype=np.float64)
-    return refined if _refine(np.ascontiguousarray(image), start, cells, refined) else None
+    image = np.ascontiguousarray(image)
+    if _refine(image, start, cells, refined):
+        return refined
+    for mended in _mended(start):
+        if _refine(image, mended, cells, refined):
+            return refined
+    return None
+
+
+def _mended(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    """The quadrilateral with one corner put where it may be.
+
+    A polygon that is fitted to the outline of a slanted square may cut off a sharp tip, or follow
+    the shadow beyond it. So each corner in turn is put where it makes a parallelogram, or, lest
+    perspective mislead, beside that on the line to a neighbour.
+    """
+    for k in range(4):
+        before, after = corners[k - 1], corners[(k + 1) % 4]
+        wanted = before + after - corners[(k + 2) % 4]
+        for neighbour in (before, after):
+            line = corners[k] - neighbour
+            share = float((wanted - neighbour) @ line / (line @ line))
+            mended = corners.copy()
+            mended[k] = neighbour + share * line
+            yield mended
+        mended = corners.copy()
+        mended[k] = wanted
+        yield mended
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -67,8 +97,10 @@ def _refine(image, corners, cells, refined):
     edges = np.empty((4, 3))
     widths = np.full(4, 1.0)
     for _ in range(_ROUNDS):
+        across, down = refined[2] - refined[0], refined[3] - refined[1]
+        border = 0.5 * (across[0] * down[1] - across[1] * down[0]) / cells
         for k in range(4):
-            if not _fit_edge(image, refined[k], refined[(k + 1) % 4], cells, edges[k], widths, k):
+            if not _fit_edge(image, refined[k], refined[(k + 1) % 4], border, edges[k], widths, k):
                 return False
         moved = 0.0
         ends = refined.copy()
@@ -118,7 +150,7 @@ def _tangent(start, end, edge, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fit_edge(image, start, end, cells, edge, widths, k):
+def _fit_edge(image, start, end, border, edge, widths, k):
     """Offset, slope and bow (3,) pixels of an edge from the line of its ends, outwards; whether
     it was found. ``widths[k]`` is the blur's deviation, kept from round to round.
 
@@ -136,7 +168,7 @@ def _fit_edge(image, start, end, cells, edge, widths, k):
     nx, ny = ty, -tx
     mx, my = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
     half = 0.5 * length
-    reach = min(_WIDEST, max(1.6, 0.75 * length / cells))
+    reach = min(_WIDEST, max(_NARROWEST, 0.75 * border / length))
     ends = 1.0 - min(0.3, max(2.5, 0.04 * length) / half)
     # Columns where the edge is rather horizontal, else rows.
     flat = abs(tx) >= abs(ty)
@@ -232,4 +264,7 @@ def _fit_profile(place, length, reach, edge, widths, k):
         if abs(right[0]) < _STEADY and abs(right[1]) < _STEADY:
             break
     widths[k] = width
-    return True
+    left = 0.0
+    for i in range(len(place)):
+        left += slopes[i, 6] * slopes[i, 6]
+    return left < len(place) * (_LIKENESS * (white - black)) ** 2

@@ -217,7 +217,7 @@ def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
             raise TrackingError(f"marker {number}: the length of an edge: {error}") from error
     areas = np.cross(edges, np.roll(edges, -1, axis=0))
     total = areas.sum(axis=0)
-    if (areas @ total < 1e-3 * lengths.min() ** 2 * np.linalg.norm(total)).any():
+    if (areas @ total <= 1e-3 * lengths.min() ** 2 * np.linalg.norm(total)).any():
         raise TrackingError(
             f"marker {number}: its corners are no convex quadrilateral; give them in order: the "
             f"upper left one as printed, and on clockwise"
