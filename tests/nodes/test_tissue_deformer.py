@@ -7,12 +7,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError
-from us_sim.nodes.conversions import tetrahedra_from, vectors_from
+from us_sim.nodes.conversions import contact_model_from, tetrahedra_from, vectors_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.pose import Pose
 from us_sim.scene_file import load_scene
@@ -191,6 +191,26 @@ def test_a_structure_without_its_label_is_refused_at_once(bench, tmp_path, small
         SceneError, match=r"structures\.kidney: the volume has no label `kidney`; it"
     ):
         bench.make(TissueDeformer, scene=str(file))
+
+
+def test_a_haptic_arm_gets_how_the_wrench_changes_and_nobody_else(bench, small_scene, tmp_path):
+    bench.make(TissueDeformer, scene=str(small_scene), lockstep=True)
+    assert bench.peer.count_publishers("tissue/contact_model") == 0
+    file = tmp_path / "haptic.yaml"
+    file.write_text(f"based_on: {small_scene}\ntracker: {{source: haptic}}")
+    bench.make(TissueDeformer, scene=str(file), lockstep=True)
+    models = bench.collect(Float64MultiArray, "tissue/contact_model")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/contact_model") > 0)
+    for step in range(3):
+        publisher.publish(pose_at(0.003 + 1e-5 * step, 1 + step))
+    bench.spin_until(lambda: len(models) == 3)
+    first, second, third = (contact_model_from(message) for message in models)
+    moved = np.concatenate([third.pose.position - first.pose.position, np.zeros(3)])
+    change = third.wrench - first.wrench
+    assert first.wrench[2] < 0  # the tissue pushes the probe out
+    # Elasticity is linear, so on this way the model's force is exact.
+    assert (-second.stiffness @ moved)[2] == pytest.approx(change[2], rel=1e-4)
 
 
 def test_a_broken_pose_is_survived(bench, deformer):

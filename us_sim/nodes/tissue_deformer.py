@@ -14,7 +14,6 @@ from std_msgs.msg import Int32MultiArray
 
 from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError, SolverError, UsSimError
-from us_sim.nodes.contact_model_publisher import ContactModelPublisher
 from us_sim.nodes.conversions import (
     cloud_message,
     pose_from,
@@ -27,6 +26,7 @@ from us_sim.tissue.solver import SOLVERS
 from us_sim.tissue.switching import SwitchableTissue
 
 if TYPE_CHECKING:
+    from us_sim.nodes.contact_model_publisher import ContactModelPublisher
     from us_sim.nodes.structure_markers import StructureMarkers
 
 __all__ = ["TissueDeformer", "main"]
@@ -38,7 +38,7 @@ ALWAYS = Time()
 class TissueDeformer(SceneNode):
     """``probe/pose`` in; ``tissue/nodes``, ``probe/wrench`` out; mesh latched.
 
-    ``tissue/contact_model`` too where somebody needs it, see `ContactModelPublisher`, and
+    ``tissue/contact_model`` too where a haptic arm needs it, see `ContactModelPublisher`, and
     ``tissue/structures`` where the scene has structures, see `StructureMarkers`.
 
     The parameter ``solver`` switches the method while running; the state is carried over. With
@@ -67,7 +67,11 @@ class TissueDeformer(SceneNode):
         self.add_post_set_parameters_callback(self._switch)
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
-        self._contact = ContactModelPublisher(self)
+        self._contact: ContactModelPublisher | None = None
+        if self.scene.tracker.source == "haptic":
+            from us_sim.nodes.contact_model_publisher import ContactModelPublisher
+
+            self._contact = ContactModelPublisher(self)
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
@@ -120,7 +124,7 @@ class TissueDeformer(SceneNode):
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
         felt = self._wrench.get_subscription_count() > 0
-        touched = self._contact.is_wanted
+        touched = self._contact is not None and self._contact.is_wanted
         stamp = message.header.stamp
         shown = self._structures is not None and self._structures.is_due(stamp)
         if not (wanted or felt or touched or shown):
@@ -139,7 +143,7 @@ class TissueDeformer(SceneNode):
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
-        if touched:
+        if self._contact is not None and touched:
             self._contact.publish(self._tissue, pose, deformation, stamp)
         if self._structures is not None and shown:
             self._structures.publish(deformation.nodes, stamp)
