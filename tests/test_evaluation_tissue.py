@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+import us_sim
 from us_sim.cli import main
 from us_sim.evaluation import kept_reference, tissue
 from us_sim.evaluation.tissue import Trial, evaluate_tissue, plan
@@ -116,7 +117,7 @@ def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys
 
     # A second run takes the reference from the cache.
     monkeypatch.setattr(kept_reference, "solve_contact", None)
-    assert evaluate_tissue(small, quick=True) == 1
+    assert evaluate_tissue(small.with_name("again"), quick=True) == 1
 
 
 def test_a_damaged_reference_is_made_again(small, caplog):
@@ -138,8 +139,20 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("subject", ["tissue", "stability", "slice"])
+def test_a_report_is_not_overwritten(subject, tmp_path, capsys):
+    report = tmp_path / f"{subject}.md"
+    report.write_text("measured for hours", encoding="utf-8")
+    assert main(["evaluate", subject, "--quick", "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert error == f"us-sim: {report} exists already; choose another folder with --out\n"
+    assert report.read_text(encoding="utf-8") == "measured for hours"
+    assert list(tmp_path.iterdir()) == [report]
+
+
 def test_without_scikit_fem_the_extra_is_named(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "skfem", None)
+    monkeypatch.setattr(us_sim, "evaluation", us_sim.evaluation)  # put back when this is over
     for name in [name for name in sys.modules if name.startswith("us_sim.evaluation")]:
         monkeypatch.delitem(sys.modules, name)
     assert main(["evaluate", "tissue", "--quick", "--out", str(tmp_path)]) == 1

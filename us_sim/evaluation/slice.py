@@ -7,7 +7,6 @@ where it is installed.
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.recorded_frames import RecordedComparison, compare_with_recorded
+from us_sim.evaluation.report_folder import prepare_folder, write_rows
 from us_sim.evaluation.slice_cases import MAIN, Case, black_and_white, cases, speckle
 from us_sim.evaluation.slice_contenders import Contender, contender, methods
 from us_sim.evaluation.slice_costs import costs
@@ -56,11 +56,11 @@ def evaluate_slice(
         0, or 1 when a method failed; its row says how, and the others are there.
 
     Raises:
-        UsSimError: the folder cannot be written, one of the two files is given without the other,
-            or cannot be read.
+        UsSimError: the folder cannot be written or holds a report, one of the two files is given
+            without the other, or cannot be read.
     """
     begin = time.perf_counter()
-    _prepare(out)
+    prepare_folder(out, "slice.md")
     recorded = _recorded(volume_file, sweep_file, out, quick)
     bench = _Bench(quick)
     planned = cases(quick)
@@ -70,10 +70,7 @@ def evaluate_slice(
             progress.update(done, case.name)
             points += bench.points(case)
         progress.update(len(planned))
-    with (out / "slice.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(point.row for point in points)
+    write_rows(out / "slice.csv", COLUMNS, [point.row for point in points])
     with Progress("around the slices", 4, "parts") as progress:
         progress.update(0, "picture of differences")
         differences = out / "slice_differences.png"
@@ -124,21 +121,6 @@ def _working(points: Sequence[Point]) -> list[str]:
     """The methods that did not fail."""
     failed = {point.method for point in points if point.failure}
     return [method for method in methods() if method not in failed]
-
-
-def _prepare(out: Path) -> None:
-    """Make sure of the folder before the long run.
-
-    Raises:
-        UsSimError: it cannot be written.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "slice.csv").open("a", encoding="utf-8").close()
-    except OSError as error:
-        raise UsSimError(
-            f"--out {out}: cannot be written ({error.strerror or error}); name another folder"
-        ) from error
 
 
 class _Bench:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.run_times import RunTimes
 from us_sim.evaluation.slice_cases import Frame
 from us_sim.evaluation.slice_contenders import Contender
 from us_sim.evaluation.slice_reference import ExactSlice, voxel_distance
@@ -76,23 +77,12 @@ class Point:
 COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
 
 
-@dataclass(frozen=True)
-class Timing:
+@dataclass(frozen=True, eq=False)
+class Timing(RunTimes):
     """How long one method's images took."""
 
-    milliseconds: NDArray[np.float64]
     processor: NDArray[np.float64]  # ms, of all threads
     parts: tuple[float, float] = (float("nan"), float("nan"))  # ms, medians, where they are known
-
-    @property
-    def median(self) -> float:
-        """ms, of an image."""
-        return float(np.median(self.milliseconds))
-
-    @property
-    def p99(self) -> float:
-        """ms, which one image in a hundred exceeds."""
-        return float(np.percentile(self.milliseconds, 99))
 
 
 def timed_together(

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from os import cpu_count
 from pathlib import Path
 
 import numpy as np
 
+from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.recorded_frames import RecordedComparison
 from us_sim.evaluation.slice_cases import DEPTHS, MAIN, PLANES
 from us_sim.evaluation.slice_costs import Cost
@@ -41,7 +40,7 @@ class Surroundings:
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: every method in the main case, and its worst in all of them."""
-    return _table(*_summary(points))
+    return markdown_table(*_summary(points))
 
 
 def write_report(
@@ -89,7 +88,8 @@ def _text(
     views = "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items())
     parts = [
         "# Slices: error against run time",
-        f"`us-sim evaluate slice{' --quick' if quick else ''}`, {seconds:.0f} s, on {_machine()}. "
+        f"`us-sim evaluate slice{' --quick' if quick else ''}`, {seconds:.0f} s, on "
+        f"{machine('numpy', 'scipy', 'numba', 'vtk')}. "
         "Every row is in [slice.csv](slice.csv).",
         "A block of 0.2 × 0.1 × 0.1 m in a volume of speckle (0.4 mm voxels, 5 mm of it around the "
         "block, which stays rigid) is dented by a smooth field, down and aside, by up to 30 mm. "
@@ -98,7 +98,7 @@ def _text(
         "brute force in float64 by NumPy and SciPy, which shares no arithmetic with any of them.",
         HOW_TO_GET + "." if without_vtk else "",
         "## What is asked",
-        _table(("", "asked", "seen", "met"), [target.cells for target in asked]),
+        markdown_table(("", "asked", "seen", "met"), [target.cells for target in asked]),
         "Times are of this run and this machine. Ratios are of methods that took turns on one "
         "thread, the lesser of those of wall clock and of processor time; what grows with nodes "
         "and pixels is processor time. Other programs on the machine lengthen the wall clock, "
@@ -106,7 +106,7 @@ def _text(
         "(CPU ms), which is the wall clock of one thread on a machine that does nothing else.",
         "## Error against run time",
         "![Error against run time](slice_error.png)",
-        _table(*_summary(points)),
+        markdown_table(*_summary(points)),
         f"Times are of {MAIN.size} × {MAIN.size} pixels on {_nodes()} nodes pressed by 12 mm, the "
         "errors the worst of all cases. VTK knows nothing of the rigid volume around the block: "
         "its errors count where tissue is. A voxel error is the distance between where a pixel's "
@@ -128,7 +128,7 @@ def _text(
         f"Whole images of {MAIN.size} × {MAIN.size} pixels by `scan_conversion` on one thread, on "
         f"{_nodes()} nodes pressed by 12 mm, in turns; contact includes finding where the "
         "face touches the skin.",
-        _table(
+        markdown_table(
             ("probe", "CPU ms", "pixels in the image"),
             [(c.what, f"{c.ms:.2f}", f"{100 * c.shown:.0f} %") for c in around.probes],
         ),
@@ -202,7 +202,7 @@ def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
         power = exponent(mine, across)
         rows.append((method, *cells, f"{power:.2f}" if np.isfinite(power) else ""))
     words = [f"{what} {name}, CPU ms" for _, name in steps]
-    return _table(("method", *words, "exponent"), rows)
+    return markdown_table(("method", *words, "exponent"), rows)
 
 
 def _cases_table(points: Sequence[Point]) -> str:
@@ -224,7 +224,7 @@ def _cases_table(points: Sequence[Point]) -> str:
             cells = [f"{mine[m].cpu_ms_median:.2f}" if m in mine else "" for m in methods]
             wrong = [f"{mine[m].coverage_mismatch_px}" if m in mine else "" for m in methods]
             rows.append((deformation, plane, *cells, *wrong))
-    return _table(
+    return markdown_table(
         (
             "deformation",
             "plane",
@@ -249,7 +249,7 @@ def _vtk_apart(points: Sequence[Point]) -> list[str]:
         "the rest coordinates of its nodes (filter); another samples the volume there (sampling). "
         "The mesh is given in the image's own coordinates, for the filter ignores an image's "
         "direction. VTK's wheels use one thread unless told otherwise.",
-        _table(("size", "filter, CPU ms", "sampling, CPU ms"), rows),
+        markdown_table(("size", "filter, CPU ms", "sampling, CPU ms"), rows),
     ]
 
 
@@ -260,7 +260,7 @@ def _nodes() -> str:
 def _settings_table(settings: Sequence[Cost]) -> str:
     plain = settings[0].ms if settings else 0.0
     rows = [(c.what, f"{c.ms:.2f}", f"{c.ms - plain:+.2f}") for c in settings]
-    return _table(("imaging", "CPU ms", "more than at the defaults"), rows)
+    return markdown_table(("imaging", "CPU ms", "more than at the defaults"), rows)
 
 
 def _recorded(comparison: RecordedComparison | None) -> list[str]:
@@ -268,33 +268,3 @@ def _recorded(comparison: RecordedComparison | None) -> list[str]:
         return []
     pictures = [f"![Recorded and cut]({f.name})" for f in comparison.files if f.suffix == ".png"]
     return ["## Recorded frames", comparison.markdown(), *pictures]
-
-
-def _machine() -> str:
-    processor = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-                break
-    except OSError:
-        pass
-    libraries = []
-    for name in ("numpy", "scipy", "numba", "vtk"):
-        try:
-            libraries.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return (
-        f"{processor}, {cpu_count()} cores, {platform.system()}, Python "
-        f"{platform.python_version()}, {', '.join(libraries)}"
-    )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
-    lines = [head, ["-" * max(width, 1) for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
-        for line in lines
-    )

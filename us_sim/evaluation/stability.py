@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from us_sim.errors import SolverError
 from us_sim.evaluation.observed_step_limit import observed_step_limit
+from us_sim.evaluation.report_folder import prepare_folder
 from us_sim.evaluation.stability_cases import StabilityCase, extreme_cases, model_of, sampled_cases
 from us_sim.evaluation.stability_refusals import REFUSALS, refusal_of
 from us_sim.evaluation.stability_report import print_table, write_report
@@ -92,8 +93,11 @@ def evaluate_stability(out: Path, quick: bool) -> int:
 
     Returns:
         0, or 1 when a case was not finite, bounded or truthful, or refused for no reason.
+
+    Raises:
+        UsSimError: the folder cannot be written or holds a report.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    prepare_folder(out, "stability.md")
     start = time.perf_counter()
     tasks = list(_tasks(quick))
     with Progress("stability", len(tasks), "cases") as progress:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import platform
 import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
-import scipy
 
+from us_sim.evaluation.machine import machine
 from us_sim.evaluation.stability_maps import draw_map, draw_step_limits
 from us_sim.tissue.solver import SOLVERS
 
@@ -81,7 +79,7 @@ def write_report(tried: Sequence[Tried], out: Path, quick: bool, seconds: float)
     lines = [
         "# Stability of the tissue solvers",
         "",
-        f"`{command}`, {seconds:.0f} s on {_machine()}.",
+        f"`{command}`, {seconds:.0f} s in two processes, on {machine('numpy', 'scipy', 'numba')}.",
         "",
         _DEFINITIONS,
         "| " + " | ".join(_HEADER) + " |",
@@ -233,16 +231,3 @@ def _refusals(tried: Sequence[Tried]) -> list[str]:
         name, _, sentence = text.split(" | ", 2)
         lines += [f"| {name} | {', '.join(methods)} | {sentence} |"]
     return [*lines, ""]
-
-
-def _machine() -> str:
-    model = platform.processor() or platform.machine()
-    try:
-        known = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-        model = re.search(r"model name\s*:\s*(.+)", known)[1]  # type: ignore[index]
-    except (OSError, TypeError):
-        pass
-    return (
-        f"{model}, two processes, {platform.system()}, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}, SciPy {scipy.__version__}, Numba {numba.__version__}"
-    )

@@ -7,7 +7,6 @@ fine quadratic elements (`us_sim.evaluation.reference`).
 
 from __future__ import annotations
 
-import csv
 import inspect
 import time
 from collections.abc import Iterator
@@ -16,9 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from us_sim.errors import UsSimError
 from us_sim.evaluation.kept_reference import Reference, kept_reference
 from us_sim.evaluation.own_equations import converged, equations, solved_independently
+from us_sim.evaluation.report_folder import prepare_folder, write_rows
 from us_sim.evaluation.tissue_cases import LARGEST_MESH, LOCKING, MESHES, SCENES, Scene
 from us_sim.evaluation.tissue_points import (
     COLUMNS,
@@ -134,10 +133,11 @@ def evaluate_tissue(out: Path, quick: bool) -> int:
         0, or 1 when a method failed; its row says how, and the others are there.
 
     Raises:
-        UsSimError: the folder cannot be written, or no reference can be computed.
+        UsSimError: the folder cannot be written or holds a report, or no reference can be
+            computed.
     """
     begin = time.perf_counter()
-    _prepare(out)
+    prepare_folder(out, "tissue.md")
     trials = plan(quick)
     scenes = {trial.scene.name: trial.scene for trial in trials}
     references = _references(list(scenes.values()), quick)
@@ -149,10 +149,7 @@ def evaluate_tissue(out: Path, quick: bool) -> int:
             progress.update(done, f"{trial.scene.name}, {trial.method}, {counts}")
             points += bench.points(trial)
         progress.update(len(trials))
-    with (out / "tissue.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(point.row for point in points)
+    write_rows(out / "tissue.csv", COLUMNS, [point.row for point in points])
     seconds = time.perf_counter() - begin
     pictures = write_report(out, points, references, quick, seconds)
     print(table(points))
@@ -168,22 +165,6 @@ def _known_settings(method: str) -> list[dict[str, Any]]:
         return settings_of(method)
     except ImportError:
         return [{}]  # its trial fails, and says so
-
-
-def _prepare(out: Path) -> None:
-    """Make sure of the folder before the long run.
-
-    Raises:
-        UsSimError: it cannot be written.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / "tissue.csv"
-        probe.open("a", encoding="utf-8").close()
-    except OSError as error:
-        raise UsSimError(
-            f"--out {out}: cannot be written ({error.strerror or error}); name another folder"
-        ) from error
 
 
 def _references(scenes: list[Scene], quick: bool) -> dict[str, Reference]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from us_sim.evaluation.run_times import RunTimes
 from us_sim.evaluation.tissue_cases import Scene
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.model import TissueModel
@@ -97,21 +98,10 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Timing:
-    """A scene's path, followed frame by frame."""
+class Timing(RunTimes):
+    """A scene's path, followed frame by frame; a run is a timed frame."""
 
     last: Deformation
-    milliseconds: NDArray[np.float64]  # (F,) of each timed frame
-
-    @property
-    def median(self) -> float:
-        """ms a frame."""
-        return float(np.median(self.milliseconds))
-
-    @property
-    def p99(self) -> float:
-        """ms, which one frame in a hundred exceeds."""
-        return float(np.percentile(self.milliseconds, 99))
 
 
 def timed(solver: TissueSolver, scene: Scene, threads: int) -> Timing:
@@ -128,7 +118,7 @@ def timed(solver: TissueSolver, scene: Scene, threads: int) -> Timing:
                 frames.append((time.perf_counter() - before) * 1e3)
             if time.perf_counter() - begin > _LONGEST:
                 break
-    return Timing(last, np.array(frames))
+    return Timing(np.array(frames), last)
 
 
 def compare(found: Outcome, exact: Outcome, rest_volume: float) -> Errors:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from os import cpu_count
 from pathlib import Path
 
 import numpy as np
 
 from us_sim.evaluation.kept_reference import Reference
+from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.tissue_cases import LOCKING, MESHES, SCENES
 from us_sim.evaluation.tissue_plots import exponent, plot_errors, plot_sizes
 from us_sim.evaluation.tissue_points import Point
@@ -23,7 +22,7 @@ _PAPERS_FINEST = int(np.prod(MESHES[-1]))
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: the defaults of every method against the nonlinear reference."""
-    return _table(
+    return markdown_table(
         ("scene", "method", "nodes", "ms", "p99", "L2 %", "max mm", "force %", "volume %"),
         [
             (
@@ -122,7 +121,8 @@ def _text(
 ) -> str:
     parts = [
         "# Tissue: error against run time",
-        f"`us-sim evaluate tissue{' --quick' if quick else ''}`, {seconds:.0f} s, on {_machine()}. "
+        f"`us-sim evaluate tissue{' --quick' if quick else ''}`, {seconds:.0f} s, on "
+        f"{machine('numpy', 'scipy', 'numba', 'scikit-fem')}. "
         "Every row is in [tissue.csv](tissue.csv).",
         "A block of 0.2 × 0.1 × 0.1 m, held at its bottom, E = 10 kPa and ν = 0.45 unless a scene "
         "says otherwise, is pressed by a sphere of 30 mm radius that moves 2.5 mm a frame (in "
@@ -192,33 +192,12 @@ def _locking(points: Sequence[Point]) -> list[str]:
         "## Locking",
         f"Error of the reaction to a press of 12 mm on {_PAPERS_FINEST:,} nodes, while the probe "
         "moves, as the tissue becomes incompressible:",
-        _table(head, rows),
+        markdown_table(head, rows),
     ]
 
 
-def _machine() -> str:
-    processor = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-                break
-    except OSError:
-        pass
-    libraries = []
-    for name in ("numpy", "scipy", "numba", "scikit-fem"):
-        try:
-            libraries.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return (
-        f"{processor}, {cpu_count()} cores, {platform.system()}, Python "
-        f"{platform.python_version()}, {', '.join(libraries)}"
-    )
-
-
 def _reference_table(references: dict[str, Reference]) -> str:
-    return _table(
+    return markdown_table(
         ("scene", "elements", "unknowns", "force N", "L2 change", "force change", "penetration mm"),
         [
             (
@@ -236,7 +215,7 @@ def _reference_table(references: dict[str, Reference]) -> str:
 
 
 def _table_of_defaults(points: Sequence[Point]) -> str:
-    return _table(
+    return markdown_table(
         (
             "scene",
             "method",
@@ -265,7 +244,7 @@ def _table_of_defaults(points: Sequence[Point]) -> str:
 
 
 def _own_table(points: Sequence[Point], focus: _Focus) -> str:
-    return _table(
+    return markdown_table(
         ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference"),
         [
             (
@@ -294,7 +273,7 @@ def _size_table(sizes: Sequence[Point]) -> str:
         ):
             numbers = [_number(value(mine[n])) if n in mine else "" for n in counts]
             rows.append((method, what, *numbers, _number(exponent(list(mine.values()), value))))
-    return _table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
+    return markdown_table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
 
 
 def _front(points: Sequence[Point], scene: str, nodes: int) -> str:
@@ -304,15 +283,6 @@ def _front(points: Sequence[Point], scene: str, nodes: int) -> str:
         for p in front
     ]
     return f"- **{scene}** ({SCENES[scene].words}): {'; '.join(steps) or 'nothing was measured'}."
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
-    lines = [head, ["-" * width for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
-        for line in lines
-    )
 
 
 def _number(value: float) -> str:
