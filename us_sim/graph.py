@@ -25,6 +25,7 @@ __all__ = [
     "NodeProcess",
     "Parameters",
     "ProcessGroup",
+    "awaited_topics",
     "keep_on_this_host",
     "player_settings",
     "simulation_nodes",
@@ -91,15 +92,19 @@ def simulation_nodes(
     return nodes
 
 
+def awaited_topics(scene: Scene) -> list[str]:
+    """Topics that are published once all of the scene's nodes are ready."""
+    topics = ["probe/pose", "ultrasound/image"]
+    topics += ["tissue/nodes"] if scene.tissue else []
+    return topics + (["skin/nodes"] if scene.skin else [])
+
+
 def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:
     """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
-    topics = ["tracker/pose", "probe/pose", "ultrasound/image"]
-    topics += ["tissue/nodes"] if scene.tissue else []
-    topics += ["skin/nodes"] if scene.skin else []
     return {
         "path": str(path.expanduser().resolve()),
         "topic": (scene.tracker.body or "") if scene.tracker.source == "path" else "",
-        "await_topics": topics,
+        "await_topics": ["tracker/pose", *awaited_topics(scene)],
         "await_subscriber": "session_recorder" if recorded else "",
     }
 

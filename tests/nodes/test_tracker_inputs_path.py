@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import Image, PointCloud2
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.probe_tracker import ProbeTracker
@@ -47,12 +48,20 @@ def scene_with(tmp_path, small_scene, **tracker):
     return str(file)
 
 
+def publish_the_rest(bench):
+    """The topics by which the scene's other nodes say that they are ready."""
+    bench.peer.create_publisher(Image, "ultrasound/image", 10)
+    for topic in ("tissue/nodes", "skin/nodes"):
+        bench.peer.create_publisher(PointCloud2, topic, 10)
+
+
 def test_a_bags_poses_come_once_and_as_far_apart_as_recorded(bench, tmp_path, small_scene, bag):
     scene = scene_with(tmp_path, small_scene, file=bag)
     node = bench.make(ProbeTracker, scene=scene)
-    bench.spin_for(10)
-    assert node.health.received == 0, "it began though nobody listened"
     poses = bench.collect(PoseStamped, "probe/pose")
+    bench.spin_for(60)
+    assert node.health.received == 0, "it began though the other nodes are not ready"
+    publish_the_rest(bench)
     before = node.get_clock().now().nanoseconds
     bench.spin_until(lambda: len(poses) == 20)
     bench.spin_for(5)
@@ -71,6 +80,7 @@ def test_a_recording_of_plus_leads_from_the_probe_to_the_reference(
         tmp_path, small_scene, file=recording, body="ProbeToReference", frame="Reference"
     )
     bench.make(ProbeTracker, scene=scene)
+    publish_the_rest(bench)
     poses = bench.collect(PoseStamped, "probe/pose")
     bench.spin_until(lambda: len(poses) == 2)
     np.testing.assert_allclose([p.pose.position.x for p in poses], [0.006, 0.008])

@@ -9,6 +9,7 @@ import numpy as np
 
 from us_sim.assembly import path_of
 from us_sim.errors import SceneError
+from us_sim.graph import awaited_topics
 from us_sim.pose import Pose
 from us_sim.tracking.measurement import Measurement
 
@@ -19,12 +20,14 @@ __all__ = ["PathInput"]
 
 SHORTEST_S, LONGEST_S = 1e-3, 0.02
 """How often it is looked whether a pose is due, at most and at least."""
+CHECK_S, CHECKS = 0.05, 6
+"""How often, and how often in a row, all nodes must be there before the first pose."""
 
 
 class PathInput:
     """The poses of ``tracker.file``, once, as fast as they were recorded.
 
-    It begins when somebody listens to ``probe/pose``; stamps are the present's.
+    It begins when the scene's other nodes are ready; stamps are the present's.
     """
 
     def __init__(self, node: ProbeTracker) -> None:
@@ -45,7 +48,22 @@ class PathInput:
         # A recorder's clock may have been set back; what was recorded before is sent before.
         self._due = np.maximum.accumulate(self._path.log_times - self._path.log_times[0])
         self._next = 0
-        self._begun: int | None = None
+        self._begun = self._checks = 0
+        node.get_logger().info("waiting for the simulation")
+        self._timer = node.create_timer(CHECK_S, self._begin)
+
+    def _begin(self) -> None:
+        """Start once everything has been there for a while, so that all have found each other."""
+        node = self._node
+        there = node.count_subscribers("probe/pose") and all(
+            node.count_publishers(topic) for topic in awaited_topics(node.scene)
+        )
+        self._checks = self._checks + 1 if there else 0
+        if self._checks < CHECKS:
+            return
+        self._timer.cancel()
+        self._begun = node.get_clock().now().nanoseconds
+        node.get_logger().info(f"playing {len(self._path)} poses of {self._path.topic}")
         steps = np.diff(self._due)
         period = 0.5e-9 * float(np.median(steps)) if len(steps) else LONGEST_S
         self._timer = node.create_timer(float(np.clip(period, SHORTEST_S, LONGEST_S)), self._tick)
@@ -53,11 +71,6 @@ class PathInput:
     def _tick(self) -> None:
         """Hand on each pose whose time has come."""
         now = self._node.get_clock().now().nanoseconds
-        if self._begun is None:
-            if not self._node.count_subscribers("probe/pose"):
-                return
-            self._begun = now
-            self._node.get_logger().info(f"playing {len(self._path)} poses of {self._path.topic}")
         while self._next < len(self._path) and self._due[self._next] <= now - self._begun:
             self._send(self._begun + int(self._due[self._next]))
             self._next += 1
