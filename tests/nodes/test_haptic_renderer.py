@@ -21,7 +21,9 @@ from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.pose import Pose
 from us_sim.tracking.contact_model import ContactModel
 
-TRACKER = "tracker: {source: haptic, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s"
+TRACKER = (
+    "tracker: {source: haptic, frame: arm, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s"
+)
 SPRING = 200.0  # N/m
 
 
@@ -90,6 +92,7 @@ def test_a_wall_pushes_back_with_its_stiffness_times_the_depth(bench, arm):
     [
         ("nan", "pose", "not finite"),
         ("unstamped", "stamp", "has no stamp"),
+        ("frame", "frame", "is in frame 'leg', not 'arm'"),
         ("jump", "", "has jumped by 55.0 mm"),
         ("clutch", "", "the clutch is held"),
         ("model", "model", "51 finite numbers in all, not 3"),
@@ -100,9 +103,11 @@ def test_any_doubt_makes_it_zero_until_there_is_none(bench, arm, doubt, kind, re
     handle.press(0.005)
     bench.spin_until(lambda: felt(wrenches) < -0.99)
     if doubt == "nan":
-        handle.poses.publish(pose_at(float("nan"), 2))
+        handle.poses.publish(pose_at(float("nan"), 2, frame="arm"))
     elif doubt == "unstamped":
-        handle.poses.publish(pose_at(0.005, 0))
+        handle.poses.publish(pose_at(0.005, 0, frame="arm"))
+    elif doubt == "frame":
+        handle.poses.publish(pose_at(0.005, 2, frame="leg"))
     elif doubt == "jump":
         handle.move(0.06, model=False)
     elif doubt == "clutch":
@@ -141,7 +146,7 @@ def test_from_the_tissue_to_the_hand(bench, scene):
     def press(depth):
         nonlocal second
         second += 1
-        message = pose_at(depth, 0)
+        message = pose_at(depth, 0, frame="arm")
         message.header.stamp = Time(nanoseconds=1_000_000_000 + 5_000_000 * second).to_msg()
         handle.publish(message)
         probe.publish(message)
@@ -156,6 +161,25 @@ def test_from_the_tissue_to_the_hand(bench, scene):
         return expected < -0.05 and felt(wrenches) == pytest.approx(expected, rel=1e-3)
 
     bench.spin_until(agrees)
+
+
+def test_the_tissues_model_is_made_for_nobody(bench, scene):
+    deformer = bench.make(TissueDeformer, scene=str(scene), lockstep=True)
+    wrenches = bench.collect(WrenchStamped, "probe/wrench")
+    probe = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("probe/wrench") > 0)
+    probe.publish(pose_at(0.003, 1))
+    bench.spin_until(lambda: wrenches)
+    assert not deformer._contact.is_wanted
+    models = bench.collect(Float64MultiArray, "tissue/contact_model")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/contact_model") > 0)
+    probe.publish(pose_at(0.003, 2))
+    bench.spin_until(lambda: models)
+    model = contact_model_from(models[0])
+    assert model.stamp == 2_000_000_000
+    felt_at_probe = wrenches[-1].wrench
+    assert model.wrench[2] == pytest.approx(felt_at_probe.force.z)
+    assert model.stiffness[2, 2] > 100  # N/m
 
 
 def test_a_model_survives_its_message():

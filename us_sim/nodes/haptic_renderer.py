@@ -45,7 +45,7 @@ class HapticRenderer(SceneNode):
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can be felt")
         settings = self.scene.tracker.haptic or HapticSettings()
         self._rendering = haptic_rendering_of(self.scene)
-        self._frame = ""
+        self._frame = self.scene.tracker.frame
         self._is_taken = False
         self._stops = 0
         self._wrenches = self.stream(WrenchStamped, "haptic/wrench")
@@ -66,7 +66,14 @@ class HapticRenderer(SceneNode):
     def _take_pose(self, message: PoseStamped) -> None:
         now = time.monotonic_ns()
         self.health.received += 1
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        stamp, frame = Time.from_msg(message.header.stamp).nanoseconds, message.header.frame_id
+        if frame != self._frame:
+            self._refuse(
+                "frame",
+                f"haptic/pose is in frame '{frame}', not '{self._frame}', so nothing is felt: set "
+                f"the arm's frame, or tracker.frame in the scene",
+            )
+            return
         try:
             pose = pose_from(message)
         except UsSimError as error:
@@ -77,7 +84,6 @@ class HapticRenderer(SceneNode):
                 "stamp", "haptic/pose has no stamp, so nothing is felt: let its driver set it"
             )
             return
-        self._frame = message.header.frame_id
         self._rendering.pose(stamp, pose, now)
 
     def _take_clutch(self, message: Bool) -> None:
