@@ -72,7 +72,7 @@ def test_a_wide_lens_is_seen_through():
 
 def test_a_charuco_board_is_measured_by_its_chessboard():
     board = RigidBody.charuco("6X6_250", 5, 7, 0.03, 0.018)
-    true = Pose([-0.06, -0.1, 0.6], turned([1, 0, 0], 0.4).orientation)
+    true = Pose([-0.06, -0.1, 0.35], turned([1, 0, 0], 0.4).orientation)
     source = CameraSource(WEBCAM, board)
     seen = source.measure(RenderedView(WEBCAM, board).render(true, ORDINARY), 0)
     assert np.linalg.norm(seen.pose.position - true.position) < 1e-3

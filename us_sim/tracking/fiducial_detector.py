@@ -73,7 +73,9 @@ class FiducialDetector:
         self._cells = dictionary(body.dictionary).markerSize + 2
         self._chessboard_detector = None
         if body.chessboard is not None:
-            self._chessboard_detector = cv2.aruco.CharucoDetector(body.chessboard.board)
+            beside = cv2.aruco.CharucoParameters()
+            beside.minMarkers = 1  # a corner beside one that is found, since it is refined itself
+            self._chessboard_detector = cv2.aruco.CharucoDetector(body.chessboard.board, beside)
 
     def detect(
         self,
