@@ -11,6 +11,7 @@ from us_sim.pose import Pose
 from us_sim.slicing.plane import SlicePlane
 from us_sim.slicing.probe import LinearProbe
 from us_sim.slicing.resampling import sample_labels, sample_plane
+from us_sim.slicing.span_sampling import MOST_VOXELS_A_SIDE
 from us_sim.volume.volume import Volume
 
 MILLIMETRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
@@ -79,6 +80,12 @@ def test_labels_are_those_of_the_nearest_voxel():
 def test_a_volume_without_labels_says_so():
     with pytest.raises(VolumeError, match="has no labels"):
         sample_labels(Volume(noise((3, 3, 3)), MILLIMETRES), along_x(0, 1, 3))
+
+
+def test_a_volume_beyond_the_numbers_of_the_kernel_is_refused():
+    long = np.broadcast_to(np.uint8(0), (2, 2, MOST_VOXELS_A_SIDE + 1))
+    with pytest.raises(VolumeError, match="at most 16384 a side"):
+        sample_plane(Volume(long, MILLIMETRES), along_x(0, 1, 3))
 
 
 def test_memory_mapped_voxels_are_sampled_in_place(tmp_path):

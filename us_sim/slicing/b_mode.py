@@ -125,6 +125,7 @@ class BMode:
         Raises:
             MeshError: the nodes are not as many as at rest, or not finite.
             ProbeError: the pose is nowhere near.
+            VolumeError: the volume has too many voxels.
         """
         slices = [self._slice(plane, nodes) for plane in self._formation.planes(pose)]
         coupling = None
@@ -143,12 +144,12 @@ class BMode:
         """
         plane = self._probe.plane(pose)
         if nodes is None or self._slicer is None:
-            return sample_labels(self._volume, plane)
+            return sample_labels(self._volume, plane, threads=self._threads)
         return self._slicer.labels(nodes, plane)
 
     def _slice(self, plane: SlicePlane, nodes: NDArray[np.float64] | None) -> NDArray[np.uint8]:
         if nodes is None or self._slicer is None:
-            return sample_plane(self._volume, plane)
+            return sample_plane(self._volume, plane, threads=self._threads)
         return self._slicer.image(nodes, plane)
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:

@@ -2,8 +2,8 @@
 
 Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
 their value, so that the volume ends at the faces of its voxels and not half a voxel inside; beyond
-those faces everything is 0. Grey values are trilinear and rounded half up; labels are those of
-the nearest voxel.
+those faces everything is 0. Grey values are trilinear and rounded half up, see `span_sampling`;
+labels are those of the nearest voxel.
 
 >>> import numpy as np
 >>> from us_sim.pose import Pose
@@ -29,15 +29,18 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.slicing.location import BLACK
 from us_sim.slicing.plane import SlicePlane
+from us_sim.slicing.rest_outline import NO_OUTLINE
 from us_sim.slicing.row_bands import share_rows
-from us_sim.slicing.trilinear import inside_volume, sample_linear
+from us_sim.slicing.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
+from us_sim.slicing.spans import END_SHIFT
+from us_sim.slicing.trilinear import inside_volume
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from us_sim.volume.volume import Volume
 
 __all__ = [
+    "full_runs",
+    "grey_voxels",
     "label_voxels",
     "pixel_to_index",
     "sample_labels",
@@ -51,8 +54,26 @@ def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDAr
     """The image (rows, columns) on a plane through the volume as it is, without tissue.
 
     It does not depend on the number of threads that share its rows.
+
+    Raises:
+        VolumeError: the volume has too many voxels.
     """
-    return _sample(sample_linear, *voxels_of(volume.intensities), volume, plane, threads)
+    voxels, shape = grey_voxels(volume)
+    runs = full_runs(plane) if plane.spans is None else plane.spans
+    # One map holds on whole rows, so that no pixel is left for what lies outside a mesh.
+    spans = np.full((plane.rows, 1), plane.columns << END_SHIFT, dtype=np.int64)
+    used = np.ones(plane.rows, dtype=np.int32)
+    maps, inside = pixel_to_index(volume, plane)[None], np.zeros(1, dtype=np.bool_)
+    image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
+
+    def draw(first_row: int, end_row: int) -> None:
+        sample_spans(
+            voxels, shape, maps, inside, 0, spans, used, runs, True, *NO_OUTLINE,
+            first_row, end_row, image,
+        )  # fmt: skip
+
+    share_rows(threads, plane.rows, draw)
+    return image
 
 
 def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
@@ -61,7 +82,25 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
     Raises:
         VolumeError: the volume has no labels.
     """
-    return _sample(sample_nearest, *label_voxels(volume), volume, plane, threads)
+    voxels, shape = label_voxels(volume)
+    maps = pixel_to_index(volume, plane)[None]
+    elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
+    if plane.spans is not None:
+        elements[~plane.is_shown()] = BLACK
+    image = np.empty(elements.shape, dtype=np.uint8)
+    share_rows(
+        threads,
+        plane.rows,
+        lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+    )
+    return image
+
+
+def full_runs(plane: SlicePlane) -> NDArray[np.int32]:
+    """(rows, 2, 2) as `SlicePlane.spans`, for an image that fills its grid."""
+    runs = np.zeros((plane.rows, 2, 2), dtype=np.int32)
+    runs[:, 0, 1] = plane.columns
+    return runs
 
 
 def pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
@@ -81,6 +120,25 @@ def voxels_of(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.i
     return flat, np.array(array.shape, dtype=np.int64)
 
 
+def grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The grey values' voxels as `sample_spans` takes them.
+
+    Raises:
+        VolumeError: there are too many.
+    """
+    intensities = volume.intensities
+    if max(intensities.shape) > MOST_VOXELS_A_SIDE or intensities.size > MOST_VOXELS:
+        raise VolumeError(
+            f"the volume has {intensities.shape} voxels: cut or coarsen it to at most "
+            f"{MOST_VOXELS_A_SIDE} a side and {MOST_VOXELS} in all"
+        )
+    voxels, shape = voxels_of(intensities)
+    if intensities.shape[2] == 1:
+        # Nothing follows the last voxel of a row; a volume so thin is small.
+        voxels, _ = voxels_of(np.repeat(intensities, 2, axis=2))
+    return voxels, shape
+
+
 def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The labels' voxels as the kernels take them.
 
@@ -90,23 +148,6 @@ def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     if volume.labels is None:
         raise VolumeError("the volume has no labels: give one with a segmentation")
     return voxels_of(volume.labels)
-
-
-def _sample(
-    kernel: Callable[..., None],
-    voxels: NDArray[np.uint8],
-    shape: NDArray[np.int64],
-    volume: Volume,
-    plane: SlicePlane,
-    threads: int,
-) -> NDArray[np.uint8]:
-    maps = pixel_to_index(volume, plane)[None]
-    elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
-    if plane.spans is not None:
-        elements[~plane.is_shown()] = BLACK
-    image = np.empty(elements.shape, dtype=np.uint8)
-    share_rows(threads, plane.rows, lambda a, b: kernel(voxels, shape, maps, elements, a, b, image))
-    return image
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -28,21 +28,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.errors import VolumeError
 from us_sim.mesh_faces import face_order
 from us_sim.slicing.clusters import Clusters
 from us_sim.slicing.cut_polygons import cut_tetrahedra, room_for_cuts
 from us_sim.slicing.location import BLACK
 from us_sim.slicing.plane import SlicePlane
-from us_sim.slicing.resampling import label_voxels, pixel_to_index, sample_nearest, voxels_of
+from us_sim.slicing.resampling import (
+    full_runs,
+    grey_voxels,
+    label_voxels,
+    pixel_to_index,
+    sample_nearest,
+)
 from us_sim.slicing.rest_outline import NO_OUTLINE, Outline, RestSurface
 from us_sim.slicing.row_bands import share_rows
 from us_sim.slicing.section import RestMesh, finite_nodes
 from us_sim.slicing.slicer import Slicer
 from us_sim.slicing.span_sampling import (
     INNER_MARGIN,
-    MOST_VOXELS,
-    MOST_VOXELS_A_SIDE,
     fill_elements,
     sample_spans,
 )
@@ -73,7 +76,7 @@ class ScanConversion(Slicer):
         self._surface = RestSurface(
             mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
         )
-        self._voxels, self._shape = _with_a_next_one(volume.intensities)
+        self._voxels, self._shape = grey_voxels(volume)
         self._moved = np.empty(mesh.nodes.shape)
         self._cuts = room_for_cuts(256)
         self._spans = np.empty((0, 0), dtype=np.int64)
@@ -167,8 +170,7 @@ class ScanConversion(Slicer):
         if plane.spans is not None:
             return plane.spans
         if len(self._full) != plane.rows or self._full[0, 0, 1] != plane.columns:
-            self._full = np.zeros((plane.rows, 2, 2), dtype=np.int32)
-            self._full[:, 0, 1] = plane.columns
+            self._full = full_runs(plane)
         return self._full
 
     def _convert(
@@ -211,22 +213,3 @@ def _neighbours(
     neighbours = np.full(tetrahedra.shape, -1, dtype=np.int32)
     neighbours[solid] = of_solid.reshape(-1, 4)
     return neighbours
-
-
-def _with_a_next_one(
-    intensities: NDArray[np.uint8],
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """A volume's voxels as `sample_spans` takes them, and their shape (3,).
-
-    Raises:
-        VolumeError: there are too many.
-    """
-    if max(intensities.shape) > MOST_VOXELS_A_SIDE or intensities.size > MOST_VOXELS:
-        raise VolumeError(
-            f"the volume has {intensities.shape} voxels: cut or coarsen it to at most "
-            f"{MOST_VOXELS_A_SIDE} a side and {MOST_VOXELS} in all"
-        )
-    if intensities.shape[2] == 1:
-        # Nothing follows the last voxel of a row; a volume so thin is small.
-        return voxels_of(np.repeat(intensities, 2, axis=2))[0], voxels_of(intensities)[1]
-    return voxels_of(intensities)

@@ -101,8 +101,12 @@ def create_slicer(
 
 
 def warm_up(name: str, threads: int = 1) -> None:
-    """Compile every kernel of a method, or load it from numba's cache, by cutting a tiny image."""
+    """Compile every kernel of a method, or load it from numba's cache, by cutting a tiny image.
+
+    Those for a volume without tissue too.
+    """
     from us_sim.slicing.probe import LinearProbe
+    from us_sim.slicing.resampling import sample_labels, sample_plane
     from us_sim.volume.volume import Volume
 
     voxels = np.zeros((2, 2, 2), dtype=np.uint8)
@@ -113,3 +117,5 @@ def warm_up(name: str, threads: int = 1) -> None:
     slicer.image(1.1 * nodes, plane)
     slicer.labels(nodes, plane)
     slicer.rest_coordinates(nodes, plane)
+    sample_plane(volume, plane, threads=threads)
+    sample_labels(volume, plane, threads=threads)
