@@ -12,6 +12,8 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.assembly import probe_of, tissue_model_of, volume_of
+from us_sim.errors import ProbeError
+from us_sim.nodes import slice_interpolator
 from us_sim.nodes.conversions import (
     affine_from,
     cloud_message,
@@ -162,6 +164,15 @@ def test_a_setting_that_cannot_be_is_refused_and_nothing_changes(
     assert sentence in result.reason
     assert node.get_parameter(name).value == before
     np.testing.assert_array_equal(image_at(bench, images, poses, 2), image)
+
+
+def test_a_setting_given_at_the_start_is_refused_before_the_volume_is_made(
+    bench, small_scene, monkeypatch
+):
+    monkeypatch.setattr(slice_interpolator, "volume_of", None)
+    words = "^slice_interpolator: imaging.grey_map: 'purple' is not one of linear, soft, contrast$"
+    with pytest.raises(ProbeError, match=words):
+        bench.make(SliceInterpolator, scene=str(small_scene), grey_map="purple")
 
 
 def test_pixels_are_placed_in_millimetres_also_after_a_change_of_depth(bench, rigid):

@@ -11,7 +11,8 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.assembly import tissue_model_of, volume_of
-from us_sim.errors import SceneError
+from us_sim.errors import SceneError, SolverError
+from us_sim.nodes import tissue_deformer
 from us_sim.nodes.conversions import contact_model_from, tetrahedra_from, vectors_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.pose import Pose
@@ -219,6 +220,23 @@ def test_a_broken_pose_is_survived(bench, deformer):
     received = press(bench, publisher, nodes, 0.002, 2)
     assert np.isfinite(received).all()
     assert node.health.problems("pose") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("solver", "wrong", "^tissue_deformer.solver: 'wrong' is not one of fem, "),
+        ("solver", "", "^tissue_deformer.solver: '' is not one of fem, "),
+        ("compare_with", "wrong", "^tissue_deformer.compare_with: 'wrong' is not one of fem, "),
+        ("compare_with", "fem", "^fem cannot be compared with itself"),
+    ],
+)
+def test_a_method_that_cannot_be_is_refused_before_the_volume_is_made(
+    bench, small_scene, monkeypatch, name, value, sentence
+):
+    monkeypatch.setattr(tissue_deformer, "volume_of", None)
+    with pytest.raises(SolverError, match=sentence):
+        bench.make(TissueDeformer, scene=str(small_scene), **{name: value})
 
 
 def test_a_scene_without_tissue_is_refused(bench, tmp_path):

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from us_sim.errors import UsSimError
+from us_sim.errors import ProbeError, UsSimError
 from us_sim.slicing.imaging import Imaging
 from us_sim.slicing.probe import Probe
 
@@ -40,7 +40,7 @@ class Console:
         use: called with those that ``prepare`` let pass, when the parameters have been set.
 
     Raises:
-        ProbeError: a value given at the start is out of range.
+        ProbeError: a value given at the start is out of range; the node's name comes first.
     """
 
     def __init__(
@@ -63,7 +63,10 @@ class Console:
             _declared(node, of_probe[name], getattr(probe, name), description)
             for name, description in OF_THE_PROBE.items()
         ]
-        self.probe, self.imaging = self._with(given)
+        try:
+            self.probe, self.imaging = self._with(given)
+        except ProbeError as error:
+            raise ProbeError(f"{node.get_name()}: {error}") from error
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._change)
 

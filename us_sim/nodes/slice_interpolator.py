@@ -11,7 +11,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.assembly import scanner_of, volume_of
+from us_sim.assembly import probe_of, scanner_of, volume_of
 from us_sim.errors import UsSimError
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.console import Console
@@ -46,11 +46,10 @@ class SliceInterpolator(SceneNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
+        # Before the volume, which may take a minute to make.
+        console = Console(self, probe_of(self.scene), self.scene.imaging, self._prepare, self._use)
         volume = volume_of(self.scene)
         self._scanner = scanner_of(self.scene, volume, threads=self.threads)
-        console = Console(
-            self, self._scanner.probe, self.scene.imaging, self._scanner.prepare, self._use
-        )
         self.get_logger().info(f"preparing {self.scene.slice.method} on {self.scene.volume_name}")
         self._scanner.prepare(console.probe, console.imaging)
         self._scanner.use(console.probe, console.imaging)
@@ -72,6 +71,10 @@ class SliceInterpolator(SceneNode):
             self.newest(PointCloud2, "tissue/nodes", self._image_deformed)
         self.health.state = "ready"
         self.get_logger().info("ready")
+
+    def _prepare(self, probe: Probe, imaging: Imaging) -> None:
+        """Refuse what cannot be, and load what images with these settings will use."""
+        self._scanner.prepare(probe, imaging)
 
     def _use(self, probe: Probe, imaging: Imaging) -> None:
         """Go on with what was set at the console."""

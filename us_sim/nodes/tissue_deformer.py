@@ -50,14 +50,16 @@ class TissueDeformer(SceneNode):
         super().__init__("tissue_deformer", **kwargs)
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
-        model = tissue_model_of(self.scene, volume_of(self.scene), self.get_logger().info)
-        mesh = model.mesh
+        # Before the volume, which may take a minute to make.
         solver = self._method(
             "solver", self.scene.tissue.solver, f"one of {', '.join(SOLVERS)}", "deforms the tissue"
         )
         compared = self._method(
             "compare_with", "", "another one, or '' for none", "runs on the same poses beside it"
         )
+        _require_two(solver, compared)
+        model = tissue_model_of(self.scene, volume_of(self.scene), self.get_logger().info)
+        mesh = model.mesh
         self.get_logger().info(
             f"preparing {solver} for {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra"
         )
@@ -91,7 +93,12 @@ class TissueDeformer(SceneNode):
             description=f"method that {purpose}; may change while running",
             additional_constraints=choices,
         )
-        return str(self.declare_parameter(name, value, descriptor).value)
+        method = str(self.declare_parameter(name, value, descriptor).value)
+        if method not in SOLVERS and (method or name == "solver"):
+            raise SolverError(
+                f"{self.get_name()}.{name}: {method!r} is not one of {', '.join(SOLVERS)}"
+            )
+        return method
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         """Prepare a named solver before the switch, so that one that cannot be made is refused."""
@@ -101,11 +108,7 @@ class TissueDeformer(SceneNode):
             self._tissue.prepare(wanted["solver"])
             if wanted["compare_with"]:
                 self._tissue.prepare(wanted["compare_with"])
-                if wanted["compare_with"] == wanted["solver"]:
-                    raise SolverError(
-                        f"{wanted['solver']} cannot be compared with itself: set compare_with to "
-                        f"another method, or to '', first"
-                    )
+                _require_two(wanted["solver"], wanted["compare_with"])
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -170,6 +173,14 @@ class TissueDeformer(SceneNode):
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T
         return cloud_message({"x": x, "y": y, "z": z}, stamp, "patient")
+
+
+def _require_two(solver: str, compared: str) -> None:
+    if compared == solver:
+        raise SolverError(
+            f"{solver} cannot be compared with itself: set compare_with to another method, or to "
+            f"'', first"
+        )
 
 
 def main(args: list[str] | None = None) -> int:
