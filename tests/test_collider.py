@@ -165,8 +165,8 @@ def test_moving_probe_and_points_together_changes_nothing(collider, where, posit
     found, normal = signed_distance(collider, pose, moved)
     expected, direction = distance(collider, where)
     assert found[0] == pytest.approx(expected, abs=1e-12)
-    if abs(expected) < collider.offset_box[3]:
-        return  # within the core the last bit may decide between two nearest sides
+    if expected < -0.5 * collider.offset_box[3]:
+        return  # near the core the last bit may decide between two nearest sides
     np.testing.assert_allclose(normal[0], pose.rotation @ direction, atol=1e-6)
 
 
