@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pyigtl
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from igtl_peers import PlainServer, free_port, pyigtl_server, wait_until
 from pyigtl.messages import CRC64, MessageBase
 
@@ -204,6 +206,31 @@ def test_what_is_no_pose_is_said_and_survived(listen, plain, sent, kind, sentenc
     assert said == kind
     assert sentence in text
     assert heard.connections == 1
+
+
+def test_a_pose_that_is_sent_again_is_not_new(listen, plain):
+    heard = listen(plain.port)
+    connection = plain.accept()
+    for stamp in ((1, 0), (1, 0), (2, 0)):
+        connection.sendall(message("TRANSFORM", columns(MATRIX), stamp=stamp))
+    wait_until(lambda: len(heard.measurements) == 2)
+    assert [m.stamp for m in heard.measurements] == [10**9, 2 * 10**9]
+    assert [kind for kind, _ in heard.problems] == ["repeated"]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    data=st.binary(max_size=300),
+    kind=st.sampled_from(["TRANSFORM", "TDATA", "QTDATA", "POSITION"]),
+    version=st.sampled_from([1, 2, 3]),
+)
+def test_any_body_is_poses_or_a_sentence(data, kind, version):
+    header = header_of(message(kind, data, version=version)[: HEADER.size])
+    try:
+        poses = poses_in(header, data)
+    except TrackingError:
+        return
+    assert all(matrix.shape == (4, 4) for _, matrix in poses)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError
+from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import bgr_image_message, image_message
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
@@ -30,6 +31,8 @@ __all__ = ["CameraDriver", "main"]
 
 RETRY_S = 1.0
 """How long a camera that is not there is left alone."""
+PATIENCE_S = 1.0
+"""How long an image that is awaited may hold up the node's end."""
 CHECK_S, CHECKS = 0.05, 6
 """How often, and how often in a row, somebody must listen before a file begins.
 
@@ -44,9 +47,10 @@ class CameraDriver(Node):
     ``camera_info`` (the YAML file of `us-sim calibrate camera`; its size is asked of the camera),
     ``frame_id``, ``encoding`` (mono8 or bgr8), ``rate`` (images a second: asked of a camera, that
     of a file), ``loop`` (a file starts again at its end, else the node ends), ``latency`` (s from
-    the middle of the exposure to the image's arrival; the stamp is so much earlier).
+    the middle of the exposure to the image's arrival; the stamp is so much earlier),
+    ``await_topics`` and ``await_subscriber`` (see `Awaited`).
 
-    A file begins when somebody subscribes.
+    A file begins when somebody subscribes, and what is awaited is there.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -60,6 +64,7 @@ class CameraDriver(Node):
         latency = fixed_parameter(
             self, "latency", 0.0, "s from exposure to arrival", within=(-1.0, 10.0)
         )
+        self._awaited = Awaited(self)
         if encoding not in ("mono8", "bgr8"):
             raise TrackingError(f"encoding is '{encoding}'; it must be mono8 or bgr8")
         self._grey = encoding == "mono8"
@@ -91,8 +96,9 @@ class CameraDriver(Node):
     def destroy_node(self) -> None:
         """Let go of the camera."""
         self._closing.set()
-        self._thread.join()
-        self._video.close()
+        self._thread.join(PATIENCE_S)
+        if not self._thread.is_alive():  # a camera that hangs is left to the process's end
+            self._video.close()
         super().destroy_node()
 
     def _source(self) -> str:
@@ -139,7 +145,8 @@ class CameraDriver(Node):
         while checks < CHECKS:
             if self._closing.wait(CHECK_S):
                 return
-            checks = checks + 1 if self._images.get_subscription_count() else 0
+            there = self._images.get_subscription_count() and self._awaited.are_there()
+            checks = checks + 1 if there else 0
         begun, number = self.get_clock().now().nanoseconds, 0
         shown = True
         while not self._closing.is_set():

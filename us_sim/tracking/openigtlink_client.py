@@ -63,6 +63,7 @@ class OpenIGTLinkClient:
         self._place = f"{settings.host}:{settings.port}"
         self._names: dict[str, None] = {}
         self._heard = time.monotonic()
+        self._stamp = 0  # ns, of the newest pose handed on
         self._closing = threading.Event()
         self._socket: socket.socket | None = None
         self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
@@ -132,6 +133,11 @@ class OpenIGTLinkClient:
             except PoseError as error:
                 self._problem("pose", f"{self._place}: {name}: {error}; it is not used")
                 continue
+            if header.stamp and header.stamp == self._stamp:
+                # Some servers repeat the last pose of a body that they do not see.
+                self._problem("repeated", f"{self._place}: {name} is only a repeat; it is not used")
+                continue
+            self._stamp = header.stamp
             self._take(Measurement(header.stamp, pose))
 
     def _is_wanted(self, name: str) -> bool:

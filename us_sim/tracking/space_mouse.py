@@ -92,9 +92,9 @@ class SpaceMouse:
             self._device.open_path(found[0]["path"])
         except OSError as error:
             raise TrackingError(
-                f"{self.name} cannot be opened ({error}): give yourself access to its hidraw device "
-                f"(Linux: a udev rule for vendor {found[0]['vendor_id']:04x}), or end the program "
-                f"that uses it"
+                f"{self.name} cannot be opened ({error}): give yourself access to its hidraw "
+                f"device (Linux: a udev rule for vendor {found[0]['vendor_id']:04x}), or end the "
+                f"program that uses it"
             ) from error
         self._reports = SpaceMouseReports()
 
