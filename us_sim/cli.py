@@ -168,7 +168,12 @@ def _run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene, volume=args.volume)
     parameters = _parameters(args.param)
     if args.dry_run:
+        from us_sim.scene_files import check_files
+
+        checked = check_files(scene)
         print(dry_run(scene, parameters, record=args.record, path=args.path))
+        if checked:
+            print(f"readable  {', '.join(checked)}")
         return 0
     return run(
         scene,

@@ -24,7 +24,7 @@ from us_sim.errors import VolumeError
 from us_sim.volume.stored_size import check_stored_size
 from us_sim.volume.volume import Volume
 
-__all__ = ["read_volume"]
+__all__ = ["read_placement", "read_volume"]
 
 _METRES = 1e-3  # these formats hold millimetres
 
@@ -43,6 +43,29 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
             or has a spacing or direction that places no volume.
     """
     path = Path(path)
+    header, index_to_patient = _header(path)
+    try:
+        image = header.Execute()
+    except RuntimeError as error:
+        raise VolumeError(
+            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
+            f"this machine's memory; copy or export it again"
+        ) from error
+    stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
+    return Volume(_grey_values(path, stored), index_to_patient)
+
+
+def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Where a volume file's voxels are: (4, 4) from their indices to m, from its header alone.
+
+    Raises:
+        VolumeError: as `read_volume`, but for what only the voxels tell.
+    """
+    return _header(Path(path))[1]
+
+
+def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
+    """What is to be read, and its placement."""
     if not path.exists():
         raise VolumeError(f"{path}: there is no such file")
     if not path.is_file():
@@ -60,16 +83,7 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
         raise VolumeError(
             f"{path}: is a sequence of tracked frames, not a volume; reconstruct a volume from it"
         )
-    index_to_patient = _placement(path, header)
-    try:
-        image = header.Execute()
-    except RuntimeError as error:
-        raise VolumeError(
-            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
-            f"this machine's memory; copy or export it again"
-        ) from error
-    stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
-    return Volume(_grey_values(path, stored), index_to_patient)
+    return header, _placement(path, header)
 
 
 def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
