@@ -1,23 +1,17 @@
-"""What is asked of the slices, against what was seen in one run.
-
->>> from us_sim.evaluation.slice_targets import Target
->>> Target("an image", "at most 2 ms", "1.5 ms", True).cells
-('an image', 'at most 2 ms', '1.5 ms', 'yes')
-"""
+"""What is asked of the slices, against what was seen in one run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from us_sim.evaluation.slice_cases import MAIN
 from us_sim.evaluation.slice_points import Point
+from us_sim.evaluation.target import Target
 
 __all__ = [
     "LARGE_VOLUME",
-    "Target",
     "exponent",
     "main_points",
     "mesh_points",
@@ -28,21 +22,6 @@ __all__ = [
 _METHOD = "scan_conversion"
 #: Voxels a side, of the volume whose memory is asked for.
 LARGE_VOLUME = 512
-
-
-@dataclass(frozen=True)
-class Target:
-    """One line of the table."""
-
-    what: str
-    asked: str
-    seen: str
-    met: bool | None  # None where it was not measured
-
-    @property
-    def cells(self) -> tuple[str, str, str, str]:
-        """Of the table."""
-        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
 
 
 def main_points(points: Sequence[Point]) -> list[Point]:
