@@ -37,6 +37,7 @@ _DISTINCT = np.radians(1.0)
 _TRIED = 3  # markers from which a pose is guessed
 _REFINED = 3  # guesses that are refined
 _ITERATIONS = 25
+_DETERMINED = 1e-9  # least eigenvalue of the normal matrix with a unit diagonal
 _HUBER = 2.0  # standard deviations beyond which a corner pulls no harder
 
 
@@ -77,7 +78,7 @@ def body_poses(
 
     Returns:
         At most two, that of the least error first; none where no pose has all points before the
-        camera, or fewer than four have a line of sight.
+        camera, fewer than four have a line of sight, or these do not determine a pose.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     pixels = np.ascontiguousarray(pixels, dtype=np.float64)
@@ -157,7 +158,8 @@ def _refined(
     position: NDArray[np.float64],
     deviation: float,
 ) -> BodyPose | None:
-    """The pose of least misfit near a first one; None where that leads behind the camera."""
+    """The pose of least misfit near a first one; None where that leads behind the camera, or
+    the points leave a way to move open."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, position
     normal = np.empty((6, 6))
@@ -168,7 +170,12 @@ def _refined(
     squares = float((residuals**2).sum())
     freedom = max(1, residuals.size - 6)
     found = max(deviation, float(np.sqrt(min(squares, misfit * deviation**2) / freedom)))
-    covariance = np.linalg.pinv(normal, hermitian=True) * (found / deviation) ** 2
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
+    if not values[0] > _DETERMINED:
+        return None
+    half = scale[:, None] * vectors / np.sqrt(values)
+    covariance = half @ half.T * (found / deviation) ** 2
     return BodyPose(
         Pose.from_matrix(matrix),
         0.5 * (covariance + covariance.T),

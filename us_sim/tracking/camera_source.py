@@ -111,18 +111,24 @@ class CameraSource:
 
     def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
         """The body's markers, near where they were or else anywhere."""
-        least = self.settings.minimum_markers
         near = self._near(before) if before is not None else None
         if near is not None:
             detection = self._detector.detect(image, *near)
-            if len(detection.ids) >= least:
+            if self._is_enough(detection):
                 return detection
         if image.size >= 4 * _SEARCHED:
             reduction = int(math.sqrt(image.size / _SEARCHED))
             detection = self._detector.detect(image, reduction=reduction)
-            if len(detection.ids) >= least:
+            if self._is_enough(detection):
                 return detection
         return self._detector.detect(image)
+
+    def _is_enough(self, detection: Detection) -> bool:
+        """Whether there is no need to look further."""
+        return (
+            len(detection.ids) >= self.settings.minimum_markers
+            or len(detection.chessboard_ids) >= 4
+        )
 
     def _near(self, pose: Pose) -> tuple[tuple[int, int, int, int], int] | None:
         """The window around the body as it was, and by how much to reduce the image there."""
@@ -151,7 +157,7 @@ class CameraSource:
         refusal = ""
         # Each round leaves out what the pose of the round before shows to be unfit.
         while True:
-            markers = np.unique(owners)
+            markers = np.unique(owners[owners >= 0])
             if len(markers) < least and self.body.chessboard is None:
                 count = len(markers)
                 self.last_problem = refusal or (
@@ -169,8 +175,8 @@ class CameraSource:
             )
             if not found:
                 self.last_problem = (
-                    "the markers that are seen have no pose before the camera: check the camera "
-                    "info and the body's file"
+                    "what is seen of the body does not tell its pose: show more of it, and check "
+                    "the camera info and the body's file"
                 )
                 return None
             pose = self._chosen(found, before)
@@ -184,11 +190,12 @@ class CameraSource:
             points, pixels, owners = points[kept], pixels[kept], owners[kept]
             self.last_problem = refusal
         self._learn(found, pose)
-        self.seen = len(detection.ids) if self.body.chessboard is not None else len(markers)
+        board = self.body.chessboard is not None
+        self.seen = len(detection.ids) + len(detection.unclear) if board else len(markers)
         return pose
 
     def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
-        """Markers (rows of the body) that cannot be used in a pose, and why."""
+        """Owners of points that cannot be used in a pose, and why."""
         markers = np.unique(owners)
         angles = self._view_angles(pose.pose, markers)
         limit = self.settings.view_angle_limit
@@ -217,10 +224,13 @@ class CameraSource:
         )
 
     def _name(self, row: int) -> str:
-        return "the board" if self.body.chessboard is not None else f"marker {self.body.ids[row]}"
+        return "the chessboard" if row < 0 else f"marker {self.body.ids[row]}"
 
     def _view_angles(self, pose: Pose, markers: NDArray[np.int64]) -> NDArray[np.float64]:
-        """rad, of each marker's normal to the line from it to the camera."""
+        """rad, of each marker's normal to the line from it to the camera.
+
+        The chessboard (-1) counts as the last marker on it.
+        """
         normals = self.body.normals[markers] @ pose.rotation.T
         centres = pose.apply(self.body.centres[markers])
         cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)

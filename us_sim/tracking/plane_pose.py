@@ -20,6 +20,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.tracking.definite_system import solve_definite
+
 __all__ = ["plane_poses"]
 
 
@@ -45,6 +47,9 @@ def plane_poses(
     return [(turns[i], shifts[i]) for i in np.argsort(errors) if np.isfinite(errors[i])]
 
 
+# The kernels below need no linear algebra library, which would take long to compile.
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(points, rays, turns, shifts, errors):
     """Fill in both rotations, positions and errors, infinite of what is no pose; whether there
@@ -53,69 +58,130 @@ def _solve(points, rays, turns, shifts, errors):
     count = len(points)
     centre = np.zeros(3)
     for i in range(count):
-        centre += points[i] / count
-    arms = points - centre
-    axes = np.linalg.eigh(arms.T @ arms)[1].T.copy()
-    across, along = axes[1].copy(), axes[2].copy()
-    axes[0], axes[1] = along, across
-    axes[2, 0] = along[1] * across[2] - along[2] * across[1]
-    axes[2, 1] = along[2] * across[0] - along[0] * across[2]
-    axes[2, 2] = along[0] * across[1] - along[1] * across[0]
-    plane = arms @ axes[:2].T
-    homography = np.empty((3, 3))
+        for a in range(3):
+            centre[a] += points[i, a] / count
+    axes = np.empty((3, 3))
+    plane = np.empty((count, 2))
+    if not _plane(points, centre, axes, plane):
+        return False
+    homography = np.ones(9)
     if not _homography(plane, rays, homography):
         return False
-    if not _rotations(homography, turns):
+    columns = np.empty((2, 3, 3))
+    if not _rotations(homography, columns):
         return False
+    shift = np.empty(3)
+    place = np.empty(3)
     for k in range(2):
-        shift = _shift(plane @ turns[k, :, :2].copy().T, rays)
-        turns[k] = turns[k].copy() @ axes
-        shifts[k] = shift - turns[k] @ centre
-        errors[k] = 0.0
+        errors[k] = np.inf
+        if not _shift(plane, columns[k], rays, shift) or not shift[2] > 0:
+            continue
+        for a in range(3):
+            for b in range(3):
+                turns[k, a, b] = 0.0
+                for c in range(3):
+                    turns[k, a, b] += columns[k, a, c] * axes[c, b]
+        for a in range(3):
+            shifts[k, a] = shift[a]
+            for b in range(3):
+                shifts[k, a] -= turns[k, a, b] * centre[b]
+        error = 0.0
         for i in range(count):
-            before = turns[k] @ points[i] + shifts[k]
-            x, y = before[0] / before[2] - rays[i, 0], before[1] / before[2] - rays[i, 1]
-            errors[k] += x * x + y * y
-        if not (np.isfinite(errors[k]) and shift[2] > 0):
-            errors[k] = np.inf
+            for a in range(3):
+                place[a] = shifts[k, a]
+                for b in range(3):
+                    place[a] += turns[k, a, b] * points[i, b]
+            x, y = place[0] / place[2] - rays[i, 0], place[1] / place[2] - rays[i, 1]
+            error += x * x + y * y
+        if np.isfinite(error):
+            errors[k] = error
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cross(one, other, out):
+    out[0] = one[1] * other[2] - one[2] * other[1]
+    out[1] = one[2] * other[0] - one[0] * other[2]
+    out[2] = one[0] * other[1] - one[1] * other[0]
+    return np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _plane(points, centre, axes, plane):
+    """Fill in the plane's two axes and its normal (3, 3), and the points' coordinates (N, 2);
+    whether they span a plane.
+    """
+    longest = 0.0
+    for i in range(len(points)):
+        arm = points[i] - centre
+        length = np.sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
+        if length > longest:
+            longest = length
+            axes[0] = arm / length
+    largest = 0.0
+    normal = np.empty(3)
+    for i in range(len(points)):
+        area = _cross(axes[0], points[i] - centre, normal)
+        if area > largest:
+            largest = area
+            axes[2] = normal / area
+    if not largest > 1e-6 * longest:
+        return False
+    _cross(axes[2], axes[0], axes[1])
+    for i in range(len(points)):
+        for a in range(2):
+            plane[i, a] = 0.0
+            for b in range(3):
+                plane[i, a] += axes[a, b] * (points[i, b] - centre[b])
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _homography(plane, rays, homography):
-    """Fill in (3, 3) that takes the plane's coordinates (N, 2) to rays (N, 2), by least squares;
-    whether they determine it.
+    """Fill in (9,) that takes the plane's coordinates (N, 2) to rays (N, 2), by least squares,
+    with a last entry of 1; whether they determine it.
     """
-    size = np.abs(plane).max()
-    middle = np.array([rays[:, 0].mean(), rays[:, 1].mean()])
-    spread = np.abs(rays - middle).max()
+    count = len(plane)
+    size, spread = 0.0, 0.0
+    middle = np.zeros(2)
+    for i in range(count):
+        for side in range(2):
+            size = max(size, abs(plane[i, side]))
+            middle[side] += rays[i, side] / count
+    for i in range(count):
+        for side in range(2):
+            spread = max(spread, abs(rays[i, side] - middle[side]))
     if not (size > 0 and spread > 0):
         return False
-    squares = np.zeros((9, 9))
-    row = np.zeros(9)
-    for i in range(len(plane)):
-        u, v = plane[i] / size
+    squares = np.zeros((8, 8))
+    right = np.zeros(8)
+    row = np.empty(8)
+    for i in range(count):
+        u, v = plane[i, 0] / size, plane[i, 1] / size
         for side in range(2):
             value = (rays[i, side] - middle[side]) / spread
             row[:] = 0.0
             row[3 * side], row[3 * side + 1], row[3 * side + 2] = u, v, 1.0
-            row[6], row[7], row[8] = -value * u, -value * v, -value
-            squares += np.outer(row, row)
-    values, vectors = np.linalg.eigh(squares)
-    if values[1] < 1e-10 * values[8]:
+            row[6], row[7] = -value * u, -value * v
+            for a in range(8):
+                right[a] += row[a] * value
+                for b in range(8):
+                    squares[a, b] += row[a] * row[b]
+    trace = 0.0
+    for a in range(8):
+        trace += squares[a, a]
+    if not solve_definite(squares, right):
         return False
-    flat = vectors[:, 0]
-    for a in range(3):
-        for b in range(3):
-            scale = 1.0 if b == 2 else 1.0 / size
-            value = flat[3 * a + b]
-            if a < 2:
-                value = spread * value + middle[a] * flat[6 + b]
-            homography[a, b] = value * scale
-    last = homography[2, 2]
-    if abs(last) < 1e-12 * np.abs(homography).max():
-        return False
-    homography /= last
+    # What is left of the diagonal by Cholesky's factor tells whether the points are enough.
+    for a in range(8):
+        if not squares[a, a] * squares[a, a] > 1e-10 * trace:
+            return False
+    for b in range(3):
+        scale = 1.0 if b == 2 else 1.0 / size
+        last = 1.0 if b == 2 else right[6 + b]
+        for a in range(2):
+            homography[3 * a + b] = (spread * right[3 * a + b] + middle[a] * last) * scale
+        homography[6 + b] = last * scale
     return True
 
 
@@ -124,55 +190,73 @@ def _rotations(homography, turns):
     """Fill in both rotations of the plane by the homography's slope at the plane's middle
     (section 3); whether there are any.
     """
-    place = homography[:2, 2].copy()
-    slope = homography[:2, :2] - np.outer(place, homography[2, :2])
+    px, py = homography[2], homography[5]
     # The rotation that takes the optical axis to the ray of the plane's middle.
-    square = place @ place
-    length = np.sqrt(square)
+    square = px * px + py * py
     scale = np.sqrt(1.0 + square)
-    aim = np.eye(3)
-    if length > 1e-12:
-        turn = np.zeros((3, 3))
-        for a in range(2):
-            turn[a, 2] = place[a] / length
-            turn[2, a] = -place[a] / length
-        aim += (length / scale) * turn + (1 - 1 / scale) * (turn @ turn)
-    basis = aim[:2, :2] - np.outer(place, aim[2, :2])
-    corner = np.linalg.solve(basis, slope)
-    largest = np.linalg.svd(corner)[1][0]
-    if not largest > 0:
+    bend = 1.0 / (scale * (scale + 1.0))  # (1 - 1 / scale) / square
+    aim = np.empty((3, 3))
+    aim[0, 0], aim[0, 1], aim[0, 2] = 1.0 - bend * px * px, -bend * px * py, px / scale
+    aim[1, 0], aim[1, 1], aim[1, 2] = -bend * px * py, 1.0 - bend * py * py, py / scale
+    aim[2, 0], aim[2, 1], aim[2, 2] = -px / scale, -py / scale, 1.0 / scale
+    ba, bb = aim[0, 0] - px * aim[2, 0], aim[0, 1] - px * aim[2, 1]
+    bc, bd = aim[1, 0] - py * aim[2, 0], aim[1, 1] - py * aim[2, 1]
+    inverse = 1.0 / (ba * bd - bb * bc)
+    corner = np.empty((2, 2))
+    for k in range(2):
+        x = homography[k] - px * homography[6 + k]
+        y = homography[3 + k] - py * homography[6 + k]
+        corner[0, k] = (bd * x - bb * y) * inverse
+        corner[1, k] = (ba * y - bc * x) * inverse
+    total = (corner * corner).sum()
+    area = corner[0, 0] * corner[1, 1] - corner[0, 1] * corner[1, 0]
+    # The largest singular value, which is that of the plane's size over its distance.
+    largest = np.sqrt(0.5 * (total + np.sqrt(max(0.0, total * total - 4 * area * area))))
+    if not (largest > 0 and np.isfinite(largest)):
         return False
     corner /= largest
     first = np.sqrt(max(0.0, 1 - corner[0, 0] ** 2 - corner[1, 0] ** 2))
     second = np.sqrt(max(0.0, 1 - corner[0, 1] ** 2 - corner[1, 1] ** 2))
     if corner[0, 0] * corner[0, 1] + corner[1, 0] * corner[1, 1] > 0:
         second = -second
-    columns = np.empty((3, 2))
+    before = np.empty((2, 3))
     for k in range(2):
         sign = 1.0 - 2.0 * k
-        columns[:2] = corner
-        columns[2, 0], columns[2, 1] = sign * first, sign * second
+        for a in range(3):
+            before[0, a] = aim[a, 0] * corner[0, 0] + aim[a, 1] * corner[1, 0]
+            before[0, a] += aim[a, 2] * sign * first
+            before[1, a] = aim[a, 0] * corner[0, 1] + aim[a, 1] * corner[1, 1]
+            before[1, a] += aim[a, 2] * sign * second
         # Rounding leaves the columns a little off a rotation's.
-        left, _, right = np.linalg.svd(aim @ columns, False)
-        turned = left @ right
-        turns[k, :, :2] = turned
-        turns[k, 0, 2] = turned[1, 0] * turned[2, 1] - turned[2, 0] * turned[1, 1]
-        turns[k, 1, 2] = turned[2, 0] * turned[0, 1] - turned[0, 0] * turned[2, 1]
-        turns[k, 2, 2] = turned[0, 0] * turned[1, 1] - turned[1, 0] * turned[0, 1]
+        normal = np.empty(3)
+        across = np.empty(3)
+        long = np.sqrt((before[0] * before[0]).sum())
+        area = _cross(before[0], before[1], normal)
+        _cross(normal, before[0], across)
+        for a in range(3):
+            turns[k, a, 0] = before[0, a] / long
+            turns[k, a, 1] = across[a] / (area * long)
+            turns[k, a, 2] = normal[a] / area
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shift(turned, rays):
-    """(3,) m that brings points (N, 3), turned already, before their rays, by least squares."""
+def _shift(plane, turn, rays, shift):
+    """Fill in (3,) m that brings a turned plane's points before their rays, by least squares;
+    whether they determine it.
+    """
     squares = np.zeros((3, 3))
-    right = np.zeros(3)
-    row = np.zeros(3)
+    shift[:] = 0.0
+    row = np.empty(3)
     for i in range(len(rays)):
+        depth = turn[2, 0] * plane[i, 0] + turn[2, 1] * plane[i, 1]
         for side in range(2):
             row[:] = 0.0
             row[side], row[2] = 1.0, -rays[i, side]
-            wanted = rays[i, side] * turned[i, 2] - turned[i, side]
-            squares += np.outer(row, row)
-            right += wanted * row
-    return np.linalg.solve(squares, right)
+            aside = turn[side, 0] * plane[i, 0] + turn[side, 1] * plane[i, 1]
+            wanted = rays[i, side] * depth - aside
+            for a in range(3):
+                shift[a] += wanted * row[a]
+                for b in range(3):
+                    squares[a, b] += row[a] * row[b]
+    return solve_definite(squares, shift)
