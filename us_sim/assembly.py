@@ -44,6 +44,7 @@ __all__ = [
     "probe_of",
     "scanner_of",
     "tissue_model_of",
+    "tracker_poses_of",
     "tracking_of",
     "volume_of",
 ]
@@ -147,14 +148,23 @@ def tracking_of(scene: Scene) -> ProbeTracking:
 
         gate = OutlierGate(tracker.gate)
     return ProbeTracking(
-        _pose_or_file(tracker.registration),
-        _pose_or_file(tracker.calibration),
+        *tracker_poses_of(scene),
         make_filter(tracker.filter),
         gate,
         time_offset=tracker.time_offset,
         coast_for=tracker.coast_for,
         lost_after=tracker.lost_after,
     )
+
+
+def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
+    """Registration (the device in ``patient``) and calibration (the probe in the body).
+
+    Raises:
+        CalibrationError: a file of one of them cannot be used.
+    """
+    tracker = scene.tracker
+    return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
 
 
 def haptic_rendering_of(scene: Scene) -> HapticRendering:
@@ -169,9 +179,7 @@ def haptic_rendering_of(scene: Scene) -> HapticRendering:
 
     tracker = scene.tracker
     settings = tracker.haptic or HapticSettings()
-    device = HapticDevice(
-        settings, _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
-    )
+    device = HapticDevice(settings, *tracker_poses_of(scene))
     return HapticRendering(settings, device, time_offset=tracker.time_offset)
 
 

@@ -52,7 +52,17 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     demo = commands.add_parser("demo", help="press on the virtual arm; images, summary, recording")
-    demo.add_argument("scene", nargs="?", default="upper_arm", help="scene file or name")
+    demo.add_argument(
+        "scene",
+        nargs="?",
+        help="scene file or name; default: upper_arm, or upper_arm_camera with --source camera",
+    )
+    demo.add_argument(
+        "--source",
+        choices=("path", "camera"),
+        default="path",
+        help="poses as they were recorded, or tracked in a camera video that is rendered of them",
+    )
     demo.add_argument(
         "--out",
         type=Path,
@@ -152,7 +162,15 @@ def _live_options(parser: argparse.ArgumentParser) -> None:
 def _demo(args: argparse.Namespace) -> int:
     from us_sim.live import demo
 
-    return demo(args.scene, args.volume, args.out, _parameters(args.param), network=args.network)
+    camera = args.source == "camera"
+    return demo(
+        args.scene or ("upper_arm_camera" if camera else "upper_arm"),
+        args.volume,
+        args.out,
+        _parameters(args.param),
+        network=args.network,
+        camera=camera,
+    )
 
 
 def _run(args: argparse.Namespace) -> int:

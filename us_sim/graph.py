@@ -29,6 +29,7 @@ __all__ = [
     "keep_on_this_host",
     "player_settings",
     "simulation_nodes",
+    "video_settings",
 ]
 
 Parameters = dict[str, dict[str, str]]
@@ -105,6 +106,16 @@ def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, ob
         "path": str(path.expanduser().resolve()),
         "topic": (scene.tracker.body or "") if scene.tracker.source == "path" else "",
         "await_topics": ["tracker/pose", *awaited_topics(scene)],
+        "await_subscriber": "session_recorder" if recorded else "",
+    }
+
+
+def video_settings(scene: Scene, video: Path, info: Path, *, recorded: bool) -> dict[str, object]:
+    """Parameters of a ``camera_driver`` that begins when all of the scene's nodes are ready."""
+    return {
+        "source": str(video),
+        "camera_info": str(info),
+        "await_topics": ["camera/camera_info", *awaited_topics(scene)],
         "await_subscriber": "session_recorder" if recorded else "",
     }
 

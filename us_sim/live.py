@@ -7,6 +7,7 @@ import os
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from us_sim.assembly import volume_of
 from us_sim.errors import UsSimError, VolumeError
@@ -15,6 +16,9 @@ from us_sim.progress import Progress
 from us_sim.scene import Scene
 from us_sim.scene_file import load_scene
 from us_sim.supervision import Monitored, follow, plan_of
+
+if TYPE_CHECKING:
+    from us_sim.evaluation.camera_video import PathVideo
 
 __all__ = ["demo", "dry_run", "play", "prepare_volume", "run"]
 
@@ -61,9 +65,23 @@ def run(
 
 
 def demo(
-    name: str, volume: Path | None, out: Path, parameters: Parameters, *, network: bool
+    name: str,
+    volume: Path | None,
+    out: Path,
+    parameters: Parameters,
+    *,
+    network: bool,
+    camera: bool = False,
 ) -> int:
     """Replay the scene's path through its nodes; recording, contact sheet and summary in ``out``.
+
+    Args:
+        name: of the scene, or its file.
+        volume: in place of the scene's.
+        out: folder to write to.
+        parameters: given by a person, by node.
+        network: talk beyond this host.
+        camera: show the scene's camera a rendered video of the path.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or a node failed.
@@ -79,11 +97,13 @@ def demo(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    plan = plan_of(scene, parameters, record=recording, path=Path(scene.path))
+    video = _prepared_video(scene, Path(scene.path)) if camera else None
+    path = None if camera else Path(scene.path)
+    plan = plan_of(scene, parameters, record=recording, path=path, video=video)
     prepare_volume(scene)
     started = time.monotonic()
     startup = follow(plan, log=out / "nodes.log")
-    return _report(scene, out, recording, startup, time.monotonic() - started)
+    return _report(scene, out, recording, startup, time.monotonic() - started, video)
 
 
 def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:
@@ -142,6 +162,22 @@ def prepare_volume(scene: Scene) -> None:
             shown.__exit__(None, None, None)
 
 
+def _prepared_video(scene: Scene, file: Path) -> PathVideo:
+    """What the scene's camera sees of a path, rendered in view of the person who waits."""
+    from us_sim.evaluation.camera_video import path_video
+    from us_sim.recording.path import read_path
+
+    with contextlib.ExitStack() as stack:
+        bar: list[Progress] = []
+
+        def show(done: int, total: int) -> None:
+            if not bar:
+                bar.append(stack.enter_context(Progress("rendering the video", total, "images")))
+            bar[0].update(done)
+
+        return path_video(scene, read_path(file), show)
+
+
 def _require_a_cache() -> None:
     """Raise VolumeError when what is made would be lost, and made again by every node."""
     from us_sim.volume.phantom_cache import cache_folder
@@ -158,7 +194,14 @@ def _require_a_cache() -> None:
         ) from error
 
 
-def _report(scene: Scene, out: Path, recording: Path, startup: float, wall: float) -> int:
+def _report(
+    scene: Scene,
+    out: Path,
+    recording: Path,
+    startup: float,
+    wall: float,
+    video: PathVideo | None,
+) -> int:
     """Summary and contact sheet of what was recorded, and one paragraph for the person."""
     from us_sim.evaluation.contact_sheet import contact_sheet
     from us_sim.evaluation.session import read_session, write_summary
@@ -168,14 +211,23 @@ def _report(scene: Scene, out: Path, recording: Path, startup: float, wall: floa
         areas = session.lumen_areas(scene, 120, lambda done: bar.update(100 * done))
     summary = session.summary(areas)
     summary |= {"scene": scene.name, "startup_s": round(startup, 2), "wall_s": round(wall, 2)}
+    tracked = None
+    if video is not None:
+        from us_sim.evaluation.tracked_path import tracked_path
+
+        tracked = tracked_path(session, video)
+        summary["tracked_path"] = tracked.summary
     contact_sheet(session, scene, areas, out / "contact_sheet.png")
     write_summary(summary, out / "summary.json")
     latency = summary["latency_ms"]["end_to_end"]
     print(
-        f"{summary['poses_in']} poses in, {summary['images_out']} images out, "
+        f"{summary['poses_in']} {'poses' if video is None else 'camera images'} in, "
+        f"{summary['images_out']} images out, "
         f"{summary['dropped']} dropped, {summary['images_per_second']:.1f} images/s, "
         f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     )
+    if tracked is not None:
+        print(tracked)
     for vessel in areas.area if areas is not None else ():
         print(
             f"{vessel}: {summary['areas'][f'{vessel}_change_at_full_press']:+.0%} at full press, "

@@ -18,11 +18,13 @@ from us_sim.graph import (
     ProcessGroup,
     player_settings,
     simulation_nodes,
+    video_settings,
 )
 from us_sim.progress import Progress
 from us_sim.scene import Scene
 
 if TYPE_CHECKING:
+    from us_sim.evaluation.camera_video import PathVideo
     from us_sim.nodes.session_monitor import SessionMonitor
 
 __all__ = ["Monitored", "Plan", "follow", "plan_of", "refuse_unknown"]
@@ -42,8 +44,10 @@ class Plan:
 
     scene: Scene
     processes: list[NodeProcess]
-    poses: int | None  # in the path that is played
+    poses: int | None  # or images, in the path or video that is played
     duration: float | None  # s
+    player: str = "path_player"  # node that plays them
+    played: str = "tracker/pose"  # topic
 
     @property
     def nodes(self) -> list[str]:
@@ -57,16 +61,35 @@ def plan_of(
     record: Path | None,
     path: Path | None,
     duration: float | None = None,
+    video: PathVideo | None = None,
 ) -> Plan:
+    """What is started to run a scene.
+
+    Args:
+        scene: what is run.
+        parameters: given by a person, by node.
+        record: MCAP file to record to.
+        path: bag to play to the tracker.
+        duration: s, after which all ends.
+        video: to show the scene's camera in place of a path.
+    """
     parameters = dict(parameters)
     processes = []
     if record is not None:
         settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
+        if video is not None:
+            settings["exclude"] = ["/camera/image_raw"]  # the video is there already
         processes.append(
             NodeProcess("session_recorder", settings, parameters.pop("session_recorder", {}))
         )
     player = parameters.pop("path_player", {}) if path is not None else {}
+    driver = parameters.pop("camera_driver", {}) if video is not None else {}
     processes += simulation_nodes(scene, parameters, played=path is not None)
+    if video is not None:
+        settings = video_settings(scene, video.file, video.camera_info, recorded=record is not None)
+        processes.append(NodeProcess("camera_driver", settings, driver))
+        count = len(video.poses)
+        return Plan(scene, processes, count, duration, "camera_driver", "camera/image_raw")
     poses = None
     if path is not None:
         poses = len(path_of(scene, path, player.get("topic")))
@@ -192,7 +215,9 @@ def _stay(plan: Plan, group: ProcessGroup, monitor: Monitored) -> None:
     began = time.monotonic()
     ended: float | None = None
     total = plan.poses if plan.poses is not None else plan.duration
-    unit = "poses" if plan.poses is not None else "s"
+    unit = "s"
+    if plan.poses is not None:
+        unit = "poses" if plan.player == "path_player" else "images"
     with Progress("running", total, unit) as bar:
         while True:
             monitor.spin()
@@ -200,8 +225,8 @@ def _stay(plan: Plan, group: ProcessGroup, monitor: Monitored) -> None:
             if "rejected disk" in monitor.node.reports.get("session_recorder", {}):
                 raise UsSimError(monitor.node.messages["session_recorder"])
             now = time.monotonic()
-            done = monitor.node.count("path_player", "tracker/pose") if plan.poses else now - began
-            if plan.poses is not None and ended is None and not group.is_running("path_player"):
+            done = monitor.node.count(plan.player, plan.played) if plan.poses else now - began
+            if plan.poses is not None and ended is None and not group.is_running(plan.player):
                 ended = now
             if ended is not None:
                 done = total or done

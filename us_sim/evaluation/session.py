@@ -22,7 +22,9 @@ from us_sim.volume.measure import label_area
 __all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
 
 VESSELS = ("vein", "artery")
-STAMPED = ("/tracker/pose", "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
+PLAYED = ("/tracker/pose", "/camera/camera_info")
+"""What comes in, of a path and of a camera."""
+STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
 MILLISECOND = 1e6
 """In nanoseconds."""
@@ -140,7 +142,7 @@ class Session:
     def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
         """Everything as one JSON-like mapping; times in ms, areas in mm²."""
         stamps = self.images
-        poses = len(self.sent.get("/tracker/pose", []))
+        poses = max(len(self.sent.get(topic, [])) for topic in PLAYED)
         seconds = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 1 else 0.0
         latency = {
             topic: dict(zip(("p50", "p99"), self.latency(topic), strict=True))

@@ -45,14 +45,17 @@ _RATE = 30.0  # frames per second
 _SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s of the hand
 _EXPOSURE = 0.015  # s, in the condition with motion blur
 _HASTE = 3.0  # times the hand's speed in that condition
-_LENS = [-0.2, 0.06, 6e-4, -4e-4, 0.0]
+_LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
 
-#: Webcams of the same field of view, 56° across a picture of 4 by 3.
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+#: Webcams of the same field of view from top to bottom, 44°.
 CAMERAS = {
-    "640x480": CameraModel(640, 480, [[600, 0, 322.3], [0, 601, 238.1], [0, 0, 1]], _LENS),
-    "1920x1080": CameraModel(
-        1920, 1080, [[1350, 0, 965.2], [0, 1352, 536.7], [0, 0, 1]], [0.3 * k for k in _LENS]
-    ),
+    "640x480": CameraModel(640, 480, _pinhole(600.0, 601.0, 322.3, 238.1), _LENS),
+    "1920x1080": CameraModel(1920, 1080, _pinhole(1350.0, 1352.0, 965.2, 536.7), 0.3 * _LENS),
 }
 
 CONDITIONS = {

@@ -75,7 +75,7 @@ class CameraDriver(Node):
         self.finished = Future()
         self.health = Health(self, source)
         self._images = self._publisher(Image, "camera/image_raw")
-        self._infos = self._publisher(CameraInfo, "camera/camera_info")
+        self._descriptions = self._publisher(CameraInfo, "camera/camera_info")
         if self._camera is None:
             self.get_logger().warning(
                 "images without a calibration: no pose can be measured in them; make one with "
@@ -210,7 +210,7 @@ class CameraDriver(Node):
                 f"{camera.width} × {camera.height}: calibrate it at the size it is used at",
             )
         make = image_message if self._grey else bgr_image_message
-        self._infos.publish(_info(camera, (columns, rows), stamp, self._frame))
+        self._descriptions.publish(_info(camera, (columns, rows), stamp, self._frame))
         self._images.publish(make(pixels, stamp, self._frame))
         self.health.published("camera/image_raw", stamp)
 

@@ -14,6 +14,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
+from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
@@ -47,12 +48,7 @@ class PathPlayer(Node):
         self._loop = fixed_parameter(self, "loop", False, "start again at the end")
         self._restamp = fixed_parameter(self, "restamp", True, "stamp poses when they are sent")
         self._lockstep = fixed_parameter(self, "lockstep", False, "wait for each pose's image")
-        self._awaited = fixed_parameter(
-            self, "await_topics", [""], "begin when these are published"
-        )
-        self._subscriber = fixed_parameter(
-            self, "await_subscriber", "", "and this node subscribes to them"
-        )
+        self._awaited = Awaited(self)
         if not path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
         self._path = read_path(path, topic or None)
@@ -83,7 +79,7 @@ class PathPlayer(Node):
 
         A best-effort subscriber may find this publisher a little later than it is found itself.
         """
-        there = self._poses.get_subscription_count() and all(map(self._is_there, self._awaited))
+        there = self._poses.get_subscription_count() and self._awaited.are_there()
         self._checks = self._checks + 1 if there else 0
         if self._checks < CHECKS:
             return
@@ -98,14 +94,6 @@ class PathPlayer(Node):
         period = float(np.median(steps)) * 1e-9 / self._rate if len(steps) else 0.01
         self._half_period = 0.5e9 * period
         self.create_timer(max(period, 1e-4), self._tick)
-
-    def _is_there(self, topic: str) -> bool:
-        if not topic:
-            return True
-        if not self.count_publishers(topic):
-            return False
-        listeners = self.get_subscriptions_info_by_topic(self.resolve_topic_name(topic))
-        return not self._subscriber or self._subscriber in {info.node_name for info in listeners}
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
