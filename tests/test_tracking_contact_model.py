@@ -12,6 +12,7 @@ from us_sim.tissue.solver import create_solver
 from us_sim.tracking import se3
 from us_sim.tracking.contact_model import ContactModel, SecantStiffness
 
+SPRING = 350.0  # N/m
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -33,16 +34,16 @@ def moved(start, twist):
 
 @pytest.mark.parametrize("depth", [0.0, 0.002, 0.005, 0.02])
 def test_a_wall_gives_stiffness_times_depth_and_its_energy(depth):
-    spring, known = 350.0, 0.008
+    known = 0.008
     wall = ContactModel(
         0,
         Pose([0.01, 0.0, known]),
-        np.array([0.0, 0.0, -spring * known, 0.0, 0.0, 0.0]),
-        np.diag([0.0, 0.0, spring, 0.0, 0.0, 0.0]),
+        np.array([0.0, 0.0, -SPRING * known, 0.0, 0.0, 0.0]),
+        np.diag([0.0, 0.0, SPRING, 0.0, 0.0, 0.0]),
     )
     pressed = Pose([0.0, 0.03, depth])
-    np.testing.assert_allclose(wall.wrench_at(pressed)[2], -spring * depth, atol=1e-12)
-    assert wall.energy_at(pressed) == pytest.approx(0.5 * spring * depth**2, abs=1e-15)
+    np.testing.assert_allclose(wall.wrench_at(pressed)[2], -SPRING * depth, atol=1e-12)
+    assert wall.energy_at(pressed) == pytest.approx(0.5 * SPRING * depth**2, abs=1e-15)
     lifted = Pose([0.0, 0.03, -depth])
     np.testing.assert_allclose(wall.wrench_at(lifted), 0.0, atol=1e-12)
 
@@ -54,12 +55,12 @@ def test_at_its_pose_it_is_the_wrench_and_near_it_falls_by_the_stiffness(seed):
     model = random_model(random)
     np.testing.assert_allclose(model.wrench_at(model.pose), model.wrench, atol=1e-12)
     energy, slope = model._slope(np.zeros(6))
-    step = 1e-7 * random.normal(size=6)
+    step = 1e-9 * random.normal(size=6)
     lacking = model._split[4] + np.outer(model._split[2], model._split[2]) / float(
         model._split[0] @ model._split[2][:3]
     )
     change = model._slope(step)[1] - slope
-    np.testing.assert_allclose(change, -lacking @ step, atol=1e-9)
+    np.testing.assert_allclose(change, -lacking @ step, atol=1e-11)
     assert energy >= 0.0
 
 
@@ -70,9 +71,9 @@ def test_the_wrench_is_what_works_against_the_energy(seed):
     random = np.random.default_rng(seed)
     model = random_model(random)
     here = moved(model.pose, random.normal(size=6) * [0.01, 0.01, 0.01, 0.4, 0.4, 0.4])
-    step = 1e-6 * random.normal(size=6)
+    step = 1e-7 * random.normal(size=6)
     gained = model.energy_at(moved(here, step)) - model.energy_at(moved(here, -step))
-    assert model.wrench_at(here) @ (2 * step) == pytest.approx(-gained, rel=1e-4, abs=1e-9)
+    assert model.wrench_at(here) @ (2 * step) == pytest.approx(-gained, rel=1e-3, abs=1e-11)
 
 
 @given(SEEDS)
@@ -84,6 +85,23 @@ def test_where_the_push_has_ended_there_is_nothing(seed):
     if model._split[1] - model._split[2] @ twist <= 0.0:
         np.testing.assert_array_equal(model.wrench_at(away), 0.0)
         assert model.energy_at(away) == 0.0
+
+
+@given(SEEDS)
+@settings(max_examples=50, deadline=None)
+def test_a_light_touch_ends_without_a_kick(seed):
+    """Wherever the probe goes, the force along the push stays within a few times what it was."""
+    random = np.random.default_rng(seed)
+    model = random_model(random)
+    light = ContactModel(0, model.pose, 0.01 * model.wrench, model.stiffness)
+    size = np.linalg.norm(light.wrench[:3])
+    spring = float(light._split[2][:3] @ light.push)
+    for _ in range(50):
+        here = moved(light.pose, random.uniform(-1, 1, 6) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
+        deeper = max(0.0, -float(light._split[2] @ light.displacement(here)))
+        along = float(light.wrench_at(here)[:3] @ light.push)
+        assert abs(along) <= (2.5 * size + deeper) * (1 + 1e-9)
+    assert spring > 0.0
 
 
 def test_without_contact_nothing_is_felt_anywhere():
@@ -109,28 +127,24 @@ def test_a_model_that_cannot_be_is_refused(wrench, stiffness, sentence):
         ContactModel(0, Pose(), wrench, stiffness)
 
 
-@given(SEEDS)
-@settings(max_examples=20, deadline=None)
-def test_secants_find_the_stiffness_of_a_linear_contact(seed):
-    """Six motions that are not in one plane tell a symmetric stiffness."""
-    random = np.random.default_rng(seed)
-    stiffness = random.normal(size=(6, 6)) * [1, 1, 1, 0.03, 0.03, 0.03]
-    stiffness = 100 * (stiffness.T @ stiffness)
-    scale = np.array([1, 1, 1, 0.03, 0.03, 0.03])
-    first = np.array([0.0, 0.0, -5.0, 0.0, 0.0, 0.0])
-    secant = SecantStiffness()
-    np.testing.assert_array_equal(secant.mended(Pose(), first, None), 0.0)
-    for _ in range(10):
-        for axis in np.eye(6):
-            step = 2e-3 * axis / scale
-            secant.mended(moved(Pose(), step), first - stiffness @ step, None)
-            found = secant.mended(Pose(), first, None)
-    np.testing.assert_allclose(
-        found / np.outer(scale, scale), stiffness / np.outer(scale, scale), atol=0.1
-    )
+def test_a_secant_is_the_springs_along_the_push():
+    secant, push = SecantStiffness(), np.array([0.6, 0.0, -0.8])
+
+    def at(depth, aside):
+        wrench = np.concatenate([SPRING * depth * push, np.zeros(3)])
+        return secant.at(Pose(-depth * push + aside * np.array([0.8, 0.0, 0.6])), wrench)
+
+    np.testing.assert_array_equal(at(0.004, 0.0), 0.0)
+    np.testing.assert_array_equal(at(0.0041, 0.02), 0.0)  # too near to tell
+    for depth in (0.005, 0.0075, 0.003):
+        expected = np.zeros((6, 6))
+        expected[:3, :3] = SPRING * np.outer(push, push)
+        np.testing.assert_allclose(at(depth, 0.01 * depth), expected, atol=1e-9)
+    secant.at(Pose(), np.zeros(6))  # lifted, and all is forgotten
+    np.testing.assert_array_equal(at(0.001, 0.0), 0.0)
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("fem_cg", 0.25), ("msds_implicit", 0.35)])
+@pytest.mark.parametrize(("name", "tolerance"), [("fem_cg", 0.1), ("msds_implicit", 0.2)])
 def test_secants_come_near_the_tangent_of_solvers_that_know_none(name, tolerance):
     """Of the push when pressed deeper, against a difference of the settled wrenches."""
     solver, secant = create_solver(name, block()), SecantStiffness()
@@ -141,9 +155,14 @@ def test_secants_come_near_the_tangent_of_solvers_that_know_none(name, tolerance
         return np.concatenate([deformation.force, deformation.torque])
 
     for depth in np.arange(0.0, 0.0101, 0.001):
-        found = secant.mended(Pose([0.0, 0.0, depth]), settled(depth, 20), None)
+        found = secant.at(Pose([0.0, 0.0, depth]), settled(depth, 20))
     measured = (settled(0.0095, 60) - settled(0.0105, 60))[2] / 0.001
     assert measured > 200  # N/m
     assert found[2, 2] == pytest.approx(measured, rel=tolerance)
-    secant.mended(Pose([0.0, 0.0, -0.01]), np.zeros(6), None)  # lifted, and all is forgotten
-    np.testing.assert_array_equal(secant.mended(Pose(), np.ones(6), None), 0.0)
+
+
+def test_a_solver_that_swings_makes_no_absurd_stiffness():
+    random, secant = np.random.default_rng(0), SecantStiffness()
+    for k in range(200):
+        found = secant.at(Pose([0.0, 0.0, 6e-4 * k]), 50.0 * random.normal(size=6))
+        assert 0.0 <= np.trace(found) <= 3e3 * (1 + 1e-9)

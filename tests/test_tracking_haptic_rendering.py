@@ -39,7 +39,9 @@ class Tissue:
         deformation = self._solver.deform(pose)
         turn = pose.rotation
         wrench = np.concatenate([turn @ deformation.force, turn @ deformation.torque])
-        stiffness = self._secant.mended(pose, wrench, self._solver.contact_stiffness())
+        stiffness = self._solver.contact_stiffness()
+        if stiffness is None:
+            stiffness = self._secant.at(pose, wrench)
         return ContactModel(stamp, pose, wrench, stiffness)
 
 

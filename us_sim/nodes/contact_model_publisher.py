@@ -9,6 +9,7 @@ from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.time import Time
 from std_msgs.msg import Float64MultiArray
 
+from us_sim.errors import TrackingError
 from us_sim.nodes.conversions import contact_model_message
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.pose import Pose
@@ -46,7 +47,13 @@ class ContactModelPublisher:
             stiffness = tissue.contact_stiffness()
         except np.linalg.LinAlgError:
             stiffness = None
-        stiffness = self._secant.mended(pose, wrench, stiffness)
-        model = ContactModel(Time.from_msg(stamp).nanoseconds, pose, wrench, stiffness)
+        try:
+            if stiffness is None:
+                stiffness = self._secant.at(pose, wrench)
+            model = ContactModel(Time.from_msg(stamp).nanoseconds, pose, wrench, stiffness)
+        except TrackingError as error:
+            self._secant.forget()
+            self._node.health.problem("contact_model", f"{error}; it is not published")
+            return
         self._publisher.publish(contact_model_message(model))
         self._node.health.published("tissue/contact_model")

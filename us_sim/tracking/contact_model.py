@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -33,14 +34,14 @@ _HEAVIEST, _STIFFEST = 1e5, 1e9
 _FADING = 0.5
 """Part of the push at the model's pose below which all but the push along it fades."""
 
-_LEVER = 0.03
-"""m: a turn by an angle counts as a way of this much times it."""
-
 _FARTHEST = 0.03
 """m: with less stiffness than makes the push end on this way, it ends there all the same."""
 
+_STIFFEST_SECANT = 3e3
+"""N/m: a solver that swings may seem to be stiffer than tissue can be."""
+
 _NEAR = 5e-4
-"""m: two poses this near tell nothing of the stiffness between them."""
+"""m along the push: two poses nearer tell nothing of the stiffness between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +50,9 @@ class ContactModel:
 
     With d the displacement of the probe's origin and its rotation vector about the axes of
     ``patient``, the energy is ``-wrench · d + d · stiffness d / 2``. The part of it along the push
-    is that of a spring, which ends where it would pull; the rest fades with the push, so that
-    nothing is left without it. The wrench is the slope of this one energy: over a closed path
-    no work is done.
+    is that of a spring, which ends where it would pull. The rest is bounded by what the spring
+    stored, and fades with the push, so that nothing is left without it. The wrench is the slope of
+    this one energy: over a closed path no work is done.
 
     Raises:
         TrackingError: a number is not finite or absurd, a shape is wrong, or the stiffness is not
@@ -141,9 +142,13 @@ class ContactModel:
             return 0.0, np.zeros(6)
         share, share_slope = _share(push / force)
         pulled = wrench - stiffness @ d
-        rest = -0.5 * float((wrench + pulled) @ d)
+        # Never more than the spring along the push stored, or light contact would end with a kick.
+        most = 0.5 * force * force / spring
+        part = math.tanh(-0.5 * float((wrench + pulled) @ d) / most)
+        rest = most * part
         energy = 0.5 * push * push / spring + share * rest
-        answer = push / spring * slope + share * pulled + (share_slope / force * rest) * slope
+        answer = (push / spring + share_slope / force * rest) * slope
+        answer += share * (1.0 - part * part) * pulled
         return energy, answer
 
 
@@ -156,48 +161,42 @@ def _share(push: float) -> tuple[float, float]:
 
 
 class SecantStiffness:
-    """Mends a stiffness by how the wrench really changed between the poses that came by.
+    """The stiffness along the push, from how that changed between poses that came by.
 
-    The change that makes it right along the last motion and is least beside that (the symmetric
-    Broyden update of M. J. D. Powell, A new algorithm for unconstrained optimization, 1970). So a
-    solver that knows no stiffness gets one, and one that knows it nearly gets it better.
+    For solvers that know none of their own. What stiffness there is across the push, or against
+    turns, cannot be told from a few poses: so none is claimed.
     """
 
     def __init__(self) -> None:
-        self._scale = np.array([1.0, 1.0, 1.0, _LEVER, _LEVER, _LEVER])
         self.forget()
 
     def forget(self) -> None:
         """Begin anew, as after the contact was lost."""
-        self._mend = np.zeros((6, 6))
-        self._last: ContactModel | None = None
+        self._spring = 0.0  # N/m
+        self._last: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
-    def mended(
-        self, pose: Pose, wrench: NDArray[np.float64], stiffness: NDArray[np.float64] | None
-    ) -> NDArray[np.float64]:
-        """The stiffness (6, 6) at a pose of the probe.
+    def at(self, pose: Pose, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The stiffness (6, 6) at the next pose of the probe.
 
         Args:
             pose: in ``patient``.
             wrench: (6,) N, N m, on the probe, about its origin, axes of ``patient``.
-            stiffness: (6, 6), what the solver says; None where it says nothing.
         """
-        if not wrench.any():
+        stiffness = np.zeros((6, 6))
+        force = wrench[:3]
+        size = float(np.linalg.norm(force))
+        if size == 0.0:
             self.forget()
-            return np.zeros((6, 6))
-        known = np.zeros((6, 6)) if stiffness is None else stiffness
-        here = ContactModel(0, pose, wrench, known)
-        if self._last is not None:
-            step = self._last.displacement(pose) * self._scale
-            length = float(step @ step)
-            if length >= _NEAR * _NEAR:
-                mean = 0.5 * (known + self._last.stiffness) / np.outer(self._scale, self._scale)
-                change = (self._last.wrench - wrench) / self._scale
-                missing = change - (mean + self._mend) @ step
-                self._mend += (np.outer(missing, step) + np.outer(step, missing)) / length
-                self._mend -= (missing @ step) * np.outer(step, step) / length**2
-                self._last = here
+            return stiffness
+        push = force / size
+        if self._last is None:
+            self._last = pose.position, force
         else:
-            self._last = here
-        mended: NDArray[np.float64] = known + self._mend * np.outer(self._scale, self._scale)
-        return mended
+            way = float((pose.position - self._last[0]) @ push)
+            if abs(way) >= _NEAR:
+                spring = -float((force - self._last[1]) @ push) / way
+                spring = min(max(spring, 0.0), _STIFFEST_SECANT)
+                self._spring = 0.5 * (self._spring or spring) + 0.5 * spring
+                self._last = pose.position, force
+        stiffness[:3, :3] = self._spring * np.outer(push, push)
+        return stiffness
