@@ -32,7 +32,7 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
     rows.append(
         ("runs", "path_player", f"plays {path}")
         if path
-        else ("left out", "path_player", "no --path: poses come from outside on tracker/pose")
+        else ("left out", "path_player", f"no --path: poses come from `{scene.tracker.source}`")
     )
     rows.append(
         ("runs", "session_recorder", f"records to {record}")
@@ -41,7 +41,10 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
     )
     lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume_name}"]
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
-    lines.append("on demand wrench, tf, markers: nothing is computed for a topic nobody subscribes")
+    lines.append(
+        "on demand wrench, tf, markers, annotated image: nothing is computed for a topic nobody "
+        "subscribes"
+    )
     return "\n".join(lines)
 
 
