@@ -20,7 +20,11 @@ def test_the_script_makes_an_image():
     assert names["deformation"].force[2] < 0
 
 
-VERBS = ("demo", "run", "render", "play", "bag", "info", "evaluate", "tissue", "stability")
+VERBS = (
+    *("demo", "run", "render", "play", "bag", "info"),
+    *("evaluate", "tissue", "stability", "slice", "tracking"),
+    *("calibrate", "camera", "pivot", "landmarks", "probe", "time", "print-marker"),
+)
 
 COMMANDS = sorted(
     {
