@@ -127,7 +127,8 @@ class CameraDriver(Node):
             if self._video.open():
                 while not self._closing.is_set():
                     age = self._video.grab()
-                    if age is None or not self._keep(age):
+                    now = self.get_clock().now().nanoseconds
+                    if age is None or not self._keep(now - round(1e9 * age)):
                         break
             self._video.close()
             if not self._closing.is_set():
@@ -154,7 +155,8 @@ class CameraDriver(Node):
             now = self.get_clock().now().nanoseconds
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
-            if self._video.grab() is None or not (shown := self._keep(0.0)):
+            # It was exposed when it was due, however long it takes to decode.
+            if self._video.grab() is None or not (shown := self._keep(due)):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break
@@ -164,9 +166,13 @@ class CameraDriver(Node):
         self._ended = True
         self._guard.trigger()
 
-    def _keep(self, age: float) -> bool:
-        """Decode what was grabbed just now, for the node's thread to publish."""
-        stamp = self.get_clock().now().nanoseconds - round(1e9 * age) - self._latency
+    def _keep(self, taken: int) -> bool:
+        """Decode what was grabbed just now, for the node's thread to publish.
+
+        Args:
+            taken: ns, when it came from the camera.
+        """
+        stamp = taken - self._latency
         pixels = self._video.pixels(grey=self._grey)
         if pixels is None:
             return False

@@ -14,6 +14,7 @@ from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compres
 from us_sim.nodes.newest import Newest
 from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.camera_source import CameraSource
+from us_sim.tracking.camera_warm_up import practice
 
 if TYPE_CHECKING:
     from us_sim.nodes.probe_tracker import ProbeTracker
@@ -28,6 +29,7 @@ class CameraInput:
         self._node = node
         self._settings = node.scene.tracker.camera or CameraSettings()
         self._body = camera_body_of(node.scene)
+        practice(self._body)
         self._source: CameraSource | None = None
         self._described: CameraInfo | None = None
         node.listen(CameraInfo, "camera/camera_info", self._describe, node.of_device)
