@@ -133,6 +133,20 @@ def test_poses_that_stay_away_make_it_zero(bench, arm):
     bench.spin_until(lambda: "no pose of the handle for" in node.health.state)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_rendering_that_fails_leaves_a_zero_behind_and_says_so(bench, arm, monkeypatch):
+    node, wrenches, handle = arm
+    handle.press(0.005)
+    bench.spin_until(lambda: felt(wrenches) < -0.99)
+
+    def fail(_):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(node._rendering, "render", fail)
+    bench.spin_until(lambda: felt(wrenches) == 0.0)
+    bench.spin_until(lambda: node.health.state == "zero: the rendering has failed")
+
+
 def test_from_the_tissue_to_the_hand(bench, scene):
     """Without friction and registration the hand feels the solver's own wrench."""
     bench.make(TissueDeformer, scene=str(scene))

@@ -105,9 +105,12 @@ class HapticRenderer(SceneNode):
         """One tick, in the thread of its own."""
         if not self._is_taken:
             self._rendering.distrust("nobody takes the wrench")
-        wrench = self._rendering.render(now)
-        if self._is_taken:
-            self._publish(wrench)
+        wrench = np.zeros(6)
+        try:
+            wrench = self._rendering.render(now)
+        finally:  # also should it fail: the arm must not keep what it was told last
+            if self._is_taken:
+                self._publish(wrench)
 
     def _publish(self, wrench: NDArray[np.float64]) -> None:
         newest = self._rendering.stamp
@@ -129,6 +132,9 @@ class HapticRenderer(SceneNode):
             self.health.problem("doubt", f"nothing is felt: {self._rendering.stopped}")
         self._stops = stops
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
+        if self._thread.has_failed:
+            self.health.state = "zero: the rendering has failed"
+            self.health.problem("failure", "the rendering has failed: start the node again")
         self.health.values = {
             "stops": str(stops),
             "stopped": self._rendering.stopped,

@@ -47,6 +47,11 @@ class PeriodicThread:
             self._thread.join()
 
     @property
+    def has_failed(self) -> bool:
+        """Whether ``work`` has raised, which ends the thread."""
+        return bool(self._thread.ident) and not (self._thread.is_alive() or self._ending.is_set())
+
+    @property
     def jitter(self) -> float:
         """s, by which 99 of 100 of the last ticks' work was done later than the period after the
         one before, or earlier, at most."""
