@@ -7,15 +7,13 @@ Bodies of markers are rendered as a camera sees them at known poses
 
 from __future__ import annotations
 
-import csv
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
-from us_sim.errors import UsSimError
+from us_sim.evaluation.report_folder import prepare_folder, write_rows
 from us_sim.evaluation.tracking_cases import RIGID_BODY, SINGLE, Case, cases
 from us_sim.evaluation.tracking_filters import COLUMNS as FILTER_COLUMNS
-from us_sim.evaluation.tracking_filters import FilterPoint, filter_points
+from us_sim.evaluation.tracking_filters import filter_points
 from us_sim.evaluation.tracking_pictures import draw_views
 from us_sim.evaluation.tracking_points import COLUMNS, Bench, Point
 from us_sim.evaluation.tracking_report import table, write_report
@@ -41,10 +39,10 @@ def evaluate_tracking(out: Path, quick: bool) -> int:
         0, or 1 when a case failed; its row says how, and the others are there.
 
     Raises:
-        UsSimError: the folder cannot be written.
+        UsSimError: the folder cannot be written, or holds a report.
     """
     begin = time.perf_counter()
-    _prepare(out)
+    prepare_folder(out, "tracking.md")
     planned = cases(quick)
     bench = Bench()
     points: list[Point] = []
@@ -57,8 +55,8 @@ def evaluate_tracking(out: Path, quick: bool) -> int:
     with Progress("filters", 1, "path") as progress:
         filters = filter_points(quick)
         progress.update(1)
-    _write(out / "tracking.csv", COLUMNS, points)
-    _write(out / "filters.csv", FILTER_COLUMNS, filters)
+    write_rows(out / "tracking.csv", COLUMNS, [point.row for point in points])
+    write_rows(out / "filters.csv", FILTER_COLUMNS, [point.row for point in filters])
     views = out / "tracking_views.png"
     draw_views(views)
     seconds = time.perf_counter() - begin
@@ -81,27 +79,3 @@ def _point(bench: Bench, case: Case, quick: bool) -> Point:
     except Exception as error:
         words = f"{type(error).__name__}: {error}".replace("\n", " ")
         return Point(case, failure=words)
-
-
-def _write(
-    file: Path, columns: Sequence[str], points: Sequence[Point] | Sequence[FilterPoint]
-) -> None:
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(point.row for point in points)
-
-
-def _prepare(out: Path) -> None:
-    """Make sure of the folder before the long run.
-
-    Raises:
-        UsSimError: it cannot be written.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "tracking.csv").open("a", encoding="utf-8").close()
-    except OSError as error:
-        raise UsSimError(
-            f"--out {out}: cannot be written ({error.strerror or error}); name another folder"
-        ) from error

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,12 +23,13 @@ from us_sim.evaluation.tracking_cases import CAMERAS, CONDITIONS, MARKERS, Case,
 from us_sim.pose import Pose
 from us_sim.tracking.body_pose import body_poses, rotation_angle
 from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.camera_source import CameraSource
 from us_sim.tracking.fiducial_detector import FiducialDetector
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.se3 import rotation_between
 
-__all__ = ["COLUMNS", "Bench", "Point", "View", "mirrored"]
+__all__ = ["COLUMNS", "Bench", "Point", "View", "mirrored", "visible"]
 
 COLUMNS = (
     *("marker", "image_size", "distance_m", "angle_deg", "condition", "views", "detected"),
@@ -53,6 +54,7 @@ class View:
     mm: float = np.nan  # of the body's middle
     degrees: float = np.nan
     used: int = 0  # markers
+    visible: int = 0  # markers that the camera sees at less than the usual limit of the angle
     expected_mm: float = np.nan  # by the covariance, of the body's origin
     square: float = np.nan  # of the error in its own standard deviations (Mahalanobis)
 
@@ -182,11 +184,21 @@ def _view(
     begin, processor = time.perf_counter(), time.thread_time()
     measured = source.measure(image, round(frame * 1e9 / 30))
     processor, wall = time.thread_time() - processor, time.perf_counter() - begin
-    view = View(frame == 0, 1e3 * wall, 1e3 * processor)
-    return view if measured is None else _compared(view, measured, source.seen, seen, true)
+    view = View(frame == 0, 1e3 * wall, 1e3 * processor, visible=visible(seen, true))
+    if measured is None:
+        return view
+    return replace(_compared(view, measured, seen, true), used=source.seen)
 
 
-def _compared(view: View, measured: Measurement, used: int, seen: Marker, true: Pose) -> View:
+def visible(seen: Marker, pose: Pose) -> int:
+    """How many markers of a body face the camera, by less than its usual limit of the angle."""
+    centres = pose.apply(seen.body.centres)
+    cosines = -((seen.body.normals @ pose.rotation.T) * centres).sum(axis=1)
+    cosines /= np.linalg.norm(centres, axis=1)
+    return int((cosines > np.cos(CameraSettings().view_angle_limit)).sum())
+
+
+def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> View:
     found = measured.pose
     middle = seen.body.centres.mean(axis=0)
     off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
@@ -198,15 +210,12 @@ def _compared(view: View, measured: Measurement, used: int, seen: Marker, true: 
     square = np.nan
     if measured.covariance is not None:
         square = float(error @ np.linalg.pinv(measured.covariance, hermitian=True) @ error)
-    return View(
-        view.first,
-        view.ms,
-        view.cpu_ms,
+    return replace(
+        view,
         detected=True,
         flipped=bool(other < angle and angle > np.radians(_FLIP)),
         mm=1e3 * float(np.linalg.norm(off)),
         degrees=float(np.degrees(angle)),
-        used=used,
         expected_mm=1e3 * (measured.position_deviation or np.nan),
         square=square,
     )

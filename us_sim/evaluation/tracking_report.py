@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
-from os import cpu_count
 from pathlib import Path
 
 import numpy as np
 
+from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.tracking_cases import CONDITIONS, FRAMES, MARKERS, marker
 from us_sim.evaluation.tracking_filters import FilterPoint
 from us_sim.evaluation.tracking_plots import (
@@ -26,7 +25,9 @@ __all__ = ["table", "write_report"]
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: every measure that is asked for, and what was seen."""
-    return _table(("", "asked", "seen", "met"), [target.cells for target in targets(points)])
+    return markdown_table(
+        ("", "asked", "seen", "met"), [target.cells for target in targets(points)]
+    )
 
 
 def write_report(
@@ -66,8 +67,8 @@ def _text(
     parts = [
         "# Tracking: error against run time",
         f"`us-sim evaluate tracking{' --quick' if quick else ''}`, {seconds:.0f} s, on "
-        f"{_machine()}. Every row is in [tracking.csv](tracking.csv) and "
-        "[filters.csv](filters.csv).",
+        f"{machine('numpy', 'numba', 'opencv-python-headless', 'opencv-python')}. Every row is in "
+        "[tracking.csv](tracking.csv) and [filters.csv](filters.csv).",
         f"{count:,} images of bodies of markers are rendered as cameras see them: every pixel that "
         "an edge crosses is the mean of 64 rays through a distorting lens; then come the lens's "
         "blur, a lamp beside the camera, and the sensor's noise and grey levels, before a room "
@@ -147,7 +148,7 @@ def _bodies(points: Sequence[Point]) -> str:
                         *_percentiles([view.degrees for view in found]),
                     )
                 )
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _times(points: Sequence[Point]) -> str:
@@ -165,7 +166,7 @@ def _times(points: Sequence[Point]) -> str:
                     [p.pose_cpu_ms for p in mine],
                 ]
                 rows.append((name, size, *(f"{np.nanmedian(values):.2f}" for values in cells)))
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _conditions(points: Sequence[Point]) -> str:
@@ -189,7 +190,7 @@ def _conditions(points: Sequence[Point]) -> str:
                     *_percentiles([view.degrees for view in found]),
                 )
             )
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _covariance(points: Sequence[Point]) -> str:
@@ -210,7 +211,7 @@ def _covariance(points: Sequence[Point]) -> str:
                 _percentiles([view.expected_mm for view in mine])[0],
             )
         )
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _filters(points: Sequence[FilterPoint]) -> str:
@@ -228,7 +229,7 @@ def _filters(points: Sequence[FilterPoint]) -> str:
         )
         for p in points
     ]
-    return _table((*head, "error, mm", "µs a pose"), rows)
+    return markdown_table((*head, "error, mm", "µs a pose"), rows)
 
 
 def _percentiles(values: Sequence[float]) -> tuple[str, str]:
@@ -240,33 +241,3 @@ def _percentiles(values: Sequence[float]) -> tuple[str, str]:
 
 def _percent(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else ""
-
-
-def _machine() -> str:
-    processor = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                processor = line.partition(":")[2].strip()
-                break
-    except OSError:
-        pass
-    libraries = []
-    for name in ("numpy", "numba", "opencv-python-headless", "opencv-python"):
-        try:
-            libraries.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return (
-        f"{processor}, {cpu_count()} cores, {platform.system()}, Python "
-        f"{platform.python_version()}, {', '.join(libraries)}"
-    )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
-    lines = [head, ["-" * max(width, 1) for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
-        for line in lines
-    )

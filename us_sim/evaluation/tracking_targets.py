@@ -32,13 +32,20 @@ class Target:
 
 def targets(points: Sequence[Point]) -> list[Target]:
     """Every measure that is asked for."""
-    body = [view for view in body_views(points) if view.used == _VISIBLE]
+    body = [view for view in body_views(points) if view.visible == _VISIBLE]
     single = single_views(points)
     found = [view for view in single if view.detected]
-    where = f"{_VISIBLE} visible 30 mm markers at 0.4 m, 640 × 480 ({len(body)} views)"
+    tracked = sum(view.detected for view in body)
+    where = f"{_VISIBLE} visible 30 mm markers at 0.4 m, 640 × 480"
     return [
         _at_most("ms an image of 640 × 480 on one core, body of 6 markers", 8, _ms(points, 640)),
         _at_most("ms an image of 1920 × 1080 on one core", 20, _ms(points, 1920)),
+        Target(
+            f"{where}: tracked of {len(body)} views",
+            "all",
+            f"{tracked}",
+            tracked == len(body) if body else None,
+        ),
         _at_most(f"{where}: mm, median", 0.3, _percentile(body, "mm", 50)),
         _at_most(f"{where}: mm, 95th percentile", 1.0, _percentile(body, "mm", 95)),
         _at_most(f"{where}: degrees, median", 0.2, _percentile(body, "degrees", 50)),
