@@ -221,8 +221,12 @@ def _descend(points, pixels, lens, fisheye, deviation, matrix, normal, residuals
         if new_misfit < misfit or (iteration == 0 and np.isfinite(new_misfit)):
             gain = misfit - new_misfit
             misfit = new_misfit
-            matrix[:] = trial
-            residuals[:] = seen - pixels
+            for a in range(3):
+                for b in range(4):
+                    matrix[a, b] = trial[a, b]
+            for i in range(count):
+                residuals[i, 0] = seen[i, 0] - pixels[i, 0]
+                residuals[i, 1] = seen[i, 1] - pixels[i, 1]
             _normal_equations(arms, slopes, residuals, deviation, normal, gradient)
             damping = max(damping * 0.1, 1e-9)
             if gain <= 1e-9 * misfit + 1e-12:
@@ -235,15 +239,20 @@ def _descend(points, pixels, lens, fisheye, deviation, matrix, normal, residuals
                 break
         if iteration == _ITERATIONS:
             break
-        damped[:] = normal
         for a in range(6):
+            for b in range(6):
+                damped[a, b] = normal[a, b]
             damped[a, a] *= 1.0 + damping
             step[a] = -gradient[a]
         if not solve_definite(damped, step):
             break
-        _rotation(step[3:], turn)
-        trial[:3, :3] = turn @ matrix[:3, :3].copy()
-        trial[:3, 3] = matrix[:3, 3] + step[:3]
+        _rotation(step[3], step[4], step[5], turn)
+        for a in range(3):
+            trial[a, 3] = matrix[a, 3] + step[a]
+            for b in range(3):
+                trial[a, b] = 0.0
+                for c in range(3):
+                    trial[a, b] += turn[a, c] * matrix[c, b]
     return misfit
 
 
@@ -269,9 +278,9 @@ def _normal_equations(arms, slopes, residuals, deviation, normal, gradient):
     for i in range(len(arms)):
         length = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2)
         weight = min(1.0, _HUBER * deviation / max(length, 1e-12)) / (deviation * deviation)
-        x, y, z = arms[i]
+        x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
         for side in range(2):
-            a, b, c = slopes[i, side]
+            a, b, c = slopes[i, side, 0], slopes[i, side, 1], slopes[i, side, 2]
             # A rotation w moves a point by w × arm: the slope of that is (arm × slope) · w.
             row[0], row[1], row[2] = a, b, c
             row[3], row[4], row[5] = y * c - z * b, z * a - x * c, x * b - y * a
@@ -282,9 +291,8 @@ def _normal_equations(arms, slopes, residuals, deviation, normal, gradient):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _rotation(vector, turn):
-    """Fill in the rotation (3, 3) of a rotation vector (3,) rad, by Rodrigues."""
-    x, y, z = vector
+def _rotation(x, y, z, turn):
+    """Fill in the rotation (3, 3) of a rotation vector (x, y, z) rad, by Rodrigues."""
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
     sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0

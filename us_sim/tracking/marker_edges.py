@@ -97,8 +97,9 @@ def _refine(image, corners, cells, refined):
     edges = np.empty((4, 3))
     widths = np.full(4, 1.0)
     for _ in range(_ROUNDS):
-        across, down = refined[2] - refined[0], refined[3] - refined[1]
-        border = 0.5 * (across[0] * down[1] - across[1] * down[0]) / cells
+        ax, ay = refined[2, 0] - refined[0, 0], refined[2, 1] - refined[0, 1]
+        bx, by = refined[3, 0] - refined[1, 0], refined[3, 1] - refined[1, 1]
+        border = 0.5 * (ax * by - ay * bx) / cells
         for k in range(4):
             if not _fit_edge(image, refined[k], refined[(k + 1) % 4], border, edges[k], widths, k):
                 return False

@@ -99,11 +99,10 @@ def _solve(points, rays, turns, shifts, errors):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cross(one, other, out):
-    out[0] = one[1] * other[2] - one[2] * other[1]
-    out[1] = one[2] * other[0] - one[0] * other[2]
-    out[2] = one[0] * other[1] - one[1] * other[0]
-    return np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+def _cross(ax, ay, az, bx, by, bz):
+    """The cross product's three components, and its length."""
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return x, y, z, np.sqrt(x * x + y * y + z * z)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -111,23 +110,23 @@ def _plane(points, centre, axes, plane):
     """Fill in the plane's two axes and its normal (3, 3), and the points' coordinates (N, 2);
     whether they span a plane.
     """
-    longest = 0.0
+    longest, largest = 0.0, 0.0
     for i in range(len(points)):
-        arm = points[i] - centre
-        length = np.sqrt(arm[0] * arm[0] + arm[1] * arm[1] + arm[2] * arm[2])
+        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        length = np.sqrt(x * x + y * y + z * z)
         if length > longest:
             longest = length
-            axes[0] = arm / length
-    largest = 0.0
-    normal = np.empty(3)
+            axes[0, 0], axes[0, 1], axes[0, 2] = x / length, y / length, z / length
     for i in range(len(points)):
-        area = _cross(axes[0], points[i] - centre, normal)
+        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x, y, z, area = _cross(axes[0, 0], axes[0, 1], axes[0, 2], x, y, z)
         if area > largest:
             largest = area
-            axes[2] = normal / area
+            axes[2, 0], axes[2, 1], axes[2, 2] = x / area, y / area, z / area
     if not largest > 1e-6 * longest:
         return False
-    _cross(axes[2], axes[0], axes[1])
+    x, y, z, _ = _cross(axes[2, 0], axes[2, 1], axes[2, 2], axes[0, 0], axes[0, 1], axes[0, 2])
+    axes[1, 0], axes[1, 1], axes[1, 2] = x, y, z
     for i in range(len(points)):
         for a in range(2):
             plane[i, a] = 0.0
@@ -202,41 +201,35 @@ def _rotations(homography, turns):
     ba, bb = aim[0, 0] - px * aim[2, 0], aim[0, 1] - px * aim[2, 1]
     bc, bd = aim[1, 0] - py * aim[2, 0], aim[1, 1] - py * aim[2, 1]
     inverse = 1.0 / (ba * bd - bb * bc)
-    corner = np.empty((2, 2))
-    for k in range(2):
-        x = homography[k] - px * homography[6 + k]
-        y = homography[3 + k] - py * homography[6 + k]
-        corner[0, k] = (bd * x - bb * y) * inverse
-        corner[1, k] = (ba * y - bc * x) * inverse
-    total = (corner * corner).sum()
-    area = corner[0, 0] * corner[1, 1] - corner[0, 1] * corner[1, 0]
+    x, y = homography[0] - px * homography[6], homography[3] - py * homography[6]
+    ca, cc = (bd * x - bb * y) * inverse, (ba * y - bc * x) * inverse
+    x, y = homography[1] - px * homography[7], homography[4] - py * homography[7]
+    cb, cd = (bd * x - bb * y) * inverse, (ba * y - bc * x) * inverse
     # The largest singular value, which is that of the plane's size over its distance.
+    total, area = ca * ca + cb * cb + cc * cc + cd * cd, ca * cd - cb * cc
     largest = np.sqrt(0.5 * (total + np.sqrt(max(0.0, total * total - 4 * area * area))))
     if not (largest > 0 and np.isfinite(largest)):
         return False
-    corner /= largest
-    first = np.sqrt(max(0.0, 1 - corner[0, 0] ** 2 - corner[1, 0] ** 2))
-    second = np.sqrt(max(0.0, 1 - corner[0, 1] ** 2 - corner[1, 1] ** 2))
-    if corner[0, 0] * corner[0, 1] + corner[1, 0] * corner[1, 1] > 0:
+    ca, cb, cc, cd = ca / largest, cb / largest, cc / largest, cd / largest
+    first = np.sqrt(max(0.0, 1 - ca * ca - cc * cc))
+    second = np.sqrt(max(0.0, 1 - cb * cb - cd * cd))
+    if ca * cb + cc * cd > 0:
         second = -second
-    before = np.empty((2, 3))
     for k in range(2):
         sign = 1.0 - 2.0 * k
         for a in range(3):
-            before[0, a] = aim[a, 0] * corner[0, 0] + aim[a, 1] * corner[1, 0]
-            before[0, a] += aim[a, 2] * sign * first
-            before[1, a] = aim[a, 0] * corner[0, 1] + aim[a, 1] * corner[1, 1]
-            before[1, a] += aim[a, 2] * sign * second
+            turns[k, a, 0] = aim[a, 0] * ca + aim[a, 1] * cc + aim[a, 2] * sign * first
+            turns[k, a, 1] = aim[a, 0] * cb + aim[a, 1] * cd + aim[a, 2] * sign * second
         # Rounding leaves the columns a little off a rotation's.
-        normal = np.empty(3)
-        across = np.empty(3)
-        long = np.sqrt((before[0] * before[0]).sum())
-        area = _cross(before[0], before[1], normal)
-        _cross(normal, before[0], across)
-        for a in range(3):
-            turns[k, a, 0] = before[0, a] / long
-            turns[k, a, 1] = across[a] / (area * long)
-            turns[k, a, 2] = normal[a] / area
+        x, y, z = turns[k, 0, 0], turns[k, 1, 0], turns[k, 2, 0]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        nx, ny, nz, area = _cross(x, y, z, turns[k, 0, 1], turns[k, 1, 1], turns[k, 2, 1])
+        nx, ny, nz = nx / area, ny / area, nz / area
+        turns[k, 0, 0], turns[k, 1, 0], turns[k, 2, 0] = x, y, z
+        turns[k, 0, 2], turns[k, 1, 2], turns[k, 2, 2] = nx, ny, nz
+        x, y, z, _ = _cross(nx, ny, nz, x, y, z)
+        turns[k, 0, 1], turns[k, 1, 1], turns[k, 2, 1] = x, y, z
     return True
 
 
