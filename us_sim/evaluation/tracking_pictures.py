@@ -19,6 +19,7 @@ _TITLE = 22  # pixels
 
 def draw_views(file: Path) -> None:
     """Write a picture with a row for each condition and a column for each body."""
+    rooms = {name: RenderedView(CAMERAS[_SIZE], marker(name).body) for name in MARKERS}
     rows = []
     for condition, (settings, _) in CONDITIONS.items():
         cells = []
@@ -26,9 +27,7 @@ def draw_views(file: Path) -> None:
             case = Case(name, _SIZE, 0.4, 30.0, condition)
             seen = marker(name)
             pose = case.sequence(0)[0]
-            image = RenderedView(CAMERAS[_SIZE], seen.body).render(
-                pose, settings, 3, case.motion(0)
-            )
+            image = rooms[name].render(pose, settings, 3, case.motion(0))
             middle = CAMERAS[_SIZE].project(pose.apply(seen.body.centres.mean(axis=0)[None]))[0]
             high, wide = image.shape
             top = int(np.clip(middle[1] - _CUT / 2, 0, high - _CUT))

@@ -115,13 +115,12 @@ def plot_conditions(points: Sequence[Point], file: Path) -> None:
         for panel, values in zip(panels, zip(*columns, strict=True), strict=True):
             at = places + (number - 0.5 * (len(MARKERS) - 1)) * width
             panel.bar(at, values, 0.9 * width, color=STYLES[name][0], label=name)
-    panels[2].set_xticks(places, list(CONDITIONS))
     for panel, label in zip(panels, ("mm, 95 %", "degrees, 95 %", "found, %"), strict=True):
         panel.set_ylabel(label)
+        if panel is not panels[2]:
+            panel.set_yscale("log")
         _plain(panel)
-    for panel in panels[:2]:
-        panel.set_yscale("log")
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panels[2].set_xticks(places, list(CONDITIONS))
     _key(panels[0])
     _title(figure, "Conditions at 0.4 m and 30°, 640 × 480")
     figure.savefig(file, dpi=figure.dpi)
@@ -178,10 +177,18 @@ def _errors(
 def _plain(panel: Axes) -> None:
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        if axis.get_scale() == "log":
+            axis.set_minor_formatter(FuncFormatter(_between_decades))
+    panel.tick_params(which="minor", labelsize=7)
     panel.grid(True, which="major", color="0.93")
     panel.set_axisbelow(True)
     panel.spines[["top", "right"]].set_visible(False)
     panel.tick_params(labelsize=8.5)
+
+
+def _between_decades(value: float, _: object) -> str:
+    """Twos and fives of a decade are named, so that a panel within one has numbers too."""
+    return f"{value:g}" if f"{value:e}"[0] in "25" else ""
 
 
 def _key(panel: Axes) -> None:
