@@ -59,6 +59,19 @@ def test_the_clutch_never_moves_the_probe(seed):
     np.testing.assert_allclose(body.orientation, last.orientation, atol=1e-15)
 
 
+def test_a_clutch_that_is_held_from_the_start_holds_the_first_pose():
+    arm = HapticDevice(HapticSettings())
+    arm.clutch(True)
+    arm.take(Pose([0.01, 0.0, 0.0]), 0)
+    arm.clutch(True)
+    np.testing.assert_array_equal(arm.take(Pose([0.05, 0.0, 0.0]), 1).pose.position, [0.01, 0, 0])
+    arm.clutch(False)
+    arm.clutch(False)
+    np.testing.assert_allclose(
+        arm.take(Pose([0.05, 0.0, 0.02]), 2).pose.position, [0.01, 0, 0.02], atol=1e-15
+    )
+
+
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_the_probe_moves_as_the_trackers_frames_say(seed):

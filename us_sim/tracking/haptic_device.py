@@ -71,13 +71,16 @@ class HapticDevice:
             stamp: ns.
         """
         self._last = pose
-        return Measurement(stamp, self._held or self._body(pose))
+        body = self._held or self._body(pose)
+        if self.is_held:
+            self._held = body
+        return Measurement(stamp, body)
 
     def clutch(self, held: bool) -> None:
         """Hold the probe where it is, or let it go on from there."""
         if held and not self.is_held and self._last is not None:
             self._held = self._body(self._last)
-        elif not held and self._held is not None and self._last is not None:
+        if not held and self._held is not None and self._last is not None:
             x, y, z, w = self._last.orientation
             self._offset = self._held.position - self._scale * self._last.position
             self._regrip = se3.product(np.array([-x, -y, -z, w]), self._held.orientation)
