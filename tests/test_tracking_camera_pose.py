@@ -1,5 +1,8 @@
 """Poses from corners: both of a plane's, refined together, with a covariance that is true."""
 
+import dataclasses
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from camera_views import WEBCAM, faceted_grip, random_views
@@ -10,6 +13,7 @@ from us_sim.pose import Pose
 from us_sim.tracking.body_pose import body_poses, rotation_angle
 from us_sim.tracking.camera_model import CameraModel
 from us_sim.tracking.markers import square
+from us_sim.tracking.plane_ambiguity import PlaneAmbiguity
 from us_sim.tracking.plane_pose import plane_poses
 from us_sim.tracking.rigid_body import RigidBody
 
@@ -107,3 +111,48 @@ def test_corners_without_a_line_of_sight_have_no_pose():
     assert body_poses(WEBCAM, MARKER, pixels) == []
     board = RigidBody.single("4X4_50", 0, 0.04)
     assert body_poses(WEBCAM, board.corners[0, :3], pixels[:3]) == []
+
+
+@pytest.fixture
+def two_poses():
+    """A pose and its mirror image, 60 degrees apart, which fit equally well."""
+    (true,) = random_views(1, 2.0, (30.0, 30.0), seed=3)
+    found = body_poses(PINHOLE, MARKER, PINHOLE.project(true.apply(MARKER)))
+    return [dataclasses.replace(each, misfit=1.0) for each in found]
+
+
+def test_two_poses_that_fit_alike_widen_the_covariance_by_their_mixture(two_poses):
+    pose = PlaneAmbiguity(0.1).chosen(two_poses, None)
+    covariance = PlaneAmbiguity(0.1).settled(two_poses, pose, None)
+    # Each is the right one with probability 1 / 2.
+    apart = rotation_angle(two_poses[0].pose, two_poses[1].pose)
+    wider = np.trace(covariance[3:, 3:]) - np.trace(pose.covariance[3:, 3:])
+    assert wider == pytest.approx(0.5 * apart**2)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_images_that_speak_for_the_other_pose_win_in_the_end(two_poses):
+    first, other = two_poses
+    ambiguity = PlaneAmbiguity(0.1)
+    ambiguity.settled(two_poses, first, None)
+    better = dataclasses.replace(other, misfit=0.0)
+    chosen = []
+    for _ in range(3):
+        # Half a unit of log likelihood an image: not enough at once after a sure start.
+        ambiguity.settled([first, dataclasses.replace(other, misfit=9.0)], first, first.pose)
+    for _ in range(30):
+        before = chosen[-1].pose if chosen else first.pose
+        chosen.append(ambiguity.chosen([better, first], before))
+        ambiguity.settled([better, first], chosen[-1], before)
+    assert chosen[0] is first
+    assert chosen[-1] is better
+    assert sum(one is not two for one, two in pairwise(chosen)) == 1
+
+
+def test_a_sure_pose_keeps_its_covariance():
+    (true,) = random_views(1, 0.2, (40.0, 40.0), seed=3)
+    found = body_poses(PINHOLE, MARKER, PINHOLE.project(true.apply(MARKER)))
+    ambiguity = PlaneAmbiguity(0.1)
+    for _ in range(3):
+        covariance = ambiguity.settled(found, found[0], true)
+    assert np.allclose(covariance, found[0].covariance, atol=2e-5)

@@ -24,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.pose import Pose
-from us_sim.tracking.body_pose import BodyPose, body_poses, rotation_angle
+from us_sim.tracking.body_pose import BodyPose, body_poses
 from us_sim.tracking.camera_model import CameraModel
 from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.fiducial_detector import Detection, FiducialDetector
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.plane_ambiguity import PlaneAmbiguity
 from us_sim.tracking.rigid_body import RigidBody
 from us_sim.tracking.stray_markers import StrayMarkers, counted
 
@@ -38,8 +39,6 @@ REMEMBERED = 0.5
 """s, how long the last pose helps to find the next one and to tell it from its mirror image."""
 
 _BLACK = 24  # grey, below which all of an image is when it shows nothing
-_FORGETTING = 0.9  # of what earlier images say about which of two poses it is, from one to the next
-_SURE = 12.0  # log likelihood ratio beyond which more does not count: so that it can be unlearned
 _MARGIN = 0.35  # of the body's size in the image, around where it is looked for
 _LEAST_MARGIN = 24  # pixels
 _SEARCHED = 500_000  # pixels, of an image in which all is looked for at once
@@ -67,14 +66,14 @@ class CameraSource:
         self.seen = 0
         """Markers of the body that the last measurement is made from."""
         self._detector = FiducialDetector(body)
-        self._last: tuple[int, BodyPose] | None = None
-        self._evidence = 0.0
+        self._last: tuple[int, Pose] | None = None
+        self._ambiguity = PlaneAmbiguity(self.settings.corner_deviation)
         self._strays = StrayMarkers(body)
 
     def reset(self) -> None:
         """Forget the last pose."""
         self._last = None
-        self._evidence = 0.0
+        self._ambiguity.reset()
 
     def measure(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
         """The body's pose in ``camera_optical``, or None with the reason in ``last_problem``.
@@ -93,12 +92,13 @@ class CameraSource:
         detection = self._detect(image, before)
         if detection.doubled:
             self.last_problem = _copies(detection.doubled)
-        pose = self._pose(image, detection, before)
-        if pose is None:
+        measured = self._pose(image, detection, before)
+        if measured is None:
             return None
-        self._last = stamp, pose
+        pose, covariance = measured
+        self._last = stamp, pose.pose
         exposed = stamp - round(self.settings.latency * 1e9)
-        return Measurement(exposed, pose.pose, pose.covariance, pose.error)
+        return Measurement(exposed, pose.pose, covariance, pose.error)
 
     def _before(self, stamp: int) -> Pose | None:
         """The last pose, where it is from shortly before."""
@@ -107,7 +107,7 @@ class CameraSource:
         if not 0 <= stamp - self._last[0] <= REMEMBERED * 1e9:
             self.reset()
             return None
-        return self._last[1].pose
+        return self._last[1]
 
     def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
         """The body's markers, near where they were or else anywhere."""
@@ -148,7 +148,8 @@ class CameraSource:
 
     def _pose(
         self, image: NDArray[np.uint8], detection: Detection, before: Pose | None
-    ) -> BodyPose | None:
+    ) -> tuple[BodyPose, NDArray[np.float64]] | None:
+        """The pose and its covariance; see `measure`."""
         points, pixels, owners = detection.correspondences(self.body)
         if not len(points):
             self.last_problem = self.last_problem or self._nothing(image, detection)
@@ -179,7 +180,7 @@ class CameraSource:
                     "the camera info and the body's file"
                 )
                 return None
-            pose = self._chosen(found, before)
+            pose = self._ambiguity.chosen(found, before)
             unfit, refusal = self._unfit(pose, owners)
             if not len(unfit):
                 break
@@ -189,10 +190,9 @@ class CameraSource:
                 return None
             points, pixels, owners = points[kept], pixels[kept], owners[kept]
             self.last_problem = refusal
-        self._learn(found, pose)
         board = self.body.chessboard is not None
         self.seen = len(detection.ids) + len(detection.unclear) if board else len(markers)
-        return pose
+        return pose, self._ambiguity.settled(found, pose, before)
 
     def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
         """Owners of points that cannot be used in a pose, and why."""
@@ -236,34 +236,6 @@ class CameraSource:
         cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
         return np.arccos(np.clip(cosines, -1.0, 1.0))
 
-    def _chosen(self, found: list[BodyPose], before: Pose | None) -> BodyPose:
-        """The pose nearest to the last one, unless the images speak for the other by now."""
-        if len(found) == 1 or before is None:
-            return found[0]
-        near, far = sorted(found, key=lambda each: rotation_angle(each.pose, before))
-        return near if self._evidence_for(near, far) >= 0 else far
-
-    def _evidence_for(self, near: BodyPose, far: BodyPose) -> float:
-        """Log likelihood ratio of two poses, of which the near one follows the last."""
-        return _FORGETTING * self._evidence + _ratio(near, far)
-
-    def _learn(self, found: list[BodyPose], pose: BodyPose) -> None:
-        """Keep what this image says for the chosen pose against the other one."""
-        if len(found) == 1:
-            self._evidence = _FORGETTING * self._evidence
-            return
-        other = found[1] if pose is found[0] else found[0]
-        if self._last is not None and self._turned(pose, other):
-            self._evidence = -self._evidence
-        evidence = _FORGETTING * self._evidence + _ratio(pose, other)
-        self._evidence = float(np.clip(evidence, -_SURE, _SURE))
-
-    def _turned(self, pose: BodyPose, other: BodyPose) -> bool:
-        """Whether the chosen pose is not the one that follows the last."""
-        assert self._last is not None
-        before = self._last[1].pose
-        return rotation_angle(pose.pose, before) > rotation_angle(other.pose, before)
-
     def _nothing(self, image: NDArray[np.uint8], detection: Detection) -> str:
         if detection.unclear:
             return (
@@ -274,11 +246,6 @@ class CameraSource:
         if int(image.max()) <= _BLACK:
             return f"{start}, which is black: uncover the lens or add light"
         return self._strays.look(image, start)
-
-
-def _ratio(one: BodyPose, other: BodyPose) -> float:
-    """Log likelihood ratio."""
-    return 0.5 * (other.misfit - one.misfit)
 
 
 def _copies(numbers: tuple[int, ...]) -> str:
