@@ -1,6 +1,8 @@
 """Every source that a scene may name moves the probe, and bad input of it is said and survived."""
 
 import math
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -14,8 +16,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
 
-from us_sim.errors import SceneError
+from us_sim.errors import SceneError, TrackingError
 from us_sim.evaluation.rendered_views import SHARP, RenderedView
+from us_sim.nodes.camera_images import grey_from_compressed
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.pose import Pose
 from us_sim.tracking.camera_model import CameraModel
@@ -99,6 +102,16 @@ def test_a_frame_of_tf_is_followed_through_the_tree(bench, tracker):
     bench.spin_until(lambda: poses)
     assert poses[0].header.stamp.sec == 3
     np.testing.assert_allclose(place(poses[0]), [0, 0, 0.134])
+
+
+def test_a_frame_of_tf_is_not_missed_among_those_of_others(bench, tracker):
+    node, poses = tracker("{source: tf, frame: world, body: stylus}", lockstep=False)
+    moving = bench.publisher(TFMessage, "tf")
+    now = node.get_clock().now().nanoseconds // 1_000_000_000
+    moving.publish(transform("world", "stylus", 0.004, now))
+    for _ in range(30):
+        moving.publish(transform("elsewhere", "other", 5.0, now))
+    bench.spin_until(lambda: poses)
 
 
 @pytest.mark.parametrize("body", ["", ", body: probe"])
@@ -221,6 +234,17 @@ def test_a_compressed_image_will_do(bench, tracker, view):
     images.publish(message)
     bench.spin_until(lambda: poses)
     np.testing.assert_allclose(place(poses[0]), SEEN.position, atol=1e-3)
+
+
+def test_a_compressed_image_larger_than_can_be_decoded_is_refused():
+    def chunk(kind, data):
+        crc = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + crc
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0"))
+    with pytest.raises(TrackingError, match="cannot be decoded"):
+        grey_from_compressed(CompressedImage(format="png", data=png + chunk(b"IEND", b"")))
 
 
 def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):

@@ -92,7 +92,10 @@ def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
         TrackingError: it cannot be decoded.
     """
     data = np.frombuffer(message.data, dtype=np.uint8)
-    pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    except cv2.error:  # the header says that it is larger than OpenCV takes
+        pixels = None
     if pixels is None:
         raise TrackingError(
             f"the compressed image ('{message.format}', {data.size} bytes) cannot be decoded"

@@ -75,7 +75,11 @@ class ProbeTracker(SceneNode):
         super().destroy_node()
 
     def listen_to_device(
-        self, message_type: Any, topic: str, callback: Callable[[Any], None]
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        quality: QoSProfile = FOREIGN,
     ) -> None:
         """Subscribe as drivers may publish, best effort; all that come count as received."""
 
@@ -83,7 +87,7 @@ class ProbeTracker(SceneNode):
             self.health.received += 1
             callback(message)
 
-        self.listen(message_type, topic, count, self.of_device)
+        self.listen(message_type, topic, count, EVERY if self.lockstep else quality)
 
     @property
     def of_device(self) -> QoSProfile:
@@ -175,6 +179,7 @@ class ProbeTracker(SceneNode):
             self.get_logger().info("the probe is tracked")
         self._state = state
         self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
+        self.health.warning = "the probe is lost" if state is TrackingState.LOST else ""
         self._say_status()
 
     def _say_status(self) -> None:

@@ -18,6 +18,14 @@ if TYPE_CHECKING:
 
 __all__ = ["TfInput"]
 
+MOVING = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
+"""Many nodes share `tf`, this one too: the newest message alone would often be another's."""
+
 STATIC = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=100,
@@ -48,7 +56,7 @@ class TfInput:
             )
         self._frame, self._body = tracker.frame, tracker.body
         self._parents: dict[str, tuple[str, Pose]] = {}
-        node.listen_to_device(TFMessage, "tf", self._take)
+        node.listen_to_device(TFMessage, "tf", self._take, MOVING)
         node.listen(TFMessage, "tf_static", self._take_static, STATIC)
 
     def _take_static(self, message: TFMessage) -> None:
