@@ -179,6 +179,7 @@ def test_a_large_chessboard_is_found_as_exactly_as_a_small_one():
         (("circles", 5, 7, 0.04), "there is no board 'circles'"),
         (("charuco", 2, 7, 0.04, 0.02, 0.0, "6X6_250"), "too few corners"),
         (("charuco", 5, 7, 0.04), "needs its marker"),
+        (("charuco", 5, 7, 0.04, 0.02), "needs the dictionary of its markers"),
         (("charuco", 5, 7, 0.04, 0.05, 0.0, "6X6_250"), "must be smaller than its square"),
         (("grid", 5, 7, 0.0, 0.03, 0.005, "7X3_1"), "no marker dictionary '7X3_1'"),
         (("chessboard", 5, 7, 40.0), "needs its square in metres"),

@@ -86,6 +86,11 @@ class Board:
                 f"({1e3 * self.square:g} mm)"
             )
         if self.kind != "chessboard":
+            if not self.dictionary:
+                raise CalibrationError(
+                    f"a board of kind {self.kind} needs the dictionary of its markers, such as "
+                    f"6X6_250: it is printed below a board of `us-sim print-marker`"
+                )
             try:
                 dictionary(self.dictionary)
             except TrackingError as error:
