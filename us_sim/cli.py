@@ -60,8 +60,8 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--source",
         choices=("path", "camera"),
-        default="path",
-        help="poses as they were recorded, or tracked in a camera video that is rendered of them",
+        help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
+        "default: camera where the scene's tracker is one",
     )
     demo.add_argument(
         "--out",
@@ -162,14 +162,13 @@ def _live_options(parser: argparse.ArgumentParser) -> None:
 def _demo(args: argparse.Namespace) -> int:
     from us_sim.live import demo
 
-    camera = args.source == "camera"
     return demo(
-        args.scene or ("upper_arm_camera" if camera else "upper_arm"),
+        args.scene or ("upper_arm_camera" if args.source == "camera" else "upper_arm"),
         args.volume,
         args.out,
         _parameters(args.param),
         network=args.network,
-        camera=camera,
+        source=args.source,
     )
 
 

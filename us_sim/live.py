@@ -74,7 +74,7 @@ def demo(
     parameters: Parameters,
     *,
     network: bool,
-    camera: bool = False,
+    source: str | None = None,
 ) -> int:
     """Replay the scene's path through its nodes; recording, contact sheet and summary in ``out``.
 
@@ -84,7 +84,8 @@ def demo(
         out: folder to write to.
         parameters: given by a person, by node.
         network: talk beyond this host.
-        camera: show the scene's camera a rendered video of the path.
+        source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
+            None is the one that the scene's tracker asks for.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or a node failed.
@@ -100,8 +101,9 @@ def demo(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    video = _prepared_video(scene, Path(scene.path)) if camera else None
-    path = None if camera else Path(scene.path)
+    source = source or ("camera" if scene.tracker.source == "camera" else "path")
+    video = _prepared_video(scene, Path(scene.path)) if source == "camera" else None
+    path = Path(scene.path) if video is None else None
     plan = plan_of(scene, parameters, record=recording, path=path, video=video)
     prepare_volume(scene)
     started = time.monotonic()

@@ -13,7 +13,7 @@ from us_sim.evaluation.tracking_cases import CAMERAS, CONDITIONS, MARKERS, Case,
 __all__ = ["draw_views"]
 
 _SIZE = "640x480"
-_CUT = 300  # pixels, of the image around the body
+_CUT = 240  # pixels, of the image around the body
 _TITLE = 22  # pixels
 
 
