@@ -230,7 +230,7 @@ def test_a_wrench_written_by_hand_is_the_message(frame):
     stamp = Time(nanoseconds=1_234_567_890_123_456_789).to_msg()
     message = wrench_message(wrench[:3], wrench[3:], stamp, frame)
     assert deserialize_message(written, WrenchStamped) == message
-    assert written == serialize_message(message)
+    assert len(written) == len(serialize_message(message))  # some leave anything in the padding
 
 
 def test_a_scene_without_tissue_is_refused(bench, tmp_path):
