@@ -73,6 +73,8 @@ class CameraInput:
             if measurement is None:
                 self._node.refuse("markers", f"{topic}: {self._source.last_problem}")
             else:
+                left_out = self._source.last_problem
+                self._node.health.values["markers"] = left_out or "all that are seen are used"
                 self._node.take(measurement)
 
         return look
