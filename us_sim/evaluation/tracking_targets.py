@@ -3,31 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from us_sim.evaluation.target import Target
 from us_sim.evaluation.tracking_cases import RIGID_BODY, SINGLE
 from us_sim.evaluation.tracking_points import Point, View
 
-__all__ = ["Target", "body_views", "single_views", "targets"]
+__all__ = ["body_views", "single_views", "targets"]
 
 _VISIBLE = 4  # markers
-
-
-@dataclass(frozen=True)
-class Target:
-    """One line of the table."""
-
-    what: str
-    asked: str
-    seen: str
-    met: bool | None  # None where it was not measured
-
-    @property
-    def cells(self) -> tuple[str, str, str, str]:
-        """Of the table."""
-        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
 
 
 def targets(points: Sequence[Point]) -> list[Target]:
