@@ -114,6 +114,24 @@ def test_a_frame_of_tf_is_not_missed_among_those_of_others(bench, tracker):
     bench.spin_until(lambda: poses)
 
 
+def test_a_way_in_tf_that_never_moves_is_said(bench, tracker):
+    node, _ = tracker("{source: tf, frame: world, body: stylus}")
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    fixed = bench.peer.create_publisher(TFMessage, "tf_static", latched)
+    fixed.publish(transform("world", "stylus", 0.1, 1))
+    bench.spin_until(lambda: node.health.problems("frame") == 1)
+
+
+def test_a_pose_in_millimetres_is_not_believed(bench, tracker):
+    node, poses = tracker("{source: pose}")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    publisher.publish(pose_at(412.0, 1))
+    publisher.publish(pose_at(0.412, 2))
+    bench.spin_until(lambda: poses)
+    assert poses[0].header.stamp.sec == 2
+    assert node.health.problems("far") == 1
+
+
 @pytest.mark.parametrize("body", ["", ", body: probe"])
 def test_tf_needs_the_name_of_a_frame_that_is_not_its_own(tracker, body):
     with pytest.raises(SceneError, match=r"tracker\.body"):
@@ -272,7 +290,7 @@ def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):
 
 
 def test_status_says_tracked_coasting_lost_and_tracked_again(bench, tracker):
-    node, poses = tracker("{coast_for: 0.1 s, lost_after: 0.25 s}", lockstep=False)
+    node, poses = tracker("{coast_for: 0.4 s, lost_after: 2 s}", lockstep=False)
     status = bench.collect(DiagnosticStatus, "probe/status", latched=True)
     publisher = bench.publisher(PoseStamped, "tracker/pose")
     bench.spin_until(lambda: status)

@@ -29,6 +29,8 @@ from us_sim.tracking.tracking_state import TrackingState
 __all__ = ["ProbeTracker", "main"]
 
 PATIENT = "patient"
+FARTHEST = 100.0
+"""m from the device's origin, beyond which a pose is in another unit, or nonsense."""
 ROUNDED = 1e-2
 """How far from 1 a quaternion's length may be by rounding."""
 CHECKS = 20.0
@@ -101,8 +103,8 @@ class ProbeTracker(SceneNode):
             return True
         self.refuse(
             "frame",
-            f"{topic} is in frame '{header.frame_id}', not '{frame}': set the tracker's frame, or "
-            f"tracker.frame in the scene",
+            f"{self.resolve_topic_name(topic)} is in frame '{header.frame_id}', not '{frame}': set "
+            f"the tracker's frame, or tracker.frame in the scene",
         )
         return False
 
@@ -110,7 +112,8 @@ class ProbeTracker(SceneNode):
         """When a device's message was measured, ns; its arrival where it does not say."""
         stamp = Time.from_msg(header.stamp).nanoseconds
         if stamp == 0:
-            self.health.problem("stamp", f"{topic} has no stamp: its time of arrival is used")
+            name = self.resolve_topic_name(topic)
+            self.health.problem("stamp", f"{name} has no stamp: its time of arrival is used")
             stamp = self._now()
         return stamp
 
@@ -121,7 +124,7 @@ class ProbeTracker(SceneNode):
         try:
             pose = pose_from(message)
         except PoseError as error:
-            self.refuse("pose", f"{topic}: {error}; it is not used")
+            self.refuse("pose", f"{self.resolve_topic_name(topic)}: {error}; it is not used")
             return None
         q = message.pose.orientation
         length = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
@@ -138,6 +141,14 @@ class ProbeTracker(SceneNode):
 
     def take(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
+        distance = float(abs(measurement.pose.position).max())
+        if distance > FARTHEST:
+            self.refuse(
+                "far",
+                f"the tracker's pose is {distance:.3g} m away, and no tracker sees beyond "
+                f"{FARTHEST:g} m: positions are in metres; it is not used",
+            )
+            return
         restarts = self._tracking.restarts.total()
         probe = self._tracking.take(measurement, self._now())
         if self._tracking.restarts.total() > restarts:

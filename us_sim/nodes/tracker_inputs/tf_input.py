@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
 from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
@@ -56,11 +55,20 @@ class TfInput:
             )
         self._frame, self._body = tracker.frame, tracker.body
         self._parents: dict[str, tuple[str, Pose]] = {}
+        self._fixed: set[str] = set()
         node.listen_to_device(TFMessage, "tf", self._take, MOVING)
         node.listen(TFMessage, "tf_static", self._take_static, STATIC)
 
     def _take_static(self, message: TFMessage) -> None:
-        self._keep(message)
+        """Keep what does not move; a way of nothing else makes no poses."""
+        self._fixed |= self._keep(message)
+        chain = self._chain()
+        if chain is not None and self._fixed.issuperset(chain):
+            self._node.refuse(
+                "frame",
+                f"nothing moves in tf between '{self._frame}' and '{self._body}': all of it is in "
+                f"tf_static, so no pose comes",
+            )
 
     def _keep(self, message: TFMessage) -> set[str]:
         """Remember the transforms of a message; the frames that have moved."""
@@ -79,6 +87,7 @@ class TfInput:
 
     def _take(self, message: TFMessage) -> None:
         moved = self._keep(message)
+        self._fixed -= moved
         chain = self._chain()
         if chain is None:
             self._node.refuse(
@@ -88,7 +97,7 @@ class TfInput:
             )
             return
         stamps = [
-            Time.from_msg(transform.header.stamp).nanoseconds
+            self._node.stamp_of(transform.header, "tf")
             for transform in message.transforms
             if transform.child_frame_id.lstrip("/") in moved & set(chain)
         ]
