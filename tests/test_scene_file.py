@@ -275,6 +275,17 @@ def test_a_scene_says_only_what_differs_from_the_one_it_is_based_on(tmp_path):
     assert scene.tracker.camera.body == str(tmp_path / "far" / "grip.yaml")
 
 
+def test_another_kind_of_probe_does_not_inherit_the_dimensions_of_the_base_s(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "name: mine\nbased_on: upper_arm\nprobe: {geometry: convex, radius: 5 cm, "
+        "opening_angle: 60 deg, collider: {shape: sphere, radius: 3 cm}}"
+    )
+    probe = load_scene(file).probe
+    assert (probe.aperture, probe.radius, probe.depth) == (None, 0.05, 0.04)
+    assert (probe.collider.radius, probe.collider.length) == (0.03, None)
+
+
 @pytest.mark.parametrize(
     ("base", "sentence"),
     [

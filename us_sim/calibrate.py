@@ -46,7 +46,7 @@ def _add_camera(kinds: Any) -> None:
         parser.add_argument(
             f"--{name}", type=_quantity(_LENGTH), default=0.0, metavar="M", help=f"{what}: '40 mm'"
         )
-    parser.add_argument("--dictionary", default="", help="of the markers: 6X6_250")
+    parser.add_argument("--dictionary", help="of the markers, where there are; default: 4X4_50")
     parser.add_argument(
         "--legacy", action="store_true", help="the ChArUco board is as OpenCV before 4.6 drew it"
     )
@@ -190,7 +190,7 @@ def _camera(args: argparse.Namespace) -> int:
         args.square,
         args.marker,
         args.separation,
-        args.dictionary,
+        args.dictionary or ("" if args.board == "chessboard" else "4X4_50"),
         args.legacy,
     )
     print(calibrate_photos(args.photos, board, _new(args.out), args.name))

@@ -18,6 +18,11 @@ from us_sim.errors import SceneError
 
 __all__ = ["merged", "read_document"]
 
+DIMENSIONS = {
+    "geometry": ("aperture", "radius", "opening_angle"),
+    "shape": ("radius", "length", "width", "height", "rounding"),
+}
+"""Keys that say of which kind a probe or a collider is, and those that depend on it."""
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
 
@@ -56,8 +61,14 @@ def read_document(
 
 
 def merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
-    """``below`` with what ``above`` says: mappings key by key, anything else replaced."""
+    """``below`` with what ``above`` says: mappings key by key, anything else replaced.
+
+    Where ``above`` names another geometry or shape, the dimensions of the one below go with it.
+    """
     result = dict(below)
+    for kind, dimensions in DIMENSIONS.items():
+        if kind in above and above[kind] != below.get(kind):
+            result = {key: value for key, value in result.items() if key not in dimensions}
     for key, value in above.items():
         under = result.get(key)
         if isinstance(under, dict) and isinstance(value, dict):

@@ -122,6 +122,11 @@ class Session:
         scanner = scanner_of(scene, volume)
         scanner.carry(self.rest, self.tetrahedra)
         stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
+        if not stamps:
+            raise BagError(
+                "the session holds no image with its pose and nodes, so nothing can be measured: "
+                "look into nodes.log"
+            )
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
         chosen = [stamps[i] for i in picked]
         pixel = float(np.prod(scanner.probe.pixel_spacing))

@@ -319,6 +319,12 @@ class FemNonlinear(TissueSolver):
                 least, best = energy, newton.snapshot()
         newton.restore(best)
 
+    def _rehearse(self) -> None:
+        newton = self._newton
+        newton.tissue.energy(newton.displacement)
+        self._correction.learn(np.zeros(newton.displacement.shape), np.eye(6)[0])
+        self._correction.guess(np.eye(6)[0], np.eye(3)[2])
+
     def _improve(self, pose: Pose, retreat: float, effort: _Effort) -> int:
         """Newton steps until the effort is spent; how many iterations were used."""
         newton, used = self._newton, 0

@@ -169,7 +169,11 @@ class TissueSolver(ABC):
         solver = type(self)(model)
         for depth in (0.002, 0.004):
             solver.deform(Pose(position=np.array([depth, 0.0, depth])))
+        solver._rehearse()
         solver.deform(None)
+
+    def _rehearse(self) -> None:  # noqa: B027 - most solvers have none of these
+        """Call, for `warm_up`, the kernels that only some frames need."""
 
     @property
     @abstractmethod
