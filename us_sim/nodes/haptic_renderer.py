@@ -24,8 +24,11 @@ from us_sim.tracking.haptic_settings import HapticSettings
 
 __all__ = ["HapticRenderer", "main"]
 
-REPORTS = 5.0
-"""Times a second that diagnostics are told how it goes."""
+LOOKS, REPORTS = 5.0, 1.0
+"""Times a second that it is seen who listens, and that diagnostics are told how regular it is.
+
+The latter keeps the interpreter from rendering for two ticks.
+"""
 
 _PRIORITY = 10
 """Of the executor, among real-time threads: below the one that renders."""
@@ -53,7 +56,9 @@ class HapticRenderer(SceneNode):
         self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
         self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
         self._thread = PeriodicThread(settings.rate, self._render)
+        self._look()
         self._report()
+        self.create_timer(1.0 / LOOKS, self._look)
         self.create_timer(1.0 / REPORTS, self._report)
         self._thread.start()
 
@@ -124,8 +129,8 @@ class HapticRenderer(SceneNode):
             return  # rclpy was shut down meanwhile, as by a signal
         self.health.published("haptic/wrench")
 
-    def _report(self) -> None:
-        """Tell diagnostics, and see who listens."""
+    def _look(self) -> None:
+        """See who listens, and whether the wrench is as it should be."""
         self._is_taken = self._wrenches.get_subscription_count() > 0
         doubt, stops = self._rendering.doubt, self._rendering.stops
         if stops > self._stops:
@@ -135,8 +140,11 @@ class HapticRenderer(SceneNode):
         if self._thread.has_failed:
             self.health.state = "zero: the rendering has failed"
             self.health.problem("failure", "the rendering has failed: start the node again")
+
+    def _report(self) -> None:
+        """Tell diagnostics how it goes."""
         self.health.values = {
-            "stops": str(stops),
+            "stops": str(self._rendering.stops),
             "stopped": self._rendering.stopped,
             "jitter_p99_ms": f"{1e3 * self._thread.jitter:.3f}",
             "skipped": str(self._thread.skipped),
