@@ -9,7 +9,7 @@ from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
 from us_sim.nodes.conversions import transform_from
-from us_sim.pose import Pose
+from us_sim.tracking.frame_tree import FrameTree
 from us_sim.tracking.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ STATIC = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-FRAMES = 1000
-"""Most frames kept; a tree of more is somebody's mistake."""
 
 
 class TfInput:
@@ -54,7 +52,7 @@ class TfInput:
                 f"itself; name the frame that the tracker gives the probe"
             )
         self._frame, self._body = tracker.frame, tracker.body
-        self._parents: dict[str, tuple[str, Pose]] = {}
+        self._tree = FrameTree()
         self._fixed: set[str] = set()
         node.listen_to_device(TFMessage, "tf", self._take, MOVING)
         node.listen(TFMessage, "tf_static", self._take_static, STATIC)
@@ -62,7 +60,7 @@ class TfInput:
     def _take_static(self, message: TFMessage) -> None:
         """Keep what does not move; a way of nothing else makes no poses."""
         self._fixed |= self._keep(message)
-        chain = self._chain()
+        chain = self._tree.way(self._body, self._frame)
         if chain is not None and self._fixed.issuperset(chain):
             self._node.refuse(
                 "frame",
@@ -80,15 +78,14 @@ class TfInput:
             except PoseError as error:
                 self._node.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
                 continue
-            if child in self._parents or len(self._parents) < FRAMES:
-                self._parents[child] = parent.lstrip("/"), pose
+            if self._tree.place(child, parent.lstrip("/"), pose):
                 moved.add(child)
         return moved
 
     def _take(self, message: TFMessage) -> None:
         moved = self._keep(message)
         self._fixed -= moved
-        chain = self._chain()
+        chain = self._tree.way(self._body, self._frame)
         if chain is None:
             self._node.refuse(
                 "frame",
@@ -102,18 +99,4 @@ class TfInput:
             if transform.child_frame_id.lstrip("/") in moved & set(chain)
         ]
         if stamps:
-            pose = Pose()
-            for frame in chain:
-                pose = self._parents[frame][1] @ pose
-            self._node.take(Measurement(max(stamps), pose))
-
-    def _chain(self) -> list[str] | None:
-        """The frames from the body up to below the device's; None when they do not meet."""
-        chain: list[str] = []
-        frame = self._body
-        while frame != self._frame:
-            if frame not in self._parents or frame in chain:
-                return None
-            chain.append(frame)
-            frame = self._parents[frame][0]
-        return chain
+            self._node.take(Measurement(max(stamps), self._tree.pose(chain)))
