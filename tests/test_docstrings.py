@@ -45,6 +45,8 @@ def test_examples(name):
         "us_sim.recording.path",
         "us_sim.scene_file",
         "us_sim.tracking.probe_tracking",
+        "us_sim.tracking.frame_tree",
+        "us_sim.tracker_assembly",
     ],
 )
 def test_main_parts_show_how_they_are_used_without_ros(name):

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from us_sim.assembly import camera_body_of, tracker_poses_of
 from us_sim.errors import BagError
 from us_sim.evaluation.camera_video import CAMERA, RATE, path_video, video_poses
 from us_sim.evaluation.session import Session
@@ -12,6 +11,7 @@ from us_sim.evaluation.tracked_path import IMAGES, tracked_path
 from us_sim.pose import Pose
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.scene_file import load_scene
+from us_sim.tracker_assembly import camera_body_of, tracker_poses_of
 from us_sim.tracking.camera_info import read_camera_info
 from us_sim.tracking.camera_source import CameraSource
 

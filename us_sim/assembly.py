@@ -30,22 +30,16 @@ if TYPE_CHECKING:
     from us_sim.slicing.probe import Probe
     from us_sim.tissue.mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
-    from us_sim.tracking.haptic_rendering import HapticRendering
-    from us_sim.tracking.probe_tracking import ProbeTracking
-    from us_sim.tracking.rigid_body import RigidBody
     from us_sim.volume.volume import Volume
 
 __all__ = [
-    "camera_body_of",
     "collider_of",
-    "haptic_rendering_of",
     "membrane_of",
     "path_of",
+    "pose_of",
     "probe_of",
     "scanner_of",
     "tissue_model_of",
-    "tracker_poses_of",
-    "tracking_of",
     "volume_of",
 ]
 
@@ -67,7 +61,7 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
         volume = cached_phantom(
             scene.volume.phantom, scene.volume.seed, scene.volume.voxel_size, progress
         )
-    patient_from_volume = _pose(scene.volume.pose).matrix
+    patient_from_volume = pose_of(scene.volume.pose).matrix
     return dataclasses.replace(
         volume, index_to_patient=patient_from_volume @ volume.index_to_patient
     )
@@ -129,83 +123,6 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
     method = scene.slice.method
     settings = {"regions": scene.slice.regions} if method == "row_subdivision" else {}
     return BMode(volume, probe_of(scene), scene.imaging, method=method, threads=threads, **settings)
-
-
-def tracking_of(scene: Scene) -> ProbeTracking:
-    """What turns the measurements of the scene's tracker into the probe's poses.
-
-    Raises:
-        CalibrationError: a file of a registration or calibration cannot be used.
-        TrackingError: the times make no sense.
-    """
-    from us_sim.tracking.pose_filter import make_filter
-    from us_sim.tracking.probe_tracking import ProbeTracking
-
-    tracker = scene.tracker
-    gate = None
-    if tracker.gate is not None:
-        from us_sim.tracking.outlier_gate import OutlierGate
-
-        gate = OutlierGate(tracker.gate)
-    return ProbeTracking(
-        *tracker_poses_of(scene),
-        make_filter(tracker.filter),
-        gate,
-        time_offset=tracker.time_offset,
-        coast_for=tracker.coast_for,
-        lost_after=tracker.lost_after,
-    )
-
-
-def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
-    """Registration (the device in ``patient``) and calibration (the probe in the body).
-
-    Raises:
-        CalibrationError: a file of one of them cannot be used.
-    """
-    tracker = scene.tracker
-    return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
-
-
-def haptic_rendering_of(scene: Scene) -> HapticRendering:
-    """What tells the wrench on the handle of the scene's haptic arm.
-
-    Raises:
-        CalibrationError: a file of a registration or calibration cannot be used.
-    """
-    from us_sim.tracking.haptic_device import HapticDevice
-    from us_sim.tracking.haptic_rendering import HapticRendering
-    from us_sim.tracking.haptic_settings import HapticSettings
-
-    tracker = scene.tracker
-    settings = tracker.haptic or HapticSettings()
-    device = HapticDevice(settings, *tracker_poses_of(scene))
-    return HapticRendering(settings, device, time_offset=tracker.time_offset)
-
-
-def _pose_or_file(given: PoseSection | str | None) -> Pose:
-    if isinstance(given, str):
-        from us_sim.tracking.transform_file import read_transform
-
-        return read_transform(given)
-    return _pose(given) if given is not None else Pose()
-
-
-def camera_body_of(scene: Scene) -> RigidBody:
-    """The markers on the probe that the scene's camera looks for.
-
-    Raises:
-        TrackingError: their file cannot be used.
-    """
-    from us_sim.tracking.camera_settings import CameraSettings
-    from us_sim.tracking.rigid_body import RigidBody
-
-    settings = scene.tracker.camera or CameraSettings()
-    if settings.body:
-        from us_sim.tracking.rigid_body_file import read_rigid_body
-
-        return read_rigid_body(settings.body, settings.dictionary)
-    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
 
 
 def collider_of(scene: Scene) -> Collider:
@@ -330,7 +247,7 @@ def _mesh(section: TissueSection) -> tuple[TetrahedralMesh, tuple[str, ...]]:
     if given.file:
         from us_sim.tissue.mesh_file import read_mesh
 
-        mesh, remarks = read_mesh(Path(given.file), given.unit, _pose(given.pose))
+        mesh, remarks = read_mesh(Path(given.file), given.unit, pose_of(given.pose))
         parts = int(mesh.parts.max()) + 1
         if parts > 1:
             remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
@@ -348,7 +265,8 @@ def _mesh(section: TissueSection) -> tuple[TetrahedralMesh, tuple[str, ...]]:
     return box_mesh(*planes), ()
 
 
-def _pose(section: PoseSection) -> Pose:
+def pose_of(section: PoseSection) -> Pose:
+    """The pose that a scene writes down."""
     return Pose(np.array(section.position), np.array(section.orientation))
 
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from us_sim.assembly import camera_body_of, path_of, tracking_of
+from us_sim.assembly import path_of
 from us_sim.scene import Scene
+from us_sim.tracker_assembly import camera_body_of, tracking_of
 
 __all__ = ["check_files"]
 

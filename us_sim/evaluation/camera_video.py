@@ -19,7 +19,6 @@ import yaml
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from us_sim.assembly import camera_body_of, tracker_poses_of
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.evaluation.rendered_views import Conditions, RenderedView
@@ -27,6 +26,7 @@ from us_sim.evaluation.tracking_cases import CAMERAS
 from us_sim.pose import Pose
 from us_sim.recording.path import ProbePath
 from us_sim.scene import Scene
+from us_sim.tracker_assembly import camera_body_of, tracker_poses_of
 from us_sim.tracking.camera_info import write_camera_info
 from us_sim.tracking.rigid_body import RigidBody
 from us_sim.tracking.se3 import interpolate, rotation_between

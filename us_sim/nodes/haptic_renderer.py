@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from rclpy.time import Time
 from std_msgs.msg import Bool, Float64MultiArray
 
-from us_sim.assembly import haptic_rendering_of
 from us_sim.errors import SceneError, UsSimError
 from us_sim.nodes.conversions import contact_model_from, pose_from, wrench_serialized
 from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.tracker_assembly import haptic_rendering_of
 from us_sim.tracking.haptic_settings import HapticSettings
 
 __all__ = ["HapticRenderer", "main"]

@@ -14,7 +14,6 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from us_sim.assembly import tracking_of
 from us_sim.errors import PoseError, SceneError
 from us_sim.nodes.conversions import pose_from, pose_message, transform_message
 from us_sim.nodes.parameters import fixed_parameter
@@ -23,6 +22,7 @@ from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.tracker_inputs import INPUTS, create_input
 from us_sim.pose import Pose
+from us_sim.tracker_assembly import tracking_of
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.tracking_state import TrackingState
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from us_sim.assembly import camera_body_of
 from us_sim.errors import TrackingError
 from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
 from us_sim.nodes.newest import Newest
+from us_sim.tracker_assembly import camera_body_of
 from us_sim.tracking.camera_settings import CameraSettings
 from us_sim.tracking.camera_source import CameraSource
 from us_sim.tracking.camera_warm_up import practice
