@@ -15,7 +15,7 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.switching import SwitchableTissue
-from us_sim.tracking.contact_model import ContactModel, SecantStiffness
+from us_sim.tracking.contact_model import ContactModel, SecantStiffness, wrench_in_patient
 
 __all__ = ["ContactModelPublisher"]
 
@@ -41,8 +41,7 @@ class ContactModelPublisher:
         self, tissue: SwitchableTissue, pose: Pose, deformation: Deformation, stamp: TimeMessage
     ) -> None:
         """Publish the model at a pose, just solved for, under its stamp."""
-        turn = pose.rotation
-        wrench = np.concatenate([turn @ deformation.force, turn @ deformation.torque])
+        wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
         try:
             stiffness = tissue.contact_stiffness()
         except np.linalg.LinAlgError:

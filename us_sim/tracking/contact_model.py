@@ -26,7 +26,7 @@ from us_sim.errors import TrackingError
 from us_sim.pose import Pose
 from us_sim.tracking import se3
 
-__all__ = ["ContactModel", "SecantStiffness"]
+__all__ = ["ContactModel", "SecantStiffness", "wrench_in_patient"]
 
 _HEAVIEST, _STIFFEST = 1e5, 1e9
 """N and N/m beyond which a model is not believed."""
@@ -42,6 +42,13 @@ _STIFFEST_SECANT = 3e3
 
 _NEAR = 5e-4
 """m along the push: two poses nearer tell nothing of the stiffness between them."""
+
+
+def wrench_in_patient(
+    pose: Pose, force: NDArray[np.float64], torque: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(6,) N, N m: force and torque (3,) along the probe's axes, along those of ``patient``."""
+    return np.concatenate([pose.rotation @ force, pose.rotation @ torque])
 
 
 @dataclass(frozen=True, eq=False)
