@@ -27,7 +27,7 @@ def console_scripts() -> list[str]:
     colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel, all of whose scripts
     land on PATH.
     """
-    scripts = ["us-sim = us_sim.cli:main"]
+    scripts = ["us-sim = us_sim.command.main:main"]
     if {"install", "develop"} & set(sys.argv):
         scripts += [f"{node} = us_sim.nodes.{node}:main" for node in NODES]
     return scripts

@@ -7,10 +7,10 @@ from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from us_sim.assembly import path_of
 from us_sim.errors import UsSimError
-from us_sim.graph import player_settings
-from us_sim.scene_file import load_scene
+from us_sim.run.graph import player_settings
+from us_sim.scene.building import path_of
+from us_sim.scene.reading import load_scene
 from us_sim.share import find_bag
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from us_sim.cli import main
+from us_sim.command.main import main
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 

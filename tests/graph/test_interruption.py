@@ -33,7 +33,7 @@ def processes_of(marker: str) -> list[int]:
 def test_ctrl_c(played_scene, tmp_path, images):
     out = tmp_path / "out"
     marker = f"INTERRUPTED_RUN={tmp_path}"
-    command = [sys.executable, "-m", "us_sim.cli", "demo", str(played_scene), "--out", str(out)]
+    command = [sys.executable, "-m", "us_sim", "demo", str(played_scene), "--out", str(out)]
     command += ["--param", "path_player.loop=true"]
     recording = out / "session.mcap"
     name, value = marker.split("=", 1)

@@ -8,9 +8,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
-from us_sim.assembly import probe_of
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.scene.building import probe_of
 
 TOPIC = "ultrasound/image_annotated"
 LABELS = {5: "artery", 6: "vein"}

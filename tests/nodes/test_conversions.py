@@ -15,6 +15,7 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import MeshError, ProbeError, VolumeError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import (
     affine_from,
     affine_message,
@@ -31,7 +32,6 @@ from us_sim.nodes.conversions import (
     tetrahedra_message,
     vectors_from,
 )
-from us_sim.pose import Pose
 
 STAMP = Time(sec=3, nanosec=4)
 quick = settings(max_examples=25, deadline=None)

@@ -9,6 +9,7 @@ from rclpy.time import Time
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, TrackingError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import (
     contact_model_from,
     contact_model_message,
@@ -18,8 +19,7 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.pose import Pose
-from us_sim.tracking.contact_model import ContactModel
+from us_sim.tracking.haptic.contact_model import ContactModel
 
 TRACKER = (
     "tracker: {source: haptic, frame: arm, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s"

@@ -7,11 +7,11 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
-from us_sim.assembly import membrane_of
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import vectors_from
 from us_sim.nodes.skin_deformer import SkinDeformer
-from us_sim.pose import Pose
-from us_sim.scene_file import load_scene
+from us_sim.scene.building import membrane_of
+from us_sim.scene.reading import load_scene
 
 
 def test_vertices_normals_marker_and_latched_mesh(bench, small_scene):

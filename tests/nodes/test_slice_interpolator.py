@@ -11,7 +11,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.assembly import probe_of, tissue_model_of, volume_of
 from us_sim.errors import ProbeError
 from us_sim.nodes import slice_interpolator
 from us_sim.nodes.conversions import (
@@ -22,9 +21,10 @@ from us_sim.nodes.conversions import (
     tetrahedra_message,
 )
 from us_sim.nodes.slice_interpolator import SliceInterpolator
-from us_sim.scene_file import load_scene
-from us_sim.slicing.resampling import sample_plane
-from us_sim.slicing.slicer import create_slicer
+from us_sim.scene.building import probe_of, tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene
+from us_sim.slicing.cutting.resampling import sample_plane
+from us_sim.slicing.cutting.slicer import create_slicer
 
 BARE = """
 name: bare

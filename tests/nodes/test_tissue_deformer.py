@@ -10,15 +10,15 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError, SolverError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes import tissue_deformer
 from us_sim.nodes.conversions import contact_model_from, tetrahedra_from, vectors_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.pose import Pose
-from us_sim.scene_file import load_scene
-from us_sim.structures import structures_of
-from us_sim.tissue.solver import create_solver
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene
+from us_sim.scene.structures import structures_of
+from us_sim.tissue.solvers.solver import create_solver
 
 
 @pytest.fixture

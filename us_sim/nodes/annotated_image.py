@@ -13,9 +13,9 @@ from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import colour_image_message
 from us_sim.nodes.pose_age import PoseAge
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.slicing.annotation import Annotation, Badge
-from us_sim.slicing.probe import Probe
-from us_sim.structures import colour_of
+from us_sim.scene.structures import colour_of
+from us_sim.slicing.drawing.annotation import Annotation, Badge
+from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["AnnotatedImage"]
 

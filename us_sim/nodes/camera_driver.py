@@ -23,9 +23,9 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
-from us_sim.tracking.camera_info import read_camera_info
-from us_sim.tracking.camera_model import CameraModel
-from us_sim.tracking.video_source import VideoSource
+from us_sim.tracking.camera.info import read_camera_info
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.video_source import VideoSource
 
 __all__ = ["CameraDriver", "main"]
 

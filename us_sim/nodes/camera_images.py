@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from us_sim.errors import TrackingError
-from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.camera.model import CameraModel
 
 __all__ = ["camera_from", "grey_from", "grey_from_compressed"]
 

@@ -17,8 +17,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from us_sim.errors import ProbeError, UsSimError
-from us_sim.slicing.imaging import Imaging
-from us_sim.slicing.probe import Probe
+from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["Console"]
 

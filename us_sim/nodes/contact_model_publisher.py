@@ -10,12 +10,12 @@ from rclpy.time import Time
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import TrackingError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import contact_model_message
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.pose import Pose
 from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.switching import SwitchableTissue
-from us_sim.tracking.contact_model import ContactModel, SecantStiffness, wrench_in_patient
+from us_sim.tissue.solvers.switching import SwitchableTissue
+from us_sim.tracking.haptic.contact_model import ContactModel, SecantStiffness, wrench_in_patient
 
 __all__ = ["ContactModelPublisher"]
 

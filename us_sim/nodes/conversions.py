@@ -21,8 +21,8 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker
 
 from us_sim.errors import MeshError, PoseError, ProbeError, TrackingError, VolumeError
-from us_sim.pose import Pose
-from us_sim.tracking.contact_model import ContactModel
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.haptic.contact_model import ContactModel
 
 __all__ = [
     "affine_from",

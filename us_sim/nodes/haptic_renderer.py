@@ -19,8 +19,8 @@ from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.tracker_assembly import haptic_rendering_of
-from us_sim.tracking.haptic_settings import HapticSettings
+from us_sim.scene.tracker_building import haptic_rendering_of
+from us_sim.tracking.haptic.settings import HapticSettings
 
 __all__ = ["HapticRenderer", "main"]
 

@@ -13,14 +13,14 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import SceneError, UsSimError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import affine_from, pixels_from, pose_from
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.pose import Pose
-from us_sim.tracking.openigtlink_message import image_message, transform_message
-from us_sim.tracking.openigtlink_server import OpenIGTLinkServer
+from us_sim.tracking.openigtlink.message import image_message, transform_message
+from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
 
 __all__ = ["OpenIGTLinkBridge", "main"]
 

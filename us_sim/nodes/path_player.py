@@ -14,13 +14,13 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
-from us_sim.pose import Pose
 from us_sim.recording.path import ProbePath, read_path
 
 __all__ = ["PathPlayer", "main"]

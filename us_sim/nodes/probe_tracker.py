@@ -15,16 +15,16 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import pose_from, pose_message, transform_message
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.tracker_inputs import INPUTS, create_input
-from us_sim.pose import Pose
-from us_sim.tracker_assembly import tracking_of
+from us_sim.scene.tracker_building import tracking_of
 from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.tracking_state import TrackingState
+from us_sim.tracking.state import TrackingState
 
 __all__ = ["ProbeTracker", "main"]
 

@@ -14,8 +14,8 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.newest import Newest
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
-from us_sim.scene import Scene
-from us_sim.scene_file import load_scene
+from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
 
 __all__ = ["SceneNode"]
 

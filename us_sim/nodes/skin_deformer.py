@@ -12,11 +12,11 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
-from us_sim.assembly import membrane_of
 from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import cloud_message, mesh_message, pose_from, surface_marker
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.scene.building import membrane_of
 
 __all__ = ["SkinDeformer", "main"]
 

@@ -11,8 +11,8 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.assembly import probe_of, scanner_of, volume_of
 from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.console import Console
 from us_sim.nodes.conversions import (
@@ -25,9 +25,9 @@ from us_sim.nodes.conversions import (
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.pose import Pose
-from us_sim.slicing.imaging import Imaging
-from us_sim.slicing.probe import Probe
+from us_sim.scene.building import probe_of, scanner_of, volume_of
+from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["SliceInterpolator", "main"]
 

@@ -15,7 +15,7 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import fixed_parameter
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
-from us_sim.tracking.space_mouse import SpaceMouse
+from us_sim.tracking.mouse.space_mouse import SpaceMouse
 
 __all__ = ["SpaceMouseDriver", "main"]
 

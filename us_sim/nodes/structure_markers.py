@@ -12,12 +12,12 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.assembly import volume_of
 from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import structure_markers
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.structures import Structure, structures_of
-from us_sim.tissue.mesh import TetrahedralMesh
+from us_sim.scene.building import volume_of
+from us_sim.scene.structures import Structure, structures_of
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["StructureMarkers"]
 

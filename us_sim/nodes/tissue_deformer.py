@@ -12,7 +12,6 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.assembly import tissue_model_of, volume_of
 from us_sim.errors import SceneError, SolverError, UsSimError
 from us_sim.nodes.conversions import (
     cloud_message,
@@ -22,8 +21,9 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.tissue.solver import SOLVERS
-from us_sim.tissue.switching import SwitchableTissue
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.tissue.solvers.solver import SOLVERS
+from us_sim.tissue.solvers.switching import SwitchableTissue
 
 if TYPE_CHECKING:
     from us_sim.nodes.contact_model_publisher import ContactModelPublisher

@@ -88,7 +88,7 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
         TrackingError: the same of a recording.
     """
     if is_tracker_recording(path):
-        from us_sim.tracking.plus_recording import read_tracker_recording
+        from us_sim.recording.plus_recording import read_tracker_recording
 
         return read_tracker_recording(path).probe_path(topic)
     bag = read_bag(path)
@@ -182,7 +182,7 @@ def _extract(bag: Bag, topic: BagTopic, messages: list[BagMessage]) -> ProbePath
             f"{bag.path} holds poses on {topic.name} in the frames {', '.join(frames)}: a path "
             f"has one frame"
         )
-    # What us_sim.pose.Pose refuses; a zero quaternion is what a tracker sends for a lost marker.
+    # What geometry.pose.Pose refuses; a zero quaternion is what a tracker sends for a lost marker.
     with np.errstate(invalid="ignore"):
         has_orientation = np.linalg.norm(poses[:, 3:], axis=1) >= 1e-6
     usable = np.isfinite(poses).all(axis=1) & has_orientation

@@ -1,7 +1,7 @@
 """Contact of particles with the probe on its way, as the rigid limit of the paper's repulsion.
 
 >>> import numpy as np
->>> from us_sim.collider import Sphere
+>>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.skin.contact import push_out
 >>> particle, velocity = np.array([[0.0, 0, 0]]), np.array([[0.1, 0, -0.5]])
 >>> normal, touched = np.zeros((1, 3)), np.zeros(1, dtype=bool)
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from us_sim.collider import offset_box_distance
+from us_sim.geometry.collider import offset_box_distance
 
 __all__ = ["push_out"]
 

@@ -11,8 +11,8 @@ prestrained here, and the anchors carry the tension at rest. With ``prestrain=0`
 the paper's.
 
 >>> import numpy as np
->>> from us_sim.collider import Sphere
->>> from us_sim.pose import Pose
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
 >>> from us_sim.skin.membrane import SkinMembrane
 >>> from us_sim.skin.surface import plane_surface
 >>> skin = SkinMembrane(plane_surface((0.1, 0.1), 0.005), Sphere(0.03))
@@ -30,9 +30,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from us_sim.collider import Collider, signed_distance
 from us_sim.errors import SolverError
-from us_sim.pose import Pose
+from us_sim.geometry.collider import Collider, signed_distance
+from us_sim.geometry.pose import Pose
 from us_sim.skin.contact import push_out
 from us_sim.skin.springs import spring_energy, spring_forces
 from us_sim.skin.surface import TriangleSurface, vertex_normals

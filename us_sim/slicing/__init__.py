@@ -1,1 +1,1 @@
-"""Images cut from a volume that deformed tissue carries: probe, section, location, resampling."""
+"""B-mode images from the volume that deformed tissue carries."""

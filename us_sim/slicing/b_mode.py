@@ -1,8 +1,8 @@
 """The scanner as a whole: what a probe shows of a volume, with deformed tissue or without.
 
->>> from us_sim.assembly import probe_of, volume_of
->>> from us_sim.pose import Pose
->>> from us_sim.scene_file import parse_scene
+>>> from us_sim.scene.building import probe_of, volume_of
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.scene.reading import parse_scene
 >>> from us_sim.slicing.b_mode import BMode
 >>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm", "voxel_size": "1 mm"},
 ...                      "probe": {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]}})
@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.mesh_faces import boundary_triangles
-from us_sim.pose import Pose
-from us_sim.slicing.image_formation import ImageFormation
-from us_sim.slicing.imaging import Imaging
-from us_sim.slicing.plane import SlicePlane
-from us_sim.slicing.probe import Probe
-from us_sim.slicing.resampling import sample_labels, sample_plane
-from us_sim.slicing.slicer import Slicer, create_slicer, warm_up
+from us_sim.geometry.mesh_faces import boundary_triangles
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
+from us_sim.slicing.formation.image_formation import ImageFormation
+from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
-    from us_sim.slicing.coupling import ContactSurface
+    from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.volume.volume import Volume
 
 __all__ = ["BMode"]
@@ -155,7 +155,7 @@ class BMode:
     def _contact_surface(self, deformed: bool) -> ContactSurface:
         """What the transducer's face can touch: the tissue, or the box of a volume without."""
         if self._surface is None:
-            from us_sim.slicing.coupling import ContactSurface
+            from us_sim.slicing.formation.coupling import ContactSurface
 
             if deformed and self._mesh is not None:
                 rest_nodes, tetrahedra = self._mesh

@@ -1,9 +1,9 @@
 """What every tissue solver is given: mesh, materials, what is held, and what the probe can touch.
 
->>> from us_sim.collider import Sphere
->>> from us_sim.tissue.box import face_nodes
->>> from us_sim.tissue.materials import Material, uniform_material
->>> from us_sim.tissue.mesh import box_mesh, uniform_planes
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
 >>> mesh = box_mesh(across, across, deep)
 >>> held = np.zeros(len(mesh.nodes), dtype=bool)
@@ -22,10 +22,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.collider import Collider
 from us_sim.errors import MeshError
-from us_sim.tissue.materials import TissueMaterials
-from us_sim.tissue.mesh import TetrahedralMesh
+from us_sim.geometry.collider import Collider
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TissueModel"]
 

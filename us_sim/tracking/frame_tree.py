@@ -1,6 +1,6 @@
 """Frames and their parents, as `tf` tells them, and the way from one up to another.
 
->>> from us_sim.pose import Pose
+>>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.frame_tree import FrameTree
 >>> tree = FrameTree()
 >>> tree.place("tool", "base", Pose([0.0, 0.0, 0.2])), tree.place("tip", "tool", Pose([0.1, 0, 0]))
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 
 __all__ = ["FrameTree"]
 

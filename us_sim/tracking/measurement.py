@@ -1,7 +1,7 @@
 """One pose of a tracked body as a device measured it.
 
 >>> import numpy as np
->>> from us_sim.pose import Pose
+>>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.measurement import Measurement
 >>> seen = Measurement(1_000_000_000, Pose([0.0, 0.0, 0.4]), np.diag([1e-8] * 3 + [1e-5] * 3))
 >>> round(1e3 * float(seen.position_deviation), 2)  # mm
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 
 __all__ = ["Measurement"]
 

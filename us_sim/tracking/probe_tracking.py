@@ -1,11 +1,11 @@
 """From what a device measured to where the probe is: registered, checked, filtered.
 
 >>> import numpy as np
->>> from us_sim.pose import Pose
->>> from us_sim.tracking.filter_settings import FilterSettings, GateSettings
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.filter.settings import FilterSettings, GateSettings
 >>> from us_sim.tracking.measurement import Measurement
->>> from us_sim.tracking.outlier_gate import OutlierGate
->>> from us_sim.tracking.pose_filter import make_filter
+>>> from us_sim.tracking.filter.outlier_gate import OutlierGate
+>>> from us_sim.tracking.filter.pose_filter import make_filter
 >>> from us_sim.tracking.probe_tracking import ProbeTracking
 >>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
@@ -33,12 +33,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import adjoint, product
+from us_sim.tracking.filter.outlier_gate import OutlierGate, Verdict
+from us_sim.tracking.filter.pose_filter import PoseFilter
 from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.outlier_gate import OutlierGate, Verdict
-from us_sim.tracking.pose_filter import PoseFilter
-from us_sim.tracking.se3 import adjoint, product
-from us_sim.tracking.tracking_state import TrackingClock, TrackingState
+from us_sim.tracking.state import TrackingClock, TrackingState
 
 __all__ = ["ProbeTracking"]
 

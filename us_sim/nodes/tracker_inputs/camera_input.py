@@ -11,10 +11,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from us_sim.errors import TrackingError
 from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
 from us_sim.nodes.newest import Newest
-from us_sim.tracker_assembly import camera_body_of
-from us_sim.tracking.camera_settings import CameraSettings
-from us_sim.tracking.camera_source import CameraSource
-from us_sim.tracking.camera_warm_up import practice
+from us_sim.scene.tracker_building import camera_body_of
+from us_sim.tracking.camera.settings import CameraSettings
+from us_sim.tracking.camera.source import CameraSource
+from us_sim.tracking.camera.warm_up import practice
 
 if TYPE_CHECKING:
     from us_sim.nodes.probe_tracker import ProbeTracker

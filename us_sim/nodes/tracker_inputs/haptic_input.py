@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Bool
 
-from us_sim.tracking.haptic_device import HapticDevice
-from us_sim.tracking.haptic_settings import HapticSettings
+from us_sim.tracking.haptic.device import HapticDevice
+from us_sim.tracking.haptic.settings import HapticSettings
 
 if TYPE_CHECKING:
     from us_sim.nodes.probe_tracker import ProbeTracker

@@ -7,8 +7,8 @@ import threading
 from typing import TYPE_CHECKING
 
 from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.openigtlink_client import OpenIGTLinkClient
-from us_sim.tracking.openigtlink_settings import OpenIGTLinkSettings
+from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
+from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 
 if TYPE_CHECKING:
     from us_sim.nodes.probe_tracker import ProbeTracker

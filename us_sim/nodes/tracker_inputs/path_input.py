@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from us_sim.assembly import path_of
 from us_sim.errors import SceneError
-from us_sim.graph import awaited_topics
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
+from us_sim.run.graph import awaited_topics
+from us_sim.scene.building import path_of
 from us_sim.tracking.measurement import Measurement
 
 if TYPE_CHECKING:

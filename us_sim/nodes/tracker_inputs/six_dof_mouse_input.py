@@ -8,8 +8,8 @@ from geometry_msgs.msg import Twist
 from rclpy.time import Time
 from sensor_msgs.msg import Joy
 
-from us_sim.tracking.six_dof_mouse import SixDofMouse
-from us_sim.tracking.six_dof_mouse_settings import SixDofMouseSettings
+from us_sim.tracking.mouse.settings import SixDofMouseSettings
+from us_sim.tracking.mouse.six_dof_mouse import SixDofMouse
 
 if TYPE_CHECKING:
     from us_sim.nodes.probe_tracker import ProbeTracker

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError, TrackingError
-from us_sim.tracking.markers import dictionary
+from us_sim.tracking.camera.markers import dictionary
 
 __all__ = ["BOARDS", "Board", "BoardView"]
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.board import BoardView
-from us_sim.tracking.camera_model import CameraModel
+from us_sim.tracking.camera.model import CameraModel
 
 __all__ = ["INTRINSICS", "CameraCalibration", "calibrate_camera"]
 

@@ -16,7 +16,7 @@ from us_sim.progress import Progress
 from us_sim.tracking.calibration.board import Board, BoardView
 from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
 from us_sim.tracking.calibration.report_picture import draw_coverage
-from us_sim.tracking.camera_info import write_camera_info
+from us_sim.tracking.camera.info import write_camera_info
 
 __all__ = ["calibrate_photos", "find_photos"]
 

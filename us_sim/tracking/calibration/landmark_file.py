@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.quantity import Quantity
+from us_sim.settings.quantity import Quantity
 
 __all__ = ["read_landmarks", "read_table", "read_wires"]
 

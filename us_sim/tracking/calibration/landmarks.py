@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 
 __all__ = ["LandmarkRegistration", "register_landmarks"]
 

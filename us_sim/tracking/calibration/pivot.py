@@ -4,7 +4,7 @@ A pose (R, p) of the body puts the tip t at R t + p, which is the same point c f
 [R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
 
 >>> import numpy as np
->>> from us_sim.pose import Pose
+>>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.calibration.pivot import calibrate_pivot
 >>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
 >>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 
 __all__ = ["PivotCalibration", "calibrate_pivot"]
 

@@ -6,7 +6,7 @@ lies that the pixel shows, or anywhere on its wire. The linear solution starts t
 in which a and b are perpendicular and have lengths, the pixels' sizes.
 
 >>> import numpy as np
->>> from us_sim.pose import Pose
+>>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
 >>> rng = np.random.default_rng(0)
 >>> seen, pin = [], np.zeros((1, 3))
@@ -33,7 +33,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 
 __all__ = ["PixelSighting", "ProbeCalibration", "calibrate_probe"]
 

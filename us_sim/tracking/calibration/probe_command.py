@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError, PoseError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import interpolate
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
 from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
 from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
-from us_sim.tracking.se3 import interpolate
-from us_sim.tracking.transform_file import read_transform, write_transform
+from us_sim.tracking.calibration.transform_file import read_transform, write_transform
 
 __all__ = ["calibrate_image"]
 

@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
 from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
+from us_sim.recording.plus_recording import read_tracker_recording
 from us_sim.tracking.calibration.position_signal import (
     PositionSignal,
     signal_of_images,
     signal_of_positions,
 )
-from us_sim.tracking.plus_recording import read_tracker_recording
 from us_sim.volume.sequence_header import frame_fields
 from us_sim.volume.stored_size import metaimage_header
 from us_sim.volume.sweep import Sweep, read_sweep

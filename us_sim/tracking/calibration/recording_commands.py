@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.pose import Pose
+from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.dwell import find_dwells
 from us_sim.tracking.calibration.landmark_file import read_landmarks
 from us_sim.tracking.calibration.landmarks import register_landmarks
@@ -22,7 +22,11 @@ from us_sim.tracking.calibration.recorded_motion import (
 )
 from us_sim.tracking.calibration.report_picture import draw_offset
 from us_sim.tracking.calibration.time_offset import find_time_offset
-from us_sim.tracking.transform_file import read_transform, write_calibration, write_transform
+from us_sim.tracking.calibration.transform_file import (
+    read_transform,
+    write_calibration,
+    write_transform,
+)
 
 __all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
 

@@ -1,0 +1,148 @@
+"""Forces that judge solvers, against hand-made numbers, scikit-fem, and derivatives of energies."""
+
+import numpy as np
+import pytest
+import skfem
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from us_sim.evaluation.stability.cases import StabilityCase, model_of
+from us_sim.evaluation.stability.independent_residual import (
+    IndependentResidual,
+    averaged_hooke_forces,
+    hooke_forces,
+    neo_hookean_forces,
+    push_directions,
+    spring_forces,
+    volume_forces,
+)
+from us_sim.evaluation.stability.meshes import mesh_named
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+
+RANDOM = np.random.default_rng(2)
+
+
+def materials_of(mesh, ratio):
+    count = len(mesh.tetrahedra)
+    modulus = 10 ** RANDOM.uniform(3, 6, count)
+    return TissueMaterials(modulus, np.full(count, ratio), np.full(count, 1e3))
+
+
+def test_hookes_forces_are_those_of_scikit_fem():
+    mesh = mesh_named("delaunay")
+    materials = uniform_material(mesh, Material(2e4, 0.4))
+    grid = skfem.MeshTet(mesh.nodes.T, mesh.tetrahedra.T)
+    basis = skfem.Basis(grid, skfem.ElementVector(skfem.ElementTetP1()))
+    matrix = linear_elasticity(*lame_parameters(2e4, 0.4)).assemble(basis)
+    displacement = 1e-3 * RANDOM.standard_normal(mesh.nodes.shape)
+    expected = (matrix @ displacement.ravel()).reshape(-1, 3)
+    forces = hooke_forces(mesh, materials, displacement)
+    assert np.abs(forces - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+def test_averaging_changes_nothing_where_the_strain_is_uniform_or_the_ratio_moderate():
+    mesh = mesh_named("perturbed")
+    uniform = mesh.nodes @ RANDOM.standard_normal((3, 3)) * 1e-2
+    nearly = uniform_material(mesh, Material(1e4, 0.499))
+    expected = hooke_forces(mesh, nearly, uniform)
+    averaged = averaged_hooke_forces(mesh, nearly, uniform)
+    assert np.abs(averaged - expected).max() < 1e-9 * np.abs(expected).max()
+    moderate = materials_of(mesh, 0.4)
+    any_field = 1e-3 * RANDOM.standard_normal(mesh.nodes.shape)
+    expected = hooke_forces(mesh, moderate, any_field)
+    averaged = averaged_hooke_forces(mesh, moderate, any_field)
+    assert np.abs(averaged - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_neo_hookean_forces_are_the_derivative_of_their_energy():
+    mesh = mesh_named("perturbed")
+    materials = materials_of(mesh, 0.49)
+    displacement = 2e-3 * RANDOM.standard_normal(mesh.nodes.shape)
+    direction = RANDOM.standard_normal(mesh.nodes.shape)
+    h = 1e-7
+    difference = (
+        _energy(mesh, materials, displacement + h * direction)
+        - _energy(mesh, materials, displacement - h * direction)
+    ) / (2 * h)
+    forces = neo_hookean_forces(mesh, materials, displacement)
+    assert (forces * direction).sum() == pytest.approx(difference, rel=1e-6)
+
+
+def test_neo_hookean_forces_are_linear_for_little_and_none_for_rotations():
+    mesh = mesh_named("perturbed")
+    materials = materials_of(mesh, 0.499)
+    little = 1e-9 * RANDOM.standard_normal(mesh.nodes.shape)
+    linear = averaged_hooke_forces(mesh, materials, little)
+    difference = neo_hookean_forces(mesh, materials, little) - linear
+    assert np.abs(difference).max() < 1e-5 * np.abs(linear).max()
+    turned = Pose(orientation=[0.2, 0.5, -0.3, 0.6]).apply(mesh.nodes) - mesh.nodes
+    forces = neo_hookean_forces(mesh, materials, turned)
+    assert np.abs(forces).max() < 1e-10 * materials.young_modulus.max() * 0.1**2
+
+
+def test_one_spring_and_one_tetrahedron_by_hand():
+    rest = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
+    moved = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])  # twice as long: 5 m more
+    force = spring_forces(np.array([[0, 1]]), np.array([10.0]), rest, moved)
+    assert force == pytest.approx(np.array([[-30.0, -40.0, 0.0], [30.0, 40.0, 0.0]]))
+
+    mesh = mesh_named("tetrahedron")
+    one = np.ones(1)
+    stretched = mesh.nodes * [0.0, 0.0, 0.1]  # J = 1.1
+    for element, nodal in ((3e4 * one, 0 * one), (0 * one, 3e4 * one)):
+        force = volume_forces(mesh, element, nodal, stretched)
+        # A pressure of 3000 Pa pulls back. On the bottom, of 0.06 * 0.07 / 2 m2, it takes that
+        # times the area; the sides take as much upwards, two thirds of it at the bottom's nodes.
+        assert force[1:, 2].sum() == pytest.approx(3000 * 0.06 * 0.07 / 2 / 3, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "collider",
+    [Sphere(0.03), Sphere(0.001), Capsule(0.012, 0.04), RoundedBox(0.06, 0.05, 0.05, 0.02)],
+)
+def test_push_directions_follow_the_rule_of_contact(collider):
+    pose = Pose([0.002, -0.001, 0.01], [0.2, -0.1, 0.3, 0.9])
+    points = pose.apply(RANDOM.uniform([-0.02, -0.02, -0.03], [0.02, 0.02, 0.01], (200, 3)))
+    gap, normal = push_out(collider, pose, points, 0.002)
+    found = push_directions(collider, pose, points, 0.002)
+    assert found[np.isfinite(gap)] == pytest.approx(normal[np.isfinite(gap)], abs=1e-12)
+
+
+def test_the_residual_is_unbalanced_over_contact_force():
+    model = model_of(StabilityCase("plain", collider="plate"))
+    node = int(model.movable_contact_nodes[5])
+    other = int(np.flatnonzero(~model.fixed)[0])
+    force = np.zeros_like(model.mesh.nodes)
+    force[node] = [0.3, 0.0, 4.0]  # 4 N of push, 0.3 N along the surface
+    force[other] = [0.0, 0.4, 0.0]
+    check = IndependentResidual(model, lambda _: force, 0.0)
+    deformation = Deformation(
+        model.mesh.nodes, np.array([node], np.int32), np.zeros(3), np.zeros(3), 0.0
+    )
+    assert check.check(deformation, Pose())[0] == pytest.approx(0.5 / 4)
+    force[node, 2] = -4.0  # a pull is not balanced, and refers to the push before
+    assert check.check(deformation, Pose())[0] == pytest.approx(np.hypot(4.0, 0.5) / 4)
+
+
+def _energy(mesh, materials, displacement):
+    """The stable neo-Hookean energy with averaged pressures, J, tetrahedron by tetrahedron."""
+    weight, mean, energy = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes)), 0.0
+    for i, corners in enumerate(mesh.tetrahedra):
+        rest, now = mesh.nodes[corners], (mesh.nodes + displacement)[corners]
+        edges = (rest[1:] - rest[0]).T
+        gradient = (now[1:] - now[0]).T @ np.linalg.inv(edges)
+        volume, swollen = np.linalg.det(edges) / 6, np.linalg.det(gradient)
+        shear = materials.young_modulus[i] / (2 + 2 * materials.poisson_ratio[i])
+        whole = shear / (1 - 2 * materials.poisson_ratio[i])
+        own = min(whole, 5 * shear)
+        energy += volume * (
+            shear / 2 * ((gradient**2).sum() - 3)
+            - shear * (swollen - 1)
+            + own / 2 * (swollen - 1) ** 2
+        )
+        weight[corners] += (whole - own) * volume / 4
+        mean[corners] += (whole - own) * volume / 4 * (swollen - 1)
+    return energy + 0.5 * (mean**2 / weight).sum()

@@ -1,0 +1,246 @@
+"""The search for instability finds nothing in good solvers, and in broken ones what is broken."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from us_sim.evaluation.stability import measure as stability
+from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
+from us_sim.evaluation.stability.measure import COLUMNS, evaluate_stability
+from us_sim.evaluation.stability.meshes import MESHES, SUPPORTS, fixed_nodes, mesh_named, parts
+from us_sim.evaluation.stability.motions import poses_of
+from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
+from us_sim.evaluation.stability.points import Trial, agrees, equations_of, run_trial, try_case
+from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
+from us_sim.tissue.solvers.fem_cg import FemCg
+
+CASE = StabilityCase("press", depth=0.2, contrast=10.0)
+
+
+class Lying(FemCg):
+    """Reports a hundredth of its residual."""
+
+    def _advance(self, pose):
+        deformation = super()._advance(pose)
+        return replace(deformation, residual=deformation.residual / 100)
+
+
+class Drifting(FemCg):
+    """Moves one node on and on, and says that nothing happened."""
+
+    def _advance(self, pose):
+        deformation = super()._advance(pose)
+        self._away = getattr(self, "_away", 0.0) + 0.5
+        deformation.nodes[0, 0] += self._away
+        return deformation
+
+    def _is_plausible(self, _):
+        return True
+
+
+class NotFinite(FemCg):
+    """Ends in a force that is not a number."""
+
+    def _advance(self, pose):
+        return replace(super()._advance(pose), force=np.full(3, np.nan))
+
+    def _is_plausible(self, _):
+        return True
+
+
+class Failing(FemCg):
+    """Raises what no user understands."""
+
+    def _advance(self, _):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+
+class Stuck(FemCg):
+    """Deforms once, and then fails in every frame."""
+
+    def _is_plausible(self, _):
+        self._tries = getattr(self, "_tries", 0) + 1
+        return self._tries < 3
+
+
+def tried(solver, case=CASE):
+    trial = Trial()
+    model = model_of(case)
+    run_trial(solver(model), equations_of("fem_cg", case, model), case, trial)
+    return trial
+
+
+def test_a_good_solver_passes():
+    trial = tried(FemCg)
+    assert trial.passed
+    assert trial.recovered_mm == 0.0
+    assert agrees(trial.residual_reported, trial.residual_checked, 0.0)
+
+
+def test_a_solver_that_understates_its_residual_is_caught():
+    trial = tried(Lying)
+    assert trial.finite
+    assert trial.bounded
+    assert not trial.truthful
+    assert not trial.passed
+    assert trial.residual_checked == pytest.approx(100 * trial.residual_reported, rel=1e-6)
+
+
+def test_a_solver_that_drifts_off_is_caught():
+    assert not tried(Drifting).bounded
+
+
+def test_a_solver_that_returns_nan_is_caught():
+    assert not tried(NotFinite).finite
+
+
+def test_a_solver_that_raises_is_caught():
+    trial = tried(Failing)
+    assert not trial.finite
+    assert "LinAlgError" in trial.failure
+
+
+def test_a_solver_that_fails_for_ever_is_caught():
+    trial = tried(Stuck)
+    assert trial.finite
+    assert trial.bounded
+    assert trial.kept > 40
+    assert "in every frame" in trial.failure
+
+
+@pytest.mark.parametrize(
+    ("reported", "checked", "rounding", "true"),
+    [
+        (0.1, 0.19, 0.0, True),
+        (0.1, 0.21, 0.0, False),
+        (0.21, 0.1, 0.0, False),
+        (0.0, 9e-6, 0.0, True),
+        (0.0, 1.1e-5, 0.0, False),
+        (0.0, 1.1e-5, 2e-5, True),
+        (float("nan"), 1e-9, 0.0, False),
+    ],
+)
+def test_residuals_agree_within_a_factor_of_two_or_both_are_negligible(
+    reported, checked, rounding, true
+):
+    assert agrees(reported, checked, rounding) is true
+
+
+def test_what_can_move_as_a_whole_is_refused_by_quasi_static_methods():
+    for case in (
+        StabilityCase("free", support="nothing"),
+        StabilityCase("one of two", mesh="two pieces", support="one piece"),
+    ):
+        trial = try_case("fem_cg", case)
+        assert trial.refused
+        assert trial.passed
+        assert trial.actions[0].startswith("refused: the tissue can move as a whole")
+
+
+def test_a_free_tissue_of_springs_keeps_its_shape():
+    trial = try_case("msds", StabilityCase("free", support="nothing", depth=0.1))
+    assert trial.passed
+    assert trial.recovered_mm < 0.1
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_broken_input_is_refused_in_one_sentence(name):
+    trial = refusal_of("fem_cg", name)
+    assert trial.refused, trial.failure
+    sentence = trial.actions[0]
+    assert "\n" not in sentence
+    assert len(sentence) > 30
+
+
+def test_input_that_is_fine_does_not_count_as_refused(monkeypatch):
+    monkeypatch.setitem(REFUSALS, "fine", lambda _: None)
+    trial = refusal_of("fem_cg", "fine")
+    assert not trial.refused
+    assert not trial.passed
+
+
+def test_the_sample_is_the_same_every_time_and_covers_the_ranges():
+    cases = sampled_cases(1024)
+    assert cases == sampled_cases(1024)
+    assert len(set(cases)) == 1024
+    for name, low, high in (
+        ("young_modulus", 1.0, 1e12),
+        ("contrast", 1.0, 1e9),
+        ("poisson_ratio", 0.0, 0.4999),
+        ("density", 1.0, 1e6),
+        ("time_step", 1e-6, 10.0),
+        ("damping", 0.0, 1e3),
+        ("depth", 0.0, 1.0),
+    ):
+        values = np.array([getattr(case, name) for case in cases])
+        assert low <= values.min() <= max(2 * low, 1e-3)
+        assert high / 2 <= values.max() <= high * (1 + 1e-9)
+    stiffest = np.array([case.young_modulus * case.contrast for case in cases])
+    assert stiffest.max() <= 1e12 * (1 + 1e-9)
+
+
+def test_enough_cases_for_every_method():
+    assert len(sampled_cases(2048)) + len(extreme_cases(corners=True)) >= 2000
+    names = [case.case for case in extreme_cases(corners=True)]
+    assert len(set(names)) == len(names)
+
+
+def test_tissues_are_what_their_names_say():
+    assert len(mesh_named("tetrahedron").tetrahedra) == 1
+    assert set(parts(mesh_named("two pieces"))) == {0, 1}
+    sliver = mesh_named("sliver")
+    ends = sliver.nodes[sliver.tetrahedra]
+    longest = np.linalg.norm(ends[:, :, None] - ends[:, None], axis=3).max(axis=(1, 2))
+    assert (sliver.volumes / longest**3).min() < 2e-6
+    for name in MESHES:
+        mesh = mesh_named(name)
+        assert mesh.nodes[:, 2].min() == 0.0
+        held = {support: int(fixed_nodes(mesh, support).sum()) for support in SUPPORTS}
+        assert held["nothing"] == 0
+        assert held["everything"] == len(mesh.nodes)
+        assert 1 <= held["three"] <= 3
+
+
+def test_a_tremor_is_of_a_kilohertz():
+    heights = np.array([pose.position[2] for pose in poses_of("tremor", mesh_named("box"), 0.5)])
+    time = np.arange(len(heights)) / 2718
+    expected = 0.04 + 0.02 * 0.08 * np.sin(2 * np.pi * 1000 * time)
+    assert heights == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("springs", ["algorithm_1", "fitted with volume"])
+@pytest.mark.parametrize("damping", [0.0, 30.0])
+def test_predicted_and_observed_step_limits_agree(springs, damping):
+    case = StabilityCase("bisected", contrast=1e3, damping=damping, springs=springs)
+    predicted, observed = observed_step_limit(case)
+    assert observed == pytest.approx(predicted, rel=0.02)
+
+
+def test_the_report_has_a_row_for_each_case_and_a_map_for_each_method(
+    tmp_path, monkeypatch, capsys
+):
+    named = [CASE, StabilityCase("free", support="nothing")]
+    monkeypatch.setattr(stability, "SOLVERS", {"fem_cg": None, "msds": None})
+    monkeypatch.setattr(stability, "extreme_cases", lambda **_: named)
+    monkeypatch.setattr(stability, "sampled_cases", lambda _: [])
+    assert evaluate_stability(tmp_path / "out", quick=True) == 0
+    with (tmp_path / "out" / "stability.csv").open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == COLUMNS
+    assert len(rows) == 2 * (len(REFUSALS) + len(named))
+    ran = {row["method"]: row for row in rows if row["case"] == "press"}
+    for row in ran.values():
+        assert (row["finite"], row["bounded"], row["truthful"]) == ("true", "true", "true")
+        assert row["contrast"] == "10"
+    assert ran["fem_cg"]["time_step"] == ""
+    assert ran["msds"]["time_step"] == "0.01"
+    refused = next(row for row in rows if row["case"] == "free")
+    assert refused["finite"] == ""
+    assert refused["action"].startswith("refused: the tissue can move as a whole")
+    report = (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
+    for method in ("fem_cg", "msds"):
+        assert (tmp_path / "out" / f"stability_{method}.png").stat().st_size > 10_000
+        assert f"stability_{method}.png" in report
+    assert str(tmp_path / "out") in capsys.readouterr().out

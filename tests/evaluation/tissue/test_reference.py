@@ -1,0 +1,112 @@
+"""The nonlinear reference against what is known without it."""
+
+import numpy as np
+import pytest
+from skfem import Basis, ElementHex2, ElementVector, MeshHex
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from us_sim.errors import SolverError
+from us_sim.evaluation.tissue.cases import MESHES, SCENES
+from us_sim.evaluation.tissue.linear_equations import LinearEquations
+from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
+from us_sim.evaluation.tissue.reference import graded_planes, solve_contact
+from us_sim.geometry.collider import Capsule, Sphere, signed_distance
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.tissue.elasticity.materials import Material
+
+SOFT = Material(10e3, 0.45, 1000.0)
+PLANES = ([-0.03, 0.0, 0.01], [0.0, 0.02, 0.05], [0.0, 0.015, 0.04])
+
+
+def test_a_uniform_stretch_has_the_published_stress_in_every_element():
+    block = NeoHookeanHexahedra(PLANES, SOFT)
+    stretch = np.array([[1.3, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.9]])
+    forces = block.forces(block.nodes @ (stretch - np.eye(3)).T)
+    # Smith, de Goes and Kim 2018, eq. 13 with lambda raised by mu (their eq. 16), no logarithm.
+    shear = 10e3 / 2.9
+    bulk = 10e3 * 0.45 / (1.45 * 0.1) + shear
+    ratio = np.linalg.det(stretch)
+    cofactor = ratio * np.linalg.inv(stretch).T
+    stress = shear * stretch + (bulk * (ratio - 1) - shear) * cofactor
+    right = np.isclose(block.nodes[:, 0], 0.01)
+    inside = (block.nodes > [-0.03, 0, 0]).all(1) & (block.nodes < [0.01, 0.05, 0.04]).all(1)
+    np.testing.assert_allclose(forces[inside], 0.0, atol=1e-12)
+    # The faces beside contribute at the edges: sum over two opposite faces' difference instead.
+    moment = np.einsum("ni,nj->ij", forces, block.nodes)
+    np.testing.assert_allclose(moment, stress * 0.04 * 0.05 * 0.04, rtol=1e-12, atol=1e-10)
+    assert right.sum() == 25
+    volume = block.volume(block.nodes @ (stretch - np.eye(3)).T)
+    assert volume == pytest.approx(ratio * 0.04 * 0.05 * 0.04, rel=1e-12)
+
+
+def test_at_rest_the_stiffness_is_scikit_fems_own():
+    block = NeoHookeanHexahedra(([0.0, 0.02], [0.0, 0.01, 0.03], [0.0, 0.02]), SOFT)
+    mesh = MeshHex.init_tensor(*block.planes)
+    basis = Basis(mesh, ElementVector(ElementHex2()), intorder=5)
+    theirs = linear_elasticity(*lame_parameters(10e3, 0.45)).assemble(basis)
+    field = np.sin(40 * block.nodes[:, [1, 2, 0]])
+    values = basis.zeros()
+    order = basis.doflocs.T  # of components, three for each place
+    for axis in range(3):
+        own = np.zeros(3)
+        own[axis] = 1.0
+        mine = np.arange(len(values)) % 3 == axis
+        values[mine] = np.sin(40 * order[mine][:, [1, 2, 0][axis]])
+    ours = field.ravel() @ (block.stiffness(np.zeros_like(field)) @ field.ravel())
+    assert ours == pytest.approx(values @ (theirs @ values), rel=1e-12)
+
+
+def test_a_shallow_press_has_hertz_force():
+    depth = 0.0004
+    planes = (
+        graded_planes(-0.05, 0.05, -0.004, 0.004, 0.002),
+        graded_planes(0.0, 0.05, 0.0, 0.004, 0.002),
+        graded_planes(0.0, 0.07, 0.0, 0.002, 0.002),
+    )
+    solution = solve_contact(planes, SOFT, Sphere(0.03), [Pose([0.0, 0.0, depth])])
+    expected = 4 / 3 * 10e3 / (1 - 0.45**2) * np.sqrt(0.03) * depth**1.5
+    assert -solution.force[2] == pytest.approx(expected, rel=0.05)
+    assert solution.penetration < 2e-5
+
+
+def test_a_tilted_capsule_pushes_everything_out_and_is_mirrored():
+    half = np.radians(8) / 2
+    pose = Pose([0.0, 0.0, 0.006], [0.0, np.sin(half), 0.0, np.cos(half)])
+    planes = SCENES["tilt"].reference_planes(0.02)
+    probe = Capsule(0.025, 0.04)
+    solution = solve_contact(planes, SOFT, probe, [Pose([0.0, 0.0, 0.003]), pose])
+    block = solution.block
+    surface = block.surface_points + block.surface_values @ solution.displacement
+    assert signed_distance(probe, pose, surface)[0].min() > -2e-5
+    points = np.array([[0.03, 0.02, 0.01], [0.03, -0.02, 0.01]])
+    found = solution.at(points)
+    np.testing.assert_allclose(found[1], found[0] * [1, -1, 1])
+    with pytest.raises(SolverError, match="symmetric about y = 0"):
+        solve_contact(planes, SOFT, probe, [Pose([0.0, 0.001, 0.0])])
+
+
+def test_graded_planes_are_fine_where_asked_and_reach_the_ends():
+    planes = graded_planes(-0.1, 0.1, -0.01, 0.05, 0.005)
+    assert planes[0] == -0.1
+    assert planes[-1] == 0.1
+    steps = np.diff(planes)
+    inside = (planes[:-1] >= -0.0101) & (planes[1:] <= 0.0501)
+    np.testing.assert_allclose(steps[inside], 0.005)
+    assert (steps[1:] / steps[:-1]).max() < 2.0
+
+
+def test_linear_equations_are_hookes_where_nothing_is_averaged():
+    scene = SCENES["press_12mm"]
+    model = scene.model((5, 4, 4))
+    shear = 10e3 / 2.9
+    equations = LinearEquations(model)
+    field = np.sin(30 * model.mesh.nodes[:, [2, 0, 1]])
+    # What is averaged lowers the energy: it is that of Hooke's law or less.
+    whole = field.ravel() @ (stiffness(model.mesh, model.materials) @ field.ravel())
+    assert 0.3 * whole < (field * equations.forces(field)).sum() < whole
+    # A uniform strain has no difference between averages and tetrahedra.
+    strained = model.mesh.nodes * [0.01, 0.02, -0.005]
+    theirs = (stiffness(model.mesh, model.materials) @ strained.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(equations.forces(strained), theirs, atol=1e-9 * shear)
+    assert MESHES[0] == (20, 10, 10)

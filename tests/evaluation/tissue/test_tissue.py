@@ -1,0 +1,163 @@
+"""What `us-sim evaluate tissue` measures and writes, and what it says when it cannot."""
+
+import csv
+import re
+import sys
+
+import numpy as np
+import pytest
+
+import us_sim
+from us_sim.command.main import main
+from us_sim.evaluation.tissue import kept_reference
+from us_sim.evaluation.tissue import measure as tissue
+from us_sim.evaluation.tissue.cases import LARGEST_MESH, LOCKING, MESHES, SCENES
+from us_sim.evaluation.tissue.measure import Trial, evaluate_tissue, plan
+from us_sim.evaluation.tissue.plots import exponent
+from us_sim.evaluation.tissue.points import Outcome, Point, compare, held_memory, volumes
+from us_sim.evaluation.tissue.report import pareto_front
+from us_sim.tissue.solvers.solver import SOLVERS, create_solver
+
+COLUMNS = (
+    "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"
+    "force_error,volume_error,reference"
+)
+PRESS = SCENES["press_12mm"]
+
+
+def point(ms, error, nodes=1000):
+    return Point("press_12mm", "fem", nodes, 1, 1, "default", ms, ms, error, 1.0, 0.0, 0.0)
+
+
+def test_errors_of_a_known_field_are_what_they_are_by_hand():
+    model = PRESS.model((5, 4, 4))
+    nodes = model.mesh.nodes
+    exact = Outcome(nodes * [0, 0, -0.1], -4.0, 0.0018)
+    wrong = nodes * [0, 0, -0.1]
+    wrong[7] += [0.003, 0.0, 0.004]
+    found = Outcome(wrong, -5.0, float(volumes(model, nodes * [1, 1, 1.2]).sum()))
+    errors = compare(found, exact, 0.002)
+    assert errors.rel_l2_error == pytest.approx(0.005 / np.linalg.norm(0.1 * nodes[:, 2]))
+    assert errors.max_error_mm == pytest.approx(5.0)
+    assert errors.force_error == pytest.approx(0.25)
+    assert errors.volume_error == pytest.approx((0.0024 - 0.0018) / 0.002)
+
+
+def test_the_front_leaves_out_what_is_slower_and_worse():
+    points = [point(1.0, 0.2), point(2.0, 0.3), point(3.0, 0.1), point(4.0, float("nan"))]
+    assert pareto_front(points) == [points[0], points[2]]
+
+
+def test_the_exponent_of_a_power_law_is_found():
+    points = [point(0.001 * n**1.3, 0.1, n) for n in (2000, 8192, 65536)]
+    assert exponent(points, lambda p: p.ms_median) == pytest.approx(1.3)
+    assert np.isnan(exponent(points[:1], lambda p: p.ms_median))
+
+
+def test_memory_counts_every_array_once():
+    model = PRESS.model((5, 4, 4))
+    solver = create_solver("msds", model)
+    held = held_memory(solver)
+    assert held > model.mesh.nodes.nbytes + model.mesh.tetrahedra.nbytes
+    solver.again = solver.mass[::2]
+    assert held_memory(solver) == held
+    solver.more = np.zeros(1000)
+    assert held_memory(solver) == held + 8000
+
+
+def test_the_full_plan_has_every_method_on_every_mesh_and_scene():
+    trials = plan(quick=False)
+    for method in SOLVERS:
+        combinations = {(t.scene.name, t.counts) for t in trials if t.method == method}
+        ordinary = set(SCENES) - set(LOCKING[1:])
+        assert combinations >= {(scene, mesh) for scene in ordinary for mesh in MESHES}
+        assert combinations >= {(scene, MESHES[-1]) for scene in LOCKING}
+        assert {scene for scene, mesh in combinations if mesh == LARGEST_MESH} == {"press_25mm"}
+    assert {t.method for t in plan(quick=True)} == set(SOLVERS)
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Two methods on a small mesh, one of which fails, against a coarse reference."""
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "cache"))
+    counts = (7, 4, 4)
+    trials = [
+        Trial(PRESS, counts, "fem_cg", {"iterations": 40}, own=True),
+        Trial(PRESS, counts, "fem_cg", {"iterations": -1}, own=True),
+        Trial(PRESS, counts, "fem", {}, own=True),
+    ]
+    monkeypatch.setattr(tissue, "plan", lambda _quick: trials)
+    monkeypatch.setattr(tissue, "_QUICK_SIZES", (0.03, 0.025))
+    return tmp_path / "out"
+
+
+def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys, monkeypatch):
+    assert evaluate_tissue(small, quick=True) == 1
+    said = capsys.readouterr().out
+    assert "failed: fem_cg (iterations=-1)" in said
+    lines = (small / "tissue.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == COLUMNS
+    rows = list(csv.DictReader(lines))
+    assert [row["reference"].split(":")[0] for row in rows] == [
+        "own equations",
+        "nonlinear",
+        "failed",
+        "own equations",
+        "nonlinear",
+    ]
+    assert {row["nodes"] for row in rows} == {str(7 * 4 * 4)}
+    assert float(rows[3]["rel_l2_error"]) < 1e-6  # fem solves its equations exactly
+    assert 0.01 < float(rows[4]["rel_l2_error"]) < 0.5
+    text = (small / "tissue.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[.+?\]\((.+?)\)", text)
+    assert len(pictures) == 4
+    for name in pictures:
+        assert (small / name).read_bytes().startswith(b"\x89PNG")
+        assert name in said
+    assert "iterations is -1" in text
+
+    # A second run takes the reference from the cache.
+    monkeypatch.setattr(kept_reference, "solve_contact", None)
+    assert evaluate_tissue(small.with_name("again"), quick=True) == 1
+
+
+def test_a_damaged_reference_is_made_again(small, caplog):
+    kept_reference.kept_reference(PRESS, (0.03, 0.03))
+    (file,) = (small.parent / "cache").glob("reference-*.npz")
+    file.write_bytes(file.read_bytes()[:200])
+    again = kept_reference.kept_reference(PRESS, (0.03, 0.03))
+    assert "cannot be used" in caplog.text
+    assert again.difference == pytest.approx(0.0, abs=1e-6)
+    assert again.solution.force[2] < 0
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    assert main(["evaluate", "tissue", "--quick", "--out", str(file)]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"us-sim: --out {file}: cannot be written")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("subject", ["tissue", "stability", "slice"])
+def test_a_report_is_not_overwritten(subject, tmp_path, capsys):
+    report = tmp_path / f"{subject}.md"
+    report.write_text("measured for hours", encoding="utf-8")
+    assert main(["evaluate", subject, "--quick", "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert error == f"us-sim: {report} exists already; choose another folder with --out\n"
+    assert report.read_text(encoding="utf-8") == "measured for hours"
+    assert list(tmp_path.iterdir()) == [report]
+
+
+def test_without_scikit_fem_the_extra_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "skfem", None)
+    monkeypatch.setattr(us_sim, "evaluation", us_sim.evaluation)  # put back when this is over
+    for name in [name for name in sys.modules if name.startswith("us_sim.evaluation")]:
+        monkeypatch.delitem(sys.modules, name)
+    assert main(["evaluate", "tissue", "--quick", "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "pip install 'us_sim[evaluate]'" in error
+    assert error.count("\n") == 1
+    assert MESHES[-1] == (32, 16, 16)

@@ -1,0 +1,151 @@
+"""`evaluate tracking` in small: cases, errors, flips and filters whose answers are known."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from us_sim.command.main import main
+from us_sim.evaluation.tracking import measure as tracking
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case, marker
+from us_sim.evaluation.tracking.filters import delay, filter_points
+from us_sim.evaluation.tracking.points import COLUMNS, Bench, Point, View, mirrored, visible
+from us_sim.evaluation.tracking.targets import targets
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.camera.body_pose import rotation_angle
+
+ASKED = [
+    *("marker", "image_size", "distance_m", "angle_deg", "condition", "views", "detected"),
+    *("flipped", "median_mm", "p95_mm", "median_deg", "p95_deg", "ms_median"),
+]
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Bench()
+
+
+@pytest.mark.parametrize("name", MARKERS)
+@pytest.mark.parametrize(("distance", "angle"), [(0.4, 0.0), (0.9, 60.0)])
+def test_a_case_looks_from_where_it_says(name, distance, angle):
+    body = marker(name).body
+    pose = Case(name, "640x480", distance, angle).sequence(3)[2]
+    middle = pose.apply(body.centres.mean(axis=0)[None])[0]
+    assert np.linalg.norm(middle) == pytest.approx(distance)
+    cosine = -(pose.rotation @ marker(name).front) @ middle / distance
+    assert np.degrees(np.arccos(min(1.0, cosine))) == pytest.approx(angle, abs=1e-4)
+
+
+def test_four_markers_of_the_rigid_body_face_the_camera():
+    for number in range(5):
+        for pose in Case(RIGID_BODY, "640x480", 0.4, 0.0).sequence(number):
+            assert visible(marker(RIGID_BODY), pose) == 4
+
+
+def test_the_mirror_image_of_a_tilted_plane_is_tilted_the_other_way():
+    front = np.array([0.0, 0.0, -1.0])
+    tilt = Pose([0.0, 0.0, 0.5], [np.sin(0.2), 0.0, 0.0, np.cos(0.2)])
+    other = mirrored(tilt, np.zeros(3), front)
+    assert rotation_angle(tilt, other) == pytest.approx(0.8)
+    # From afar both put the plane's points at the same pixels.
+    points = np.array([[0.02, 0.01, 0.0], [-0.02, 0.015, 0.0]])
+    np.testing.assert_allclose(tilt.apply(points)[:, :2], other.apply(points)[:, :2], atol=1e-12)
+    again = mirrored(other, np.zeros(3), front)
+    assert rotation_angle(tilt, again) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_rigid_body_is_tracked_as_well_as_asked(bench):
+    point = bench.point(Case(RIGID_BODY, "640x480", 0.4, 0.0), 4)
+    assert len(point.found) == len(point.views) == 20
+    assert point.flipped == 0
+    assert point.error(50) < 0.3
+    assert point.error(95) < 1.0
+    assert point.turned(50) < 0.2
+    assert point.turned(95) < 0.6
+    assert {view.used for view in point.views} == {4}
+
+
+def test_a_hand_over_a_single_marker_makes_it_be_missed_and_nothing_worse(bench):
+    point = bench.point(Case(SINGLE, "640x480", 0.4, 30.0, "occlusion"), 2)
+    assert len(point.views) == 10
+    assert len(point.found) < 10
+    assert point.flipped == 0
+    assert np.isnan(point.row[COLUMNS.index("pose_cpu_ms")]) == (not point.found)
+
+
+def test_percentiles_are_of_what_was_found_and_shares_of_all():
+    views = [View(True, 5.0, 4.0)]
+    views += [View(False, 3.0, 2.0, True, i == 9, float(i), 0.1 * i, 1) for i in range(11)]
+    row = dict(
+        zip(COLUMNS, Point(Case(SINGLE, "640x480", 0.4, 0.0), tuple(views)).row, strict=True)
+    )
+    assert (row["views"], row["detected"], row["flipped"]) == (12, 11, 1)
+    assert (row["median_mm"], row["p95_mm"], row["median_deg"]) == (5.0, 9.5, 0.5)
+    assert (row["ms_median"], row["ms_first"], row["cpu_ms_median"]) == (3.0, 5.0, 2.0)
+
+
+def test_targets_say_no_where_they_are_missed_and_nothing_where_nothing_was_measured():
+    assert {target.met for target in targets([])} == {None}
+    flipped = View(True, 9.0, 9.0, True, True, 2.0, 30.0, 4, visible=4)
+    missed = [Point(Case(name, "640x480", 0.4, 0.0), (flipped,)) for name in (RIGID_BODY, SINGLE)]
+    found = {target.what: target.met for target in targets(missed)}
+    assert found.pop("ms an image of 1920 × 1080 on one core") is None
+    assert [what for what, met in found.items() if met] == [
+        "4 visible 30 mm markers at 0.4 m, 640 × 480: tracked of 1 views"
+    ]
+
+
+@pytest.mark.parametrize("lag", [-0.01, 0.0, 0.0137, 0.21])
+def test_the_delay_of_a_delayed_path_is_found(lag):
+    def path(times):
+        return np.stack([np.sin(3 * times), 0.2 * np.cos(11 * times)], axis=1)
+
+    times = np.arange(0, 6, 1 / 60)
+    assert delay(times, path(times - lag), path) == pytest.approx(lag, abs=1e-5)
+
+
+def test_filters_trade_lag_for_jitter():
+    points = filter_points(quick=True)
+    none = next(p for p in points if p.method == "none")
+    assert none.lag == pytest.approx(0.0, abs=5e-4)
+    assert none.jitter == pytest.approx(np.sqrt(3) * 3e-4, rel=0.05)  # the noise itself
+    euro = [p for p in points if p.method == "one_euro"]
+    assert [p.lag for p in euro] == sorted((p.lag for p in euro), reverse=True)
+    assert [p.jitter for p in euro] == sorted(p.jitter for p in euro)
+    for p in euro:
+        assert p.stated == pytest.approx(p.lag, rel=0.35)
+    best = next(p for p in points if p.method == "kalman" and p.default)
+    assert abs(best.lag) < 2e-3
+    assert best.error < none.error
+    assert best.jitter < none.jitter
+
+
+def test_the_report_and_its_rows_are_written(tmp_path, monkeypatch, capsys):
+    few = [Case(name, "640x480", 0.4, 30.0) for name in (SINGLE, RIGID_BODY)]
+    few += [Case(RIGID_BODY, "1920x1080", 0.4, 30.0)]
+    few += [Case(SINGLE, "640x480", 0.4, 30.0, name) for name in CONDITIONS if name != "plain"]
+    monkeypatch.setattr(tracking, "cases", lambda _: few)
+    monkeypatch.setattr(tracking, "_QUICK_SEQUENCES", {"640x480": 1, "1920x1080": 1})
+    out = tmp_path / "report"
+    assert main(["evaluate", "tracking", "--quick", "--out", str(out)]) == 0
+    assert "single 40 mm marker" in capsys.readouterr().out
+    with (out / "tracking.csv").open() as file:
+        head, *rows = csv.reader(file)
+    assert head[: len(ASKED)] == ASKED
+    assert len(rows) == len(few)
+    text = (out / "tracking.md").read_text()
+    for picture in sorted(out.glob("*.png")):
+        assert f"]({picture.name})" in text
+    assert len(list(out.glob("*.png"))) == 5
+    assert len((out / "filters.csv").read_text().splitlines()) == 8
+    assert main(["evaluate", "tracking", "--quick", "--out", str(out)]) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_a_case_that_breaks_is_a_row_that_says_so(monkeypatch):
+    def broken(*_):
+        raise ValueError("no\nroom")
+
+    monkeypatch.setattr(Bench, "point", broken)
+    point = tracking._point(Bench(), Case(SINGLE, "640x480", 0.4, 0.0), True)
+    assert point.row[-1] == "ValueError: no room"

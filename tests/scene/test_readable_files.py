@@ -1,0 +1,112 @@
+"""Files that a scene names are looked into before anything runs."""
+
+import numpy as np
+import pytest
+import SimpleITK
+import yaml
+
+from us_sim.command.main import main
+from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.scene.readable_files import check_files
+from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.share import shared_path
+from us_sim.tracking.calibration.transform_file import write_transform
+
+TETRAHEDRON = """\
+$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$Nodes
+4
+1 0 0 0
+2 50 0 0
+3 0 50 0
+4 0 0 50
+$EndNodes
+$Elements
+1
+1 4 2 0 1 1 2 3 4
+$EndElements
+"""
+
+
+@pytest.fixture
+def document(tmp_path):
+    """A scene with every file that one may name; each can be read."""
+    image = SimpleITK.GetImageFromArray(np.zeros((4, 5, 6), dtype=np.uint8))
+    SimpleITK.WriteImage(image, str(tmp_path / "volume.mha"))
+    (tmp_path / "tissue.msh").write_text(TETRAHEDRON)
+    (tmp_path / "skin.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "vessel.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    for name, *frames in (("registration", "tracker", "patient"), ("calibration", "probe", "body")):
+        write_transform(
+            tmp_path / f"{name}.yaml",
+            Pose(),
+            from_frame=frames[0],
+            to_frame=frames[1],
+            method="landmarks",
+        )
+    (tmp_path / "body.yaml").write_text(
+        "dictionary: ARUCO_ORIGINAL\nmarkers:\n"
+        "  - {id: 1, size: 40 mm, position: [0, 0, 0], orientation: [0, 0, 0, 1]}\n"
+    )
+    names = {name: str(tmp_path / name) for name in (p.name for p in tmp_path.iterdir())}
+    return {
+        "name": "of_files",
+        "volume": {"file": names["volume.mha"]},
+        "probe": {"aperture": 0.04, "depth": 0.03, "collider": {"shape": "sphere", "radius": 0.02}},
+        "tissue": {
+            "solver": "fem",
+            "mesh": {"file": names["tissue.msh"], "unit": "1 mm"},
+            "fixed": ["bottom"],
+            "materials": {
+                "tissue": {"young_modulus": 1e4, "poisson_ratio": 0.4, "density": 1000.0}
+            },
+        },
+        "skin": {"file": names["skin.obj"]},
+        "structures": {"vessel": {"file": names["vessel.obj"]}},
+        "tracker": {
+            "source": "camera",
+            "registration": names["registration.yaml"],
+            "calibration": names["calibration.yaml"],
+            "camera": {"body": names["body.yaml"]},
+        },
+        "path": str(shared_path("bags/press_and_slide.mcap")),
+    }
+
+
+def test_what_could_be_read_is_said(document, tmp_path, capsys):
+    keys = [
+        *("volume.file (its header)", "tissue.mesh.file", "structures.vessel.file", "skin.file"),
+        *("tracker.registration", "tracker.calibration", "tracker.camera.body", "path"),
+    ]
+    assert check_files(parse_scene(document)) == keys
+    file = tmp_path / "scene.yaml"
+    file.write_text(yaml.safe_dump(document), encoding="utf-8")
+    assert main(["run", str(file), "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"readable  {', '.join(keys)}"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("volume.mha", "tissue.msh", "skin.obj", "vessel.obj"),
+        *("registration.yaml", "calibration.yaml", "body.yaml"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named(document, tmp_path, name):
+    (tmp_path / name).write_text("this: is [not", encoding="utf-8")
+    with pytest.raises(UsSimError, match=name):
+        check_files(parse_scene(document))
+
+
+def test_a_recording_in_place_of_a_tracker_is_read_too(tmp_path):
+    scene = load_scene("upper_arm_path")
+    assert check_files(scene) == ["tracker.file", "path"]
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"no recording")
+    file = tmp_path / "scene.yaml"
+    file.write_text("based_on: upper_arm_path\ntracker: {file: broken.mcap}\n", encoding="utf-8")
+    with pytest.raises(UsSimError, match=r"broken\.mcap"):
+        check_files(load_scene(file))

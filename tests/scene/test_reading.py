@@ -1,0 +1,327 @@
+"""Scene files: what they mean, and one sentence with file and key for each kind of mistake."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+import yaml
+
+from us_sim.errors import SceneError
+from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP
+from us_sim.geometry.pose import Pose
+from us_sim.scene.building import collider_of, probe_of
+from us_sim.scene.reading import find_scene, load_scene, parse_scene
+from us_sim.share import shared_path
+from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.volume.sweep import read_sweep
+
+COMPLETE = yaml.safe_load(
+    """
+name: test
+volume: {phantom: upper_arm, seed: 3, voxel_size: 1 mm}
+probe:
+  aperture: 40 mm
+  depth: 0.03
+  image: [64, 48]
+  collider: {shape: sphere, radius: 2 cm}
+tissue:
+  mesh: {lower: [-20 mm, -20 mm, 0], upper: [20 mm, 20 mm, 40 mm], nodes: [3, 4, 5]}
+  materials: {muscle: {young_modulus: 12 kPa, poisson_ratio: 0.4}}
+skin: {spacing: 5 mm}
+"""
+)
+
+
+def changed(key: str, value: object) -> dict:
+    """The complete scene with the value at a dotted key set (or, with None, removed)."""
+    document = copy.deepcopy(COMPLETE)
+    *parents, last = key.split(".")
+    section = document
+    for parent in parents:
+        section = section[parent]
+    if value is None:
+        del section[last]
+    else:
+        section[last] = value
+    return document
+
+
+def test_units_are_si_inside():
+    scene = parse_scene(COMPLETE)
+    assert scene.volume.voxel_size == pytest.approx(1e-3)
+    assert scene.probe.aperture == pytest.approx(0.04)
+    assert scene.probe.depth == 0.03
+    assert scene.tissue.mesh.upper == pytest.approx((0.02, 0.02, 0.04))
+    assert scene.tissue.mesh.nodes == (3, 4, 5)
+    assert scene.tissue.materials["muscle"].young_modulus == pytest.approx(12e3)
+    assert collider_of(scene).radius == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("volum", {}, r"unknown key `volum`; did you mean `volume`\?"),
+        ("probe.apertur", 1, "probe: unknown key `apertur`"),
+        ("probe.aperture", 40, r"probe.aperture: 40 m is outside .* did you mean '40 mm'\?"),
+        ("probe.aperture", "40 kPa", "probe.aperture: '40 kPa' is not a length"),
+        ("probe.aperture", float("nan"), "probe.aperture: nan is not finite"),
+        ("probe.aperture", True, "probe.aperture: True is not a length"),
+        ("probe.aperture", None, "probe.aperture: is missing"),
+        ("probe.image", [512], "probe.image: needs 2 values, not 1"),
+        ("probe.image", [512, 1.5], r"probe.image\[1\]: 1.5 is not a whole number"),
+        ("probe.geometry", "round", "probe.geometry: 'round' is not one of linear"),
+        ("probe.image", 512.5, "probe.image: 512.5 is not a whole number"),
+        ("probe.image", [4097, 5], r"probe.image\[0\]: 4097 is outside 1 to 4096"),
+        ("probe.radius", "5 cm", "probe.radius: a linear probe has no radius; it has aperture"),
+        ("probe.opening_angle", 60, "60 rad is outside .* did you mean '60 deg'"),
+        ("probe.geometry", "convex", "probe.radius: is missing; a convex probe needs radius, op"),
+        ("probe.geometry", "sector", "probe.opening_angle: is missing; a sector probe needs"),
+        ("probe.lines", 96.5, "probe.lines: 96.5 is not a whole number"),
+        ("probe.focus", -0.01, "probe.focus: -0.01 m is outside"),
+        ("probe.collider", None, "probe.collider: is missing"),
+        ("volume", None, "volume: is missing"),
+        ("volume.phantom", "leg", "volume.phantom: 'leg' is not one of upper_arm"),
+        ("volume", {}, "volume.file: is missing; name a file there, or give one with --volume"),
+        ("volume.file", "a.mha", "has both `file` and `phantom`"),
+        ("volume", {"file": "nowhere.mha"}, "volume.file: there is no file .*nowhere.mha"),
+        ("path", "nowhere.mcap", "path: there is no file .*nowhere.mcap"),
+        ("skin.file", "nowhere.obj", "skin.file: there is no file .*nowhere.obj"),
+        ("tissue.mesh.upper", [1, 1, -1], r"tissue.mesh.upper\[2\]: -1 m is not above"),
+        ("tissue.mesh.planes", {"x": [0, 0]}, "tissue.mesh.planes.x: needs two or more rising"),
+        (
+            "tissue.mesh.planes",
+            {"x": [-0.02, 0, 0.01]},
+            "tissue.mesh.planes.x: must be 3 coordinates from -0.02 to 0.02 m",
+        ),
+        ("tissue.mesh.planes", {"w": [0, 1]}, "tissue.mesh.planes: unknown axis `w`"),
+        ("tissue.mesh.upper", None, "tissue.mesh.upper: is missing; give the corners of a box, or"),
+        ("tissue.mesh.file", "liver.msh", "tissue.mesh: has both `file` and `lower`; keep one"),
+        ("tissue.mesh", {"file": "liver.msh"}, "tissue.mesh.file: there is no file .*liver.msh"),
+        ("tissue.mesh.unit", "1 mm", "`unit`, `pose` and `margin` are for a mesh from a `file`"),
+        ("structures", "vein", "structures: must be a mapping of keys, not 'vein'"),
+        ("structures", {"vein": {"color": [1, 0, 0]}}, "structures.vein: unknown key `color`; did"),
+        ("structures", {"vein": {"colour": [1, 0, 2]}}, r"vein.colour\[2\]: 2 is outside"),
+        ("structures", {"a": {"file": "a.stl"}}, "structures.a.file: there is no file .*a.stl"),
+        (
+            "structures",
+            {"a": {"file": "a", "label": "b"}},
+            "structures.a: has both `file` and `lab",
+        ),
+        ("structures", {"a": {"unit": "1 mm"}}, "structures.a: `unit` and `pose` are for a surf"),
+        ("tissue.mesh", 3, "tissue.mesh: must be a mapping of keys, not 3"),
+        (
+            "tissue.solver",
+            "magic",
+            "tissue.solver: 'magic' is not one of fem, fem_nonlinear",
+        ),
+        ("tissue.materials", {}, "tissue.materials: names no material"),
+        (
+            "tissue.materials.muscle.poisson_ratio",
+            0.5,
+            "tissue.materials.muscle.poisson_ratio: 0.5 is outside",
+        ),
+        ("name", 5, "name: must be a text, not 5"),
+    ],
+)
+def test_each_mistake_is_one_sentence_with_file_and_key(key, value, words):
+    with pytest.raises(SceneError, match=words) as caught:
+        parse_scene(changed(key, value), origin="my.yaml")
+    assert str(caught.value).startswith("my.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_structures_may_be_a_list_or_have_no_more_than_a_name():
+    for given in (["vein", "artery"], {"vein": None, "artery": {}}):
+        scene = parse_scene(changed("structures", given))
+        assert list(scene.structures) == ["vein", "artery"]
+        assert scene.structures["vein"].label is None
+    assert parse_scene(COMPLETE).structures == {}
+
+
+def test_structures_need_a_tissue():
+    document = changed("tissue", None) | {"structures": ["vein"]}
+    with pytest.raises(SceneError, match=r"my\.yaml: structures: need `tissue` to carry them"):
+        parse_scene(document, origin="my.yaml")
+
+
+def scene_with_probe(**probe):
+    document = copy.deepcopy(COMPLETE)
+    del document["tissue"], document["skin"]
+    document["probe"] = probe
+    return parse_scene(document, origin="my.yaml")
+
+
+def test_a_linear_probe_has_512_by_512_pixels_unless_told():
+    probe = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", focus="2 cm", lines=128))
+    assert isinstance(probe, LinearProbe)
+    assert (probe.columns, probe.rows, probe.lines) == (512, 512, 128)
+    assert (probe.aperture, probe.depth, probe.focus) == pytest.approx((0.04, 0.03, 0.02))
+    square = probe_of(scene_with_probe(aperture="4 cm", depth="3 cm", image=300))
+    assert (square.columns, square.rows) == (400, 300)
+
+
+def test_fans_have_square_pixels_unless_told():
+    convex = {"geometry": "convex", "radius": "60 mm", "opening_angle": "60 deg", "depth": "14 cm"}
+    probe = probe_of(scene_with_probe(**convex))
+    assert isinstance(probe, ConvexProbe)
+    assert (probe.width, probe.rows) == pytest.approx((0.2, 512))
+    assert probe.pixel_spacing[0] == pytest.approx(probe.pixel_spacing[1], rel=1e-3)
+    probe = probe_of(scene_with_probe(**convex, image=[200, 100], samples=300))
+    assert (probe.columns, probe.rows, probe.samples) == (200, 100, 300)
+    sector = {"geometry": "sector", "opening_angle": "90°", "depth": "16 cm", "aperture": "2 cm"}
+    probe = probe_of(scene_with_probe(**sector, radius="5 mm", image=400))
+    assert isinstance(probe, SectorProbe)
+    assert (probe.radius, probe.rows) == (0.005, 400)
+    assert probe.width == pytest.approx(0.01 + 0.16 * 2**0.5)
+
+
+def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read():
+    sector = {"geometry": "sector", "opening_angle": "90 deg", "depth": "16 cm"}
+    with pytest.raises(SceneError, match=r"my.yaml: probe.aperture: is missing"):
+        scene_with_probe(**sector)
+    with pytest.raises(SceneError, match=r"my.yaml: probe.aperture: 10 mm is less than the 20 mm"):
+        scene_with_probe(**sector, aperture="1 cm", radius="1 cm")
+    with pytest.raises(
+        SceneError, match=r"my.yaml: probe.aperture: 0.1 m is outside 0.003 to 0.05"
+    ):
+        scene_with_probe(**sector, aperture="10 cm")
+    with pytest.raises(SceneError, match=r"my.yaml: probe.image: the image has 5793 columns"):
+        scene_with_probe(**sector, aperture="2 cm", image=4096)
+
+
+def test_a_collider_needs_its_own_dimensions_and_no_others():
+    with pytest.raises(SceneError, match=r"probe.collider.length: is missing; a capsule needs"):
+        collider_of(parse_scene(changed("probe.collider.shape", "capsule")))
+    with pytest.raises(
+        SceneError, match=r"probe.collider.width: is missing; a convex needs radius, le"
+    ):
+        collider_of(
+            parse_scene(
+                changed("probe.collider", {"shape": "convex", "radius": 0.05, "length": 0.05})
+            )
+        )
+    with pytest.raises(SceneError, match=r"probe.collider.width: a sphere has no width"):
+        collider_of(parse_scene(changed("probe.collider.width", 0.01)))
+
+
+def test_a_broken_file_is_named_with_its_line(tmp_path):
+    file = tmp_path / "broken.yaml"
+    file.write_text("name: test\nvolume: [1, 2\n")
+    with pytest.raises(SceneError, match=r"broken.yaml: line 3: is not YAML"):
+        load_scene(file)
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match=r"broken.yaml"):
+        load_scene(file)
+    file.write_text("")
+    with pytest.raises(SceneError, match="is empty; a scene has at least name, volume and probe"):
+        load_scene(file)
+    file.write_text("just text")
+    with pytest.raises(SceneError, match=r"must be a mapping of keys, not 'just text'"):
+        load_scene(file)
+
+
+def test_an_unknown_scene_lists_the_installed_ones():
+    with pytest.raises(SceneError, match=r"installed scenes are .*liver_sweep, upper_arm"):
+        find_scene("nowhere")
+
+
+def test_the_installed_scenes_are_valid(tmp_path):
+    volume = tmp_path / "volume.mha"
+    volume.touch()
+    assert load_scene("upper_arm").tissue is not None
+    assert load_scene("liver_sweep", volume=volume).volume.file == str(volume)
+    with pytest.raises(SceneError, match=r"volume\.file: is missing"):
+        load_scene("liver_sweep")
+    for file in shared_path("config/scenes").glob("*.yaml"):
+        load_scene(file, volume=volume)
+
+
+def test_what_a_scene_does_not_name_is_not_needed():
+    needed = {part.node for part in parse_scene(changed("skin", None)).parts() if part.needed}
+    assert needed == {"probe_tracker", "tissue_deformer", "slice_interpolator"}
+    reasons = {part.node: part.reason for part in parse_scene(changed("tissue", None)).parts()}
+    assert reasons["tissue_deformer"] == "the scene has no `tissue`: the volume is sliced rigidly"
+
+
+def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(shared_data):
+    folder = shared_data / "imfusion-liver-sweep"
+    scene = load_scene("liver_sweep", volume=folder / "liver_sweep_compounded_1mm.mha")
+    recorded = LIVER_SWEEP.probe(0.314818e-3)
+    probe = probe_of(scene)
+    assert probe.radius == pytest.approx(recorded.radius, abs=1e-5)
+    assert probe.depth == pytest.approx(recorded.depth, abs=1e-5)
+    assert probe.opening_angle == pytest.approx(recorded.opening_angle, abs=1e-5)
+    sweep = read_sweep(folder / "liver_sweep.igs.mha")
+    middle = LIVER_SWEEP.pose(sweep.image_to_reference[len(sweep.numbers) // 2])
+    place = Pose(scene.volume.pose.position, scene.volume.pose.orientation) @ middle
+    np.testing.assert_allclose(place.matrix, np.eye(4), atol=2e-6)
+
+
+def test_a_scene_says_only_what_differs_from_the_one_it_is_based_on(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "grip.yaml").write_text("markers: []")
+    (tmp_path / "far" / "base.yaml").write_text(
+        "based_on: upper_arm\ntracker: {source: camera, camera: {body: grip.yaml}}"
+    )
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: mine\nbased_on: far/base.yaml\nprobe: {depth: 3 cm}\nskin: null")
+    scene, arm = load_scene(file), load_scene("upper_arm")
+    assert (scene.name, scene.origin) == ("mine", str(file))
+    assert scene.probe == dataclasses.replace(arm.probe, depth=0.03)
+    assert scene.skin is None
+    assert scene.tissue == arm.tissue
+    assert scene.tracker.camera.body == str(tmp_path / "far" / "grip.yaml")
+
+
+def test_another_kind_of_probe_does_not_inherit_the_dimensions_of_the_base_s(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "name: mine\nbased_on: upper_arm\nprobe: {geometry: convex, radius: 5 cm, "
+        "opening_angle: 60 deg, collider: {shape: sphere, radius: 3 cm}}"
+    )
+    probe = load_scene(file).probe
+    assert (probe.aperture, probe.radius, probe.depth) == (None, 0.05, 0.04)
+    assert (probe.collider.radius, probe.collider.length) == (0.03, None)
+
+
+@pytest.mark.parametrize(
+    ("base", "sentence"),
+    [
+        ("mine.yaml", "is based on this scene itself"),
+        ("other.yaml", "is based on this scene itself"),
+        ("nowhere", "there is no scene file nowhere"),
+        ("[1]", "must be a scene's file or name"),
+        ("list.yaml", "is no mapping of keys"),
+        ("bad.yaml", "is not YAML"),
+    ],
+)
+def test_a_base_that_cannot_be_is_one_sentence(tmp_path, base, sentence):
+    (tmp_path / "other.yaml").write_text("based_on: mine.yaml")
+    (tmp_path / "list.yaml").write_text("- 1")
+    (tmp_path / "bad.yaml").write_text("{")
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\nbased_on: {base}")
+    with pytest.raises(SceneError, match=sentence):
+        load_scene(file)
+
+
+@pytest.mark.parametrize(
+    ("tracker", "sentence"),
+    [
+        ("{source: telepathy}", r"tracker\.source: 'telepathy' is not one of pose"),
+        ("{filter: {method: median}}", r"tracker\.filter\.method: 'median' is not one of none"),
+        ("{gate: {maximum_speed: -1}}", r"tracker\.gate\.maximum_speed: -1 m/s is outside"),
+        ("{registration: nowhere.yaml}", r"tracker\.registration: there is no file"),
+        ("{registration: {orientation: [0, 0]}}", r"tracker\.registration\.orientation: needs 4"),
+        ("{six_dof_mouse: {axes: [0, 1]}}", r"six_dof_mouse\.axes: .* has 2 numbers"),
+        ("{camera: {size: 4}}", r"tracker\.camera\.size: 4 m is outside .* '4 cm'|'4 mm'"),
+    ],
+)
+def test_a_tracker_that_cannot_be_is_one_sentence(tmp_path, tracker, sentence):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"name: mine\nbased_on: upper_arm\ntracker: {tracker}")
+    with pytest.raises(SceneError, match=sentence) as caught:
+        load_scene(file)
+    assert "\n" not in str(caught.value)

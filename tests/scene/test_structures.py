@@ -1,0 +1,124 @@
+"""Structures of a scene: from labels and from files, in a box and in an organ's own mesh."""
+
+import numpy as np
+import pytest
+
+from us_sim.errors import MeshError, SceneError
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.scene.structures import colour_of, require_labels, structures_of
+from us_sim.tissue.mesh.node_selection import face_nodes
+
+DOCUMENT = {
+    "name": "cylinder",
+    "volume": {"phantom": "upper_arm", "seed": 1, "voxel_size": "1 mm"},
+    "probe": {
+        "aperture": "40 mm",
+        "depth": "40 mm",
+        "collider": {"shape": "sphere", "radius": "20 mm"},
+    },
+    "tissue": {
+        # 35.6 long, 7.6 across: laid into the arm, across the middle of the block.
+        "mesh": {
+            "file": "truthcylinder1.msh",
+            "unit": "1.5 mm",
+            "pose": {"position": [0, "15 mm", "20 mm"]},
+            "margin": "3 mm",
+        },
+        "fixed": ["bottom"],
+        "materials": {
+            name: {"young_modulus": "10 kPa"}
+            for name in ("skin", "fat", "muscle", "bone", "artery", "vein", "nerve")
+        },
+    },
+    "structures": {"vein": None, "vessel": {"label": "artery", "colour": [0.5, 0.25, 0.75]}},
+}
+
+
+@pytest.fixture(scope="module")
+def organ(shared_data):
+    return parse_scene(DOCUMENT, folders=[shared_data / "meshes-sofa"])
+
+
+def test_a_mesh_from_a_file_takes_the_place_of_the_box(organ):
+    notes = []
+    model = tissue_model_of(organ, volume_of(organ), notes.append)
+    assert len(model.mesh.tetrahedra) == 2524
+    assert notes == []
+    assert np.ptp(model.mesh.nodes[:, 1]) == pytest.approx(1.5e-3 * 35.56, rel=0.01)
+    np.testing.assert_array_equal(
+        np.flatnonzero(model.fixed), face_nodes(model.mesh, "bottom", 0.003)
+    )
+    assert not model.fixed[model.contact_nodes].any()
+    assert model.mesh.nodes[model.contact_nodes, 2].mean() < model.mesh.nodes[:, 2].mean()
+
+
+def test_structures_end_where_an_organ_ends(organ):
+    volume = volume_of(organ)
+    mesh = tissue_model_of(organ, volume).mesh
+    made = {one.name: one for one in structures_of(organ, volume, mesh, 20_000)}
+    assert list(made) == ["vein", "vessel"]
+    assert made["vessel"].colour == (0.5, 0.25, 0.75)
+    for one in made.values():
+        surface = one.surface
+        reach = 0.5 * np.linalg.norm(np.ptp(mesh.nodes[mesh.tetrahedra], axis=1), axis=1).max()
+        assert (surface.vertices > mesh.nodes.min(axis=0) - reach).all()
+        assert (surface.vertices < mesh.nodes.max(axis=0) + reach).all()
+        np.testing.assert_array_equal(surface.carry(mesh.nodes), surface.vertices)
+
+
+def test_a_surface_from_a_file_is_placed_in_its_unit_and_pose(small_scene, tmp_path):
+    (tmp_path / "tile.obj").write_text("v -5 0 0\nv 5 0 0\nv 0 8 0\nf 1 2 3\n")
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        small_scene.read_text() + "structures:\n"
+        "  tile:\n    file: tile.obj\n    unit: 1 mm\n"
+        "    pose: {position: [0, 0, 20 mm]}\n"
+    )
+    placed = load_scene(scene)
+    volume = volume_of(placed)
+    (tile,) = structures_of(placed, volume, tissue_model_of(placed, volume).mesh, 100)
+    expected = np.array([[-0.005, 0, 0.02], [0, 0.008, 0.02], [0.005, 0, 0.02]])
+    order = np.lexsort(tile.surface.vertices.T[::-1])
+    np.testing.assert_allclose(tile.surface.vertices[order], expected, atol=1e-9)
+
+
+def test_colours_are_those_of_an_atlas_unless_given(organ):
+    assert colour_of(organ, "vein") == (0.25, 0.4, 0.85)
+    other = parse_scene(
+        DOCUMENT
+        | {
+            "tissue": DOCUMENT["tissue"] | {"mesh": {"lower": [0, 0, 0], "upper": [1, 1, 1]}},
+            "structures": {"brachial": {"label": "artery"}, "stone": None},
+        }
+    )
+    assert colour_of(other, "brachial") == (0.85, 0.15, 0.15)
+    assert colour_of(other, "stone") == (0.7, 0.6, 0.55)
+
+
+def test_labels_that_are_not_there_are_named(organ):
+    volume = volume_of(organ)
+    unknown = parse_scene(
+        DOCUMENT
+        | {
+            "tissue": DOCUMENT["tissue"] | {"mesh": {"lower": [0, 0, 0], "upper": [1, 1, 1]}},
+            "structures": {"stone": {"label": "kidney"}},
+        },
+        origin="my.yaml",
+    )
+    words = r"my.yaml: structures.stone: label: the volume has no label `kidney`; it has skin, .*"
+    with pytest.raises(SceneError, match=words):
+        require_labels(unknown, volume)
+
+
+def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, shared_data):
+    def scene(mesh):
+        return parse_scene(
+            DOCUMENT | {"tissue": DOCUMENT["tissue"] | {"mesh": mesh}},
+            folders=[shared_data / "meshes-sofa"],
+        )
+
+    with pytest.raises(MeshError, match=r"truthcylinder1.msh: the mesh is 35.6 m long: give its"):
+        tissue_model_of(scene({"file": "truthcylinder1.msh"}), volume_of(organ))
+    with pytest.raises(MeshError, match=r"liver.vtk: this is not a tetrahedral mesh"):
+        tissue_model_of(scene({"file": "liver.vtk"}), volume_of(organ))

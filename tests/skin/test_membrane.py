@@ -1,0 +1,295 @@
+"""The skin membrane against known equilibria, laws of motion, and contact."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import SolverError
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.pose import Pose
+from us_sim.skin.membrane import CONTACT_TOLERANCE, SkinMembrane
+from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface
+
+COLLIDERS = [Sphere(0.03), Capsule(0.01, 0.04), RoundedBox(0.05, 0.02, 0.06, 0.006)]
+
+
+def settled(membrane, pose, frames=200):
+    """The skin after the membrane has come to rest with the probe at ``pose``."""
+    previous = membrane.deform(pose)
+    for _ in range(frames):
+        skin = membrane.deform(pose)
+        if skin is previous:
+            return skin
+        previous = skin
+    raise AssertionError("the membrane does not settle")
+
+
+def test_anchored_particles_alone_lie_on_the_nearest_point_of_the_collider():
+    """Without springs the anchors' energy is least there: a known equilibrium."""
+    sheet = plane_surface((0.1, 0.1), 0.01)
+    skin = SkinMembrane(sheet, Sphere(0.03), stiffness=0.0)
+    pose = Pose([0.002, -0.001, 0.008])
+    found = settled(skin, pose).vertices
+    centre = np.array([0.002, -0.001, 0.008 - 0.03])
+    away = sheet.vertices - centre
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    expected = np.where(distance < 0.03, centre + 0.03 * away / distance, sheet.vertices)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)
+    assert (distance < 0.03).sum() > 10
+
+
+def test_a_released_particle_is_a_damped_oscillator():
+    """Symplectic Euler with the damper at the step's end, written out as its own recurrence."""
+    triangle = TriangleSurface(
+        np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), np.array([[0, 2, 1]])
+    )
+    skin = SkinMembrane(
+        triangle, Sphere(0.03), stiffness=0.0, anchor_stiffness=4.0, damping=1.5, density=5.0,
+        time_step=1e-3, steps=1,
+    )  # fmt: skip
+    assert skin.step_limit > 1e-3
+    np.testing.assert_allclose(skin.mass, 5.0 * 0.005 / 3)
+    skin.deform(Pose([0, 0, 0.004]))
+    displacement, velocity = 0.004, 0.0
+    omega = np.sqrt(4.0 / skin.mass[0])
+    for _ in range(300):
+        velocity -= 1e-3 * omega**2 * displacement
+        velocity /= 1 + 1e-3 * 2 * 1.5 * omega
+        displacement += 1e-3 * velocity
+        found = skin.deform(None)
+        assert found.vertices[0, 2] == pytest.approx(displacement, abs=1e-12)
+    assert 0.0 < displacement < 0.002
+    assert found.action == ""
+
+
+def test_edge_springs_conserve_momentum():
+    """All that changes the sum of momenta is the anchors and their dampers."""
+    sheet = bent_surface((0.1, 0.06), 0.01, flat_width=0.04, radius=0.05)
+    skin = SkinMembrane(sheet, Sphere(0.03), stiffness=400.0, anchor_stiffness=1.0, steps=1)
+    for k in range(5):
+        skin.deform(Pose([0, 0, 0.002 * k]))
+    before = skin.deform(None)
+    momentum = skin.mass @ skin.velocity
+    skin_after = skin.deform(None)
+    decay = 2 * np.sqrt(1.0 / skin.mass)
+    anchors = 1.0 * (sheet.vertices - before.vertices)
+    undamped = (skin.mass * (1 + 0.01 * decay)) @ skin.velocity
+    np.testing.assert_allclose(undamped, momentum + 0.01 * anchors.sum(axis=0), atol=1e-12)
+    assert np.abs(momentum).max() > 1e-6
+    assert np.abs(skin_after.vertices - before.vertices).max() > 1e-4
+
+
+def test_energy_decays_and_the_skin_returns_to_rest():
+    sheet = plane_surface((0.1, 0.1), 0.005)
+    skin = SkinMembrane(sheet, Sphere(0.03))
+    assert skin.energy() == 0.0
+    settled(skin, Pose([0, 0, 0.01]))
+    energies = [skin.energy()]
+    while energies[-1] > 0.0 and len(energies) < 100:
+        rest = skin.deform(None)
+        energies.append(skin.energy())
+    assert energies[0] > 1e-4
+    assert (np.diff(energies) < 0).all()
+    np.testing.assert_array_equal(rest.vertices, sheet.vertices)
+    assert rest.residual == 0.0
+    assert rest.action == ""
+    assert len(energies) < 30
+
+
+@pytest.mark.parametrize("collider", COLLIDERS, ids=lambda c: type(c).__name__)
+def test_nothing_is_inside_the_probe_as_it_presses_and_slides(collider):
+    sheet = bent_surface((0.16, 0.1), 0.005, flat_width=0.08, radius=0.06)
+    skin = SkinMembrane(sheet, collider)
+    for k in range(40):
+        pose = Pose([1e-3 * k - 0.02, 5e-4 * k, min(5e-4 * k, 0.01)], [0.02 * k / 40, 0.1, 0, 1])
+        found = skin.deform(pose)
+        distance, _ = signed_distance(collider, pose, found.vertices)
+        assert distance.min() >= -CONTACT_TOLERANCE
+        assert np.isfinite(found.vertices).all()
+        np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-12)
+    assert found.residual < 0.5
+    at_rest = settled(skin, pose)
+    assert at_rest.residual < 1e-3
+    distance, _ = signed_distance(collider, pose, at_rest.vertices)
+    assert distance.min() >= -CONTACT_TOLERANCE
+    assert (np.abs(distance) < 1e-6).sum() > 10
+
+
+def test_a_probe_that_appears_deep_in_the_skin_pushes_it_all_forwards():
+    """Deeper than the capsule's axis, where the nearest surface is the one behind."""
+    sheet = plane_surface((0.12, 0.12), 0.004)
+    gradual, sudden = (SkinMembrane(sheet, Capsule(0.008, 0.03)) for _ in range(2))
+    for depth in np.linspace(0, 0.012, 40):
+        gradual.deform(Pose([0, 0, depth]))
+    pose = Pose([0, 0, 0.012])
+    first = sudden.deform(pose)
+    assert first.vertices[:, 2].min() > -2e-3
+    np.testing.assert_allclose(
+        settled(sudden, pose).vertices, settled(gradual, pose).vertices, atol=2e-4
+    )
+
+
+def test_a_far_jump_is_taken_in_more_steps_and_said():
+    sheet = plane_surface((0.12, 0.12), 0.004)
+    skin = SkinMembrane(sheet, Capsule(0.004, 0.03), steps=5)
+    skin.deform(Pose([-0.03, 0, 0.002]))
+    found = skin.deform(Pose([-0.005, 0, 0.002]))
+    assert "25 steps for a probe that moved 25 mm" in found.action
+
+
+def test_the_skin_is_smooth_around_the_probe():
+    """Off the contact its slope falls off steadily: no crease and no overshoot."""
+    sheet = plane_surface((0.2, 0.2), 0.0025)
+    skin = settled(SkinMembrane(sheet, Sphere(0.03)), Pose([0, 0, 0.01]))
+    line = np.flatnonzero((np.abs(sheet.vertices[:, 1]) < 1e-9) & (sheet.vertices[:, 0] >= 0))
+    x, _, z = skin.vertices[line[np.argsort(sheet.vertices[line, 0])]].T
+    slope = np.diff(z) / np.diff(x)
+    assert z[0] == pytest.approx(0.01, abs=1e-6)
+    assert (np.diff(z) < 1e-6).all()
+    steepest = int(np.argmin(slope))
+    assert (np.diff(slope[steepest:]) > -1e-4).all()
+    assert np.abs(np.diff(slope)).max() < 0.35
+
+
+def test_prestrain_is_what_smooths_it():
+    """Unstretched springs, as the paper's, leave what is beside the contact where it was."""
+    sheet = plane_surface((0.1, 0.1), 0.0025)
+    pose = Pose([0, 0, 0.0005])
+    moved = [
+        np.abs(settled(SkinMembrane(sheet, Sphere(0.01), prestrain=p), pose).vertices[:, 2] - 0)
+        for p in (0.0, 0.2)
+    ]
+    beside = (np.hypot(*sheet.vertices[:, :2].T) > 0.0035) & (
+        np.hypot(*sheet.vertices[:, :2].T) < 0.006
+    )
+    assert moved[1][beside].max() > 5 * moved[0][beside].max()
+
+
+def test_masses_are_raised_to_what_the_step_needs():
+    sheet = plane_surface((0.05, 0.05), 0.005)
+    heavy = SkinMembrane(sheet, Sphere(0.03), density=2.0, time_step=1e-4)
+    light = SkinMembrane(sheet, Sphere(0.03), density=2.0, time_step=0.01)
+    # The stiffest row is a vertex with 8 springs, in the sheet's own lumped masses.
+    valence = np.bincount(sheet.edges.ravel())
+    limit = np.sqrt((4 * 2.0 * sheet.vertex_areas / (2 * 40.0 * valence + 4.0)).min())
+    assert heavy.step_limit == pytest.approx(limit)
+    assert light.step_limit == pytest.approx(limit)
+    np.testing.assert_allclose(heavy.mass, 2.0 * sheet.vertex_areas)
+    assert heavy.deform(Pose([0, 0, 0.002])).action == ""
+    assert (light.mass > heavy.mass).all()
+    found = light.deform(Pose([0, 0, 0.002]))
+    assert "masses raised up to" in found.action
+    assert f"stable only up to {limit:.2g} s" in found.action
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    stiffness=st.floats(0.0, 1e5),
+    anchor=st.floats(1e-3, 1e4),
+    damping=st.floats(1.0, 10.0),
+    density=st.floats(1e-3, 1e3),
+    prestrain=st.floats(0.0, 0.9),
+    time_step=st.floats(1e-5, 1.0),
+    seed=st.integers(0, 1000),
+)
+def test_no_settings_make_it_diverge(
+    stiffness, anchor, damping, density, prestrain, time_step, seed
+):
+    rng = np.random.default_rng(seed)
+    sheet = plane_surface((0.08, 0.08), 0.01)
+    skin = SkinMembrane(
+        sheet, Sphere(0.02), stiffness=stiffness, anchor_stiffness=anchor, damping=damping,
+        density=density, prestrain=prestrain, time_step=time_step,
+    )  # fmt: skip
+    for _ in range(20):
+        skin.deform(Pose(rng.uniform(-0.02, 0.02, 3), rng.normal(size=4)))
+    pressed = skin.energy()
+    for _ in range(50):
+        found = skin.deform(None)
+        assert "not finite" not in found.action
+    # Euler conserves an energy of its own, which differs from this one where damping is slight;
+    # 500 steps beyond the limit would raise it by many powers of ten.
+    assert skin.energy() <= 3.0 * pressed
+
+
+def test_an_unmoved_probe_on_settled_skin_costs_nothing():
+    skin = SkinMembrane(plane_surface((0.1, 0.1), 0.01), Sphere(0.03))
+    pose = Pose([0, 0, 0.005])
+    found = settled(skin, pose)
+    assert skin.deform(Pose(pose.position, pose.orientation)) is found
+    assert skin.deform(Pose([0, 0, 0.0051])) is not found
+
+
+def test_skin_that_nothing_touches_stays_as_it_is():
+    sheet = plane_surface((0.1, 0.1), 0.01)
+    skin = SkinMembrane(sheet, Sphere(0.03))
+    first = skin.deform(None)
+    for z in (-0.05, -0.03, -0.001):
+        assert skin.deform(Pose([0, 0, z])) is first
+    np.testing.assert_array_equal(first.vertices, sheet.vertices)
+    assert (first.residual, first.action) == (0.0, "")
+
+
+def test_reset_brings_the_rest_shape_back_at_once():
+    sheet = plane_surface((0.1, 0.1), 0.01)
+    skin = SkinMembrane(sheet, Sphere(0.03))
+    path = [Pose([0, 0, 0.002 * k]) for k in range(5)]
+    first = [skin.deform(pose).vertices for pose in path]
+    skin.reset()
+    np.testing.assert_array_equal(skin.deform(None).vertices, sheet.vertices)
+    skin.reset()
+    for expected, pose in zip(first, path, strict=True):
+        np.testing.assert_array_equal(skin.deform(pose).vertices, expected)
+
+
+def test_results_are_not_changed_by_later_frames_nor_by_the_caller():
+    skin = SkinMembrane(plane_surface((0.1, 0.1), 0.01), Sphere(0.03))
+    found = skin.deform(Pose([0, 0, 0.005]))
+    kept = found.vertices.copy()
+    skin.deform(Pose([0, 0, 0.01]))
+    np.testing.assert_array_equal(found.vertices, kept)
+    with pytest.raises(ValueError, match="read-only"):
+        found.vertices[0, 0] = 1.0
+
+
+def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
+    skin = SkinMembrane(
+        plane_surface((0.1, 0.1), 0.01),
+        Sphere(0.03),
+        stiffness=1e308,
+        density=1e300,
+        time_step=1e-9,
+    )
+    before = skin.deform(None).vertices
+    found = skin.deform(Pose([0, 0, 0.01]))
+    assert "not finite" in found.action
+    np.testing.assert_array_equal(found.vertices, before)
+    assert not skin.velocity.any()
+
+
+def test_warming_up_leaves_the_membrane_as_it_is():
+    skin = SkinMembrane(plane_surface((0.1, 0.1), 0.01), Sphere(0.03))
+    found = skin.deform(Pose([0, 0, 0.005]))
+    energy = skin.energy()
+    skin.warm_up()
+    assert skin.energy() == energy
+    np.testing.assert_array_equal(skin._latest.vertices, found.vertices)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"stiffness": -1.0}, "stiffness is -1.0: give 0 or more"),
+        ({"anchor_stiffness": 0.0}, "anchor_stiffness is 0.0: give more than 0"),
+        ({"damping": float("nan")}, "damping is nan"),
+        ({"damping": 0.5}, "damping is 0.5: give 1 or more"),
+        ({"density": 0.0}, "density is 0.0"),
+        ({"prestrain": 1.0}, "prestrain is 1.0: give 0 to below 1"),
+        ({"time_step": float("inf")}, "time_step is inf"),
+        ({"steps": 0}, "steps is 0: give 1 to 400"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change, words):
+    with pytest.raises(SolverError, match=words):
+        SkinMembrane(plane_surface((0.1, 0.1), 0.05), Sphere(0.03), **change)

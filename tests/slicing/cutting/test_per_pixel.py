@@ -1,0 +1,96 @@
+"""The naive method, against numbers worked out by hand, linear algebra and scipy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from slicing_cases import KINDS, between_voxels, random_case, sampled, tetrahedra_at
+
+from us_sim.slicing.cutting.per_pixel import PerPixel
+from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.volume.volume import Volume
+
+# One tetrahedron with its corners at the origin and 4 mm along each axis.
+CORNER = np.array([[0.0, 0, 0], [4e-3, 0, 0], [0, 4e-3, 0], [0, 0, 4e-3]])
+ONE = np.array([[0, 1, 2, 3]])
+
+
+def millimetres(columns, rows, y=0.0, spans=None):
+    """Pixels of 1 mm in the plane of x and z, the first at x = z = 0."""
+    return SlicePlane(
+        np.array([0.0, y, 0.0]), np.array([1e-3, 0, 0]), np.array([0, 0, 1e-3]),
+        columns=columns, rows=rows, spans=spans,
+    )  # fmt: skip
+
+
+def ramp():
+    """The grey value of voxel (i, j, k), 1 mm wide, is 100 + 10 i + k."""
+    voxels = np.add.outer(np.add.outer(10 * np.arange(8), np.zeros(8, int)), np.arange(8)) + 100
+    return Volume(voxels.astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]), voxels.astype("u1"))
+
+
+def test_a_tetrahedron_that_is_stretched_twofold():
+    """Half the way in x at rest: 5 grey values a pixel in it, 10 in the rigid rest."""
+    slicer = PerPixel(ramp(), CORNER, ONE)
+    nodes = CORNER * [2.0, 1.0, 1.0]
+    expected = [
+        [100, 105, 110, 115, 120, 125, 130, 135],
+        [101, 106, 111, 116, 121, 126, 131, 171],
+        [102, 107, 112, 117, 122, 152, 162, 172],
+        [103, 108, 113, 133, 143, 153, 163, 173],
+    ]
+    np.testing.assert_array_equal(slicer.image(nodes, millimetres(8, 4)), expected)
+    # The nearest voxel's label, the greater index where two are as near.
+    assert slicer.labels(nodes, millimetres(8, 4))[1].tolist() == [101, 111, 111, 121, 121, 131,
+                                                                   131, 171]  # fmt: skip
+
+
+def test_a_tetrahedron_that_moved_away_leaves_black():
+    """By 2 mm in x: black is what it covered at rest, its surface included, and no longer does."""
+    slicer = PerPixel(ramp(), CORNER, ONE)
+    nodes = CORNER + np.array([2e-3, 0, 0])
+    image = slicer.image(nodes, millimetres(8, 4))
+    np.testing.assert_array_equal(image[0], [0, 0, 100, 110, 120, 130, 140, 170])
+    np.testing.assert_array_equal(image[3], [0, 0, 103, 113, 143, 153, 163, 173])
+    rest = slicer.rest_coordinates(nodes, millimetres(8, 4))
+    assert np.isnan(rest[3, :2]).all()
+    np.testing.assert_allclose(rest[3, 3], [1e-3, 0, 3e-3], atol=1e-15)
+    np.testing.assert_allclose(rest[3, 4], [4e-3, 0, 3e-3], atol=1e-15)
+
+
+def test_only_spans_are_shown():
+    spans = np.array([[[0, 2], [5, 8]], [[3, 3], [0, 0]]], dtype=np.int32)
+    plane = millimetres(8, 2, spans=spans)
+    image = PerPixel(ramp(), CORNER, ONE).image(CORNER, plane)
+    np.testing.assert_array_equal(image, [[100, 110, 0, 0, 0, 150, 160, 170], [0] * 8])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=6, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_every_pixel_is_where_linear_algebra_puts_it(kind, seed):
+    case = random_case(kind, seed)
+    slicer = PerPixel(case.volume, case.rest_nodes, case.tetrahedra, threads=2)
+    rest = slicer.rest_coordinates(case.nodes, case.plane).reshape(-1, 3)
+    points = case.plane.pixels().reshape(-1, 3)
+    shown = case.plane.is_shown().ravel()
+    holders, places = tetrahedra_at(case, points, 1e-9)
+    was_tissue = tetrahedra_at(case._replace(nodes=case.rest_nodes), points, 1e-9)[0].any(axis=1)
+    is_tissue = holders.any(axis=1)
+    np.testing.assert_array_equal(np.isnan(rest[:, 0]), ~shown | (was_tissue & ~is_tissue))
+    rigid = shown & ~was_tissue & ~is_tissue
+    np.testing.assert_allclose(rest[rigid], points[rigid], rtol=0, atol=1e-15)
+    tissue = shown & is_tissue
+    distances = np.linalg.norm(places[tissue] - rest[tissue][:, None], axis=-1)
+    assert np.where(holders[tissue], distances, np.inf).min(axis=1).max(initial=0.0) < 1e-9
+
+    index = rest @ case.volume.patient_to_index[:3, :3].T + case.volume.patient_to_index[:3, 3]
+    somewhere = ~np.isnan(rest[:, 0])
+    grey, label = sampled(case.volume, index[somewhere])
+    image = slicer.image(case.nodes, case.plane).ravel()
+    labels = slicer.labels(case.nodes, case.plane).ravel()
+    assert np.abs(image[somewhere] - grey).max(initial=0) <= 1
+    clear = ~between_voxels(index[somewhere])
+    np.testing.assert_array_equal(labels[somewhere][clear], label[clear])
+    assert not image[~somewhere].any()
+    assert not labels[~somewhere].any()

@@ -1,0 +1,317 @@
+"""Slices of deformed meshes against a pixel-by-pixel search, analytic maps and scipy."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
+
+from us_sim.errors import MeshError, VolumeError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.cutting import location, resampling, section, trilinear
+from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+from us_sim.slicing.cutting.row_subdivision import RowSubdivision
+from us_sim.slicing.cutting.slicer import warm_up
+from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
+
+SIZE = np.array([0.06, 0.04, 0.05])
+
+
+def volume_around_the_box(voxel=1e-3, margin=0.01, seed=0):
+    """Noise with labels, larger than the box mesh on all sides but the top."""
+    shape = np.round((SIZE + np.array([2, 2, 1]) * margin) / voxel).astype(int)
+    to_patient = np.diag([voxel, voxel, voxel, 1.0])
+    to_patient[:3, 3] = [-SIZE[0] / 2 - margin + voxel / 2, -SIZE[1] / 2 - margin + voxel / 2,
+                         voxel / 2]  # fmt: skip
+    rng = np.random.default_rng(seed)
+    voxels = rng.integers(0, 256, shape, dtype=np.uint8)
+    return Volume(voxels, to_patient, (voxels // 64) + np.uint8(1), {1: "a", 2: "b", 3: "c"})
+
+
+def box(counts=(7, 5, 6)):
+    return box_mesh(
+        uniform_planes(-SIZE[0] / 2, SIZE[0] / 2, counts[0]),
+        uniform_planes(-SIZE[1] / 2, SIZE[1] / 2, counts[1]),
+        uniform_planes(0.0, SIZE[2], counts[2]),
+    )
+
+
+def locate_one_by_one(mesh, nodes, points):
+    """The tissue's rest position at each point (P, 3), by trying all tetrahedra; NaN outside."""
+    rest = np.full(points.shape, np.nan)
+    corners, places = nodes[mesh.tetrahedra], mesh.nodes[mesh.tetrahedra]
+    for corner, place in zip(corners, places, strict=True):
+        if np.linalg.det(corner[1:] - corner[0]) <= 0:
+            continue
+        near = np.flatnonzero(
+            ((points >= corner.min(0) - 1e-9) & (points <= corner.max(0) + 1e-9)).all(axis=1)
+        )
+        weights = np.linalg.solve((corner[1:] - corner[0]).T, (points[near] - corner[0]).T).T
+        weights = np.column_stack([1 - weights.sum(axis=1), weights])
+        inside = (weights >= -1e-9).all(axis=1)
+        rest[near[inside]] = weights[inside] @ place
+    return rest
+
+
+def expected_rest(mesh, nodes, plane):
+    """The oracle for `rest_coordinates`: deformed tissue, else nothing, else the pixel itself."""
+    points = plane.pixels().reshape(-1, 3)
+    moved = locate_one_by_one(mesh, nodes, points)
+    was_tissue = ~np.isnan(locate_one_by_one(mesh, mesh.nodes, points)[:, 0])
+    outside = np.isnan(moved[:, 0])
+    moved[outside & ~was_tissue] = points[outside & ~was_tissue]
+    return moved.reshape(plane.rows, plane.columns, 3)
+
+
+def pressed(mesh, depth=0.008, width=0.012):
+    """The box with a dent in its top, its other faces where they were."""
+    x, y, z = mesh.nodes.T
+    dent = np.exp(-(x**2 + y**2) / width**2) * depth * (1 - z / SIZE[2])
+    return mesh.nodes + np.column_stack([0 * dent, 0 * dent, dent])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_undeformed_mesh_is_the_volume_itself(seed):
+    rng = np.random.default_rng(seed)
+    volume, mesh = volume_around_the_box(seed=seed), box()
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    pose = Pose([0.0, 0.0, 0.005], np.array([0.0, 0, 0, 1]) + rng.normal(scale=0.2, size=4))
+    plane = LinearProbe(0.05, 0.04, 83, 67).plane(pose)
+    np.testing.assert_allclose(
+        slicer.rest_coordinates(mesh.nodes, plane), plane.pixels(), rtol=0, atol=1e-9
+    )
+    index = plane.pixels() @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
+    expected = map_coordinates(
+        volume.intensities.astype(float), np.moveaxis(index, -1, 0), order=1, mode="nearest"
+    )
+    among = ((index >= 0) & (index <= np.array(volume.shape) - 1)).all(axis=-1)
+    image = slicer.image(mesh.nodes, plane)
+    assert np.abs(image - np.floor(expected + 0.5))[among].max() <= 1
+    assert np.abs(image.astype(int) - sample_plane(volume, plane)).max() <= 1
+    np.testing.assert_array_equal(slicer.labels(mesh.nodes, plane), sample_labels(volume, plane))
+
+
+def test_a_sheared_mesh_gives_the_analytic_map():
+    volume, mesh = volume_around_the_box(), box()
+    shear = np.array([[1.0, 0.1, 0.2], [0.0, 1.1, -0.1], [0.05, 0.0, 0.9]])
+    plane = LinearProbe(0.03, 0.03, 64, 48).plane(Pose([0, 0, 0.01], [0.05, 0.1, 0.2, 1.0]))
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    expected = plane.pixels() @ np.linalg.inv(shear).T
+    found = slicer.rest_coordinates(mesh.nodes @ shear.T, plane)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    index = expected @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
+    grey = map_coordinates(volume.intensities.astype(float), np.moveaxis(index, -1, 0), order=1)
+    assert np.abs(slicer.image(mesh.nodes @ shear.T, plane) - np.floor(grey + 0.5)).max() <= 1
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    strength=st.floats(0.0, 0.35),
+    regions=st.sampled_from([1, 3, 32, 200]),
+    shape=st.sampled_from([(1, 1), (1, 40), (40, 1), (37, 23), (64, 64)]),
+)
+def test_row_subdivision_equals_a_search_of_every_pixel(seed, strength, regions, shape):
+    rng = np.random.default_rng(seed)
+    mesh = box((4, 4, 4))
+    spacing = SIZE / 3
+    nodes = mesh.nodes + rng.uniform(-1, 1, mesh.nodes.shape) * strength * spacing
+    corners = nodes[mesh.tetrahedra]
+    if np.linalg.det(corners[:, 1:] - corners[:, :1]).min() <= 1e-9:
+        nodes = mesh.nodes + (nodes - mesh.nodes) * 0.3
+    pose = Pose(rng.uniform(-0.5, 0.5, 3) * SIZE, rng.normal(size=4))
+    plane = LinearProbe(rng.uniform(0.01, 0.12), rng.uniform(0.01, 0.12), *shape).plane(pose)
+    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, regions=regions)
+    np.testing.assert_allclose(
+        slicer.rest_coordinates(nodes, plane), expected_rest(mesh, nodes, plane), atol=1e-9
+    )
+    assert slicer.skipped == 0
+
+
+def test_two_separate_bodies_and_the_gap_between_them():
+    """Both ends of every row lie outside, and so does its middle."""
+    left = box_mesh([-0.02, -0.01], [-0.01, 0.01], [0.01, 0.02])
+    nodes = np.concatenate([left.nodes, left.nodes + np.array([0.025, 0, 0])])
+    tetrahedra = np.concatenate([left.tetrahedra, left.tetrahedra + len(left.nodes)])
+    mesh = SimpleNamespace(nodes=nodes, tetrahedra=tetrahedra)
+    plane = LinearProbe(0.06, 0.03, 301, 40).plane(Pose())
+    slicer = RowSubdivision(volume_around_the_box(), nodes, tetrahedra)
+    moved = nodes + np.array([0, 0, 0.002])
+    np.testing.assert_allclose(
+        slicer.rest_coordinates(moved, plane), expected_rest(mesh, moved, plane), atol=1e-9
+    )
+
+
+def test_a_needle_thinner_than_the_first_splits_is_found():
+    needle = np.array([[0.0051, -0.01, 0.01], [0.0058, -0.01, 0.01], [0.0051, 0.01, 0.01],
+                       [0.0051, -0.01, 0.04]])  # fmt: skip
+    mesh = SimpleNamespace(nodes=needle, tetrahedra=np.array([[0, 1, 2, 3]]))
+    plane = LinearProbe(0.06, 0.05, 512, 64).plane(Pose([0, -0.008, 0]))
+    moved = needle + np.array([0, 0, 0.001])
+    found = RowSubdivision(volume_around_the_box(), needle, mesh.tetrahedra).rest_coordinates(
+        moved, plane
+    )
+    np.testing.assert_allclose(found, expected_rest(mesh, moved, plane), atol=1e-9)
+    assert (np.abs(found - plane.pixels()).max(axis=-1) > 5e-4).sum() > 50
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("layer", [0, 1, -1])
+def test_a_plane_through_nodes_and_faces_leaves_no_hole(axis, layer):
+    """Pixels on vertices, edges and faces; with the outermost layers, on the mesh's boundary."""
+    volume, mesh = volume_around_the_box(), box((7, 5, 6))
+    planes = [np.unique(mesh.nodes[:, a]) for a in range(3)]
+    spacing = [p[1] - p[0] for p in planes]
+    across, down = (a for a in range(3) if a != axis)
+    origin = np.array([p[0] for p in planes])
+    origin[axis] = planes[axis][layer]
+    steps = np.eye(3)
+    count = [len(planes[across]), len(planes[down])]
+    plane = SlicePlane(
+        origin,
+        steps[across] * spacing[across] / 4,
+        steps[down] * spacing[down] / 4,
+        columns=4 * (count[0] - 1) + 1,
+        rows=4 * (count[1] - 1) + 1,
+    )
+    turn = Pose([0.011, 0.003, -0.007], [0.3, -0.2, 0.5, 0.8])
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    for moved in (Pose(), turn):
+        placed = SlicePlane(
+            moved.apply(origin[None])[0],
+            moved.rotation @ plane.column_step,
+            moved.rotation @ plane.row_step,
+            columns=plane.columns,
+            rows=plane.rows,
+        )
+        found = slicer.rest_coordinates(moved.apply(mesh.nodes), placed)
+        np.testing.assert_allclose(found, plane.pixels(), rtol=0, atol=1e-9)
+
+
+def test_tissue_that_was_pushed_away_leaves_black_and_no_ghost():
+    """Above the dent is air; beside the mesh the volume goes on, without a seam."""
+    mesh = box((13, 9, 11))
+    volume = volume_around_the_box()
+    volume = Volume(np.full(volume.shape, 200, np.uint8), volume.index_to_patient, volume.labels)
+    plane = LinearProbe(0.07, 0.04, 128, 100).plane(Pose())
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    nodes = pressed(mesh)
+    column, row = np.meshgrid(np.arange(128), np.arange(100))
+    x = np.unique(mesh.nodes[:, 0])
+    surface = np.interp(plane.pixels()[0, :, 0], x, 0.008 * np.exp(-(x**2) / 0.012**2))
+    depth = (row + 0.5) * 0.04 / 100
+    inside_the_box = np.abs(plane.pixels()[..., 0]) < SIZE[0] / 2
+    in_the_dent = (depth < surface[column]) & inside_the_box
+    assert in_the_dent.sum() > 300
+    np.testing.assert_array_equal(slicer.image(nodes, plane) == 0, in_the_dent)
+    np.testing.assert_array_equal(slicer.labels(nodes, plane) == 0, in_the_dent)
+    np.testing.assert_array_equal(
+        np.isnan(slicer.rest_coordinates(nodes, plane)[..., 0]), in_the_dent
+    )
+
+
+def test_a_pressed_image_starts_in_tissue():
+    """With the face at the bottom of the dent no pixel below it is black."""
+    mesh = box((13, 9, 11))
+    volume = volume_around_the_box()
+    volume = Volume(np.full(volume.shape, 200, np.uint8), volume.index_to_patient)
+    plane = LinearProbe(0.02, 0.03, 128, 100).plane(Pose([0, 0, 0.008]))
+    image = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra).image(pressed(mesh), plane)
+    assert (image == 200).all()
+
+
+def test_a_plane_away_from_the_mesh_is_rigid_or_black():
+    volume, mesh = volume_around_the_box(), box((3, 3, 3))
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    probe = LinearProbe(0.04, 0.04, 32, 32)
+    beside = probe.plane(Pose([0, SIZE[1] / 2 + 0.004, 0.005]))
+    np.testing.assert_array_equal(slicer.image(pressed(mesh), beside), sample_plane(volume, beside))
+    assert slicer.image(pressed(mesh), beside).any()
+    assert not slicer.image(pressed(mesh), probe.plane(Pose([0, 0, -0.5]))).any()
+
+
+def test_inverted_and_flat_tetrahedra_are_left_out_and_counted():
+    volume, mesh = volume_around_the_box(), box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.04])
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
+    mirrored = mesh.nodes * [1.0, 1.0, -1.0] + [0, 0, 0.04]
+    met = slicer.labels(mesh.nodes, plane)
+    assert slicer.skipped == 0
+    assert met.all()
+    assert not slicer.image(mirrored, plane).any()
+    assert slicer.skipped >= 3
+    assert not slicer.image(mesh.nodes * [1.0, 0.0, 1.0] + [0, 1e-3, 0], plane).any()
+    assert slicer.skipped == 5
+
+
+def test_threads_and_regions_do_not_change_a_byte():
+    volume, mesh = volume_around_the_box(), box()
+    plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
+    nodes = pressed(mesh)
+    images = [
+        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions=regions, threads=threads).image(
+            nodes, plane
+        )
+        for regions, threads in ((32, 1), (32, 2), (32, 3), (7, 2), (1, 4))
+    ]
+    for image in images[1:]:
+        np.testing.assert_array_equal(image, images[0])
+
+
+def test_nodes_that_cannot_be_cut_are_refused():
+    volume, mesh = volume_around_the_box(), box((3, 3, 3))
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    plane = LinearProbe(0.04, 0.04, 8, 8).plane(Pose())
+    broken = mesh.nodes.copy()
+    broken[5, 1] = np.nan
+    with pytest.raises(MeshError, match="node 5 is not finite"):
+        slicer.image(broken, plane)
+    with pytest.raises(MeshError, match="4 deformed nodes but 27 at rest"):
+        slicer.image(mesh.nodes[:4], plane)
+    with pytest.raises(MeshError, match=r"shape \(27, 2\)"):
+        slicer.image(mesh.nodes[:, :2], plane)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tetrahedra", "words"),
+    [
+        (np.full((4, 3), np.inf), [[0, 1, 2, 3]], "node 0 is not finite"),
+        (np.eye(4)[:, :3], [[0, 1, 2, 4]], "only 4 nodes"),
+        (np.eye(4)[:, :3], [[0, 1, 2, -1]], "name nodes -1"),
+        (np.eye(4)[:, :3], [[0, 1, 2]], r"give \(M, 4\) integers"),
+        (np.eye(4)[:, :3], [[0.0, 1, 2, 3]], r"give \(M, 4\) integers"),
+    ],
+)
+def test_a_rest_mesh_that_cannot_be_is_refused(nodes, tetrahedra, words):
+    with pytest.raises(MeshError, match=words):
+        RowSubdivision(volume_around_the_box(), nodes, np.array(tetrahedra))
+
+
+def test_other_bad_input_is_refused():
+    mesh, volume = box((2, 2, 2)), volume_around_the_box()
+    with pytest.raises(ValueError, match="at least one region"):
+        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions=0)
+    plain = Volume(volume.intensities, volume.index_to_patient)
+    with pytest.raises(VolumeError, match="has no labels"):
+        RowSubdivision(plain, mesh.nodes, mesh.tetrahedra).labels(
+            mesh.nodes, LinearProbe(0.04, 0.04, 8, 8).plane(Pose())
+        )
+
+
+def test_nothing_is_left_to_compile_after_warming_up():
+    warm_up("row_subdivision")
+    kernels = (section._cut, location.cells, location.subdivide_rows, location.leave_black,
+               trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
+    before = [len(kernel.signatures) for kernel in kernels]
+    assert min(before) >= 1
+    volume, mesh = volume_around_the_box(), box()
+    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
+    plane = LinearProbe(0.04, 0.04, 30, 20).plane(Pose())
+    slicer.image(pressed(mesh), plane)
+    slicer.labels(pressed(mesh), plane)
+    assert [len(kernel.signatures) for kernel in kernels] == before

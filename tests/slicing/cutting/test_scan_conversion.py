@@ -1,0 +1,248 @@
+"""The exact slicer's kernels: every pixel once, places kept, spans, threads, memory."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import MeshError, VolumeError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.cutting import (
+    clusters,
+    cut_polygons,
+    resampling,
+    rest_outline,
+    span_sampling,
+    spans,
+)
+from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+from us_sim.slicing.cutting.scan_conversion import ScanConversion
+from us_sim.slicing.cutting.slicer import warm_up
+from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
+
+SIZE = np.array([0.06, 0.04, 0.05])
+
+
+def volume_around_the_box(voxel=1e-3, margin=0.01):
+    shape = np.round((SIZE + 2 * margin) / voxel).astype(int)
+    to_patient = np.diag([voxel, voxel, voxel, 1.0])
+    to_patient[:3, 3] = -SIZE / 2 - margin + voxel / 2
+    to_patient[2, 3] += SIZE[2] / 2
+    voxels = np.random.default_rng(0).integers(1, 256, shape, dtype=np.uint8)
+    return Volume(voxels, to_patient, (voxels // 64) + np.uint8(1), {1: "a"})
+
+
+def box(counts=(7, 5, 6)):
+    return box_mesh(
+        uniform_planes(-SIZE[0] / 2, SIZE[0] / 2, counts[0]),
+        uniform_planes(-SIZE[1] / 2, SIZE[1] / 2, counts[1]),
+        uniform_planes(0.0, SIZE[2], counts[2]),
+    )
+
+
+def times_written(slicer, nodes, plane):
+    """(rows, columns) how many polygons hold each pixel, outlines left aside."""
+    count, *_ = slicer._cut(nodes, plane)
+    cuts = slicer._cuts
+    found = np.empty((plane.rows, plane.columns), dtype=np.int64)
+    used = np.empty(plane.rows, dtype=np.int32)
+    spans.convert_cuts(
+        cuts.corners, cuts.sides, count, cuts.outlines, cuts.points, cuts.owner, 0,
+        slicer._shown(plane), 0, plane.rows, found, used,
+    )  # fmt: skip
+    written = np.zeros((plane.rows, plane.columns), dtype=int)
+    for row in range(plane.rows):
+        for span in found[row, : used[row]]:
+            written[row, span & 8191 : span >> 13 & 8191] += 1
+    return written
+
+
+def plane_of_nodes(mesh, axis, layer, across=4):
+    """Pixels on the nodes of a layer of a box mesh, and on its edges and faces."""
+    planes = [np.unique(mesh.nodes[:, a]) for a in range(3)]
+    u, v = (a for a in range(3) if a != axis)
+    origin = np.array([p[0] for p in planes])
+    origin[axis] = planes[axis][layer]
+    steps = [np.eye(3)[a] * (planes[a][1] - planes[a][0]) / across for a in (u, v)]
+    size = [across * (len(planes[a]) - 1) + 1 for a in (u, v)]
+    return SlicePlane(origin, *steps, columns=size[0], rows=size[1])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_within_the_mesh_every_pixel_is_written_exactly_once(seed):
+    rng = np.random.default_rng(seed)
+    mesh = box()
+    spacing = SIZE / [6, 4, 5]
+    nodes = mesh.nodes + rng.uniform(-0.2, 0.2, mesh.nodes.shape) * spacing
+    slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
+    pose = Pose([0.0, 0.0, 0.015], rng.normal(size=4))
+    plane = LinearProbe(0.01, 0.01, 113, 97).plane(pose)
+    assert (times_written(slicer, nodes, plane) == 1).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("layer", [0, 2, -1])
+@pytest.mark.parametrize("off", [0.0, 1e-12, -1e-12, 3e-10, 1e-7])
+def test_on_nodes_edges_and_faces_nothing_is_written_twice(axis, layer, off):
+    mesh = box()
+    plane = plane_of_nodes(mesh, axis, layer)
+    inwards = 1.0 if layer >= 0 else -1.0
+    along = np.eye(3)[axis] * off * inwards * np.linalg.norm(plane.column_step)
+    plane = SlicePlane(plane.origin + along, plane.column_step, plane.row_step, plane.columns,
+                       plane.rows)  # fmt: skip
+    slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
+    written = times_written(slicer, mesh.nodes, plane)
+    assert written.max() <= 1
+    # Left and upper borders belong to the half-open polygons, right and lower ones to outlines.
+    if 0 < layer < 3:
+        assert (written[:-1, :-1] == 1).all()
+    found = slicer.rest_coordinates(1.0 * mesh.nodes, plane)
+    np.testing.assert_allclose(found, plane.pixels(), rtol=0, atol=1e-9)
+
+
+def test_the_closed_surface_is_covered_where_tissue_moved():
+    """With every rigid pixel black, what is seen is the mesh, its outermost pixels included."""
+    mesh = box()
+    plane = plane_of_nodes(mesh, axis=1, layer=2)
+    shown = SlicePlane(plane.origin - plane.column_step - plane.row_step, plane.column_step,
+                       plane.row_step, plane.columns + 2, plane.rows + 2)  # fmt: skip
+    volume = volume_around_the_box()
+    far = mesh.nodes + np.array([0.5, 0.0, 0.0])
+    slicer = ScanConversion(volume, far, mesh.tetrahedra)
+    seen = ~np.isclose(slicer.rest_coordinates(mesh.nodes, shown)[..., 0], shown.pixels()[..., 0])
+    expected = np.zeros(seen.shape, dtype=bool)
+    expected[1:-1, 1:-1] = True
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
+    mesh = box()
+    full = LinearProbe(0.05, 0.04, 64, 50).plane(Pose([0.004, 0, 0.003], [0.1, 0.05, 0, 1]))
+    rng = np.random.default_rng(1)
+    edges = np.sort(rng.integers(0, 65, (50, 4)), axis=1).reshape(50, 2, 2).astype(np.int32)
+    edges[3] = edges[7, 1] = 0
+    fan = SlicePlane(full.origin, full.column_step, full.row_step, 64, 50, spans=edges)
+    volume = volume_around_the_box()
+    slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
+    nodes = mesh.nodes * [0.8, 1.0, 0.9]
+    shown = fan.is_shown()
+    for draw in (
+        lambda plane: slicer.image(nodes, plane),
+        lambda plane: slicer.labels(nodes, plane),
+        lambda plane: sample_plane(volume, plane, threads=2),
+        lambda plane: sample_labels(volume, plane, threads=3),
+    ):
+        np.testing.assert_array_equal(draw(fan), np.where(shown, draw(full), 0))
+    places = slicer.rest_coordinates(nodes, fan)
+    assert np.isnan(places[~shown]).all()
+    np.testing.assert_array_equal(places[shown], slicer.rest_coordinates(nodes, full)[shown])
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_threads_and_repetition_do_not_change_a_byte(threads):
+    volume, mesh = volume_around_the_box(), box()
+    rng = np.random.default_rng(0)
+    nodes = mesh.nodes + rng.uniform(-0.006, 0.006, mesh.nodes.shape)
+    plane = LinearProbe(0.08, 0.07, 301, 203).plane(Pose([0, 1e-3, -0.01], [0.1, 0, 0.2, 1]))
+    one = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
+    many = ScanConversion(volume, mesh.nodes, mesh.tetrahedra, threads=threads)
+    for _ in range(2):
+        np.testing.assert_array_equal(one.image(nodes, plane), many.image(nodes, plane))
+    assert one.skipped == many.skipped > 0
+    np.testing.assert_array_equal(one.labels(nodes, plane), many.labels(nodes, plane))
+
+
+def test_more_spans_than_pixels_find_room():
+    """A hundred copies of a mesh in one place: where spans overlap, each is a span of its own."""
+    mesh, copies = box((2, 2, 2)), 100
+    nodes = np.concatenate([mesh.nodes] * copies)
+    tetrahedra = np.concatenate([mesh.tetrahedra + 8 * k for k in range(copies)])
+    volume = volume_around_the_box()
+    plane = LinearProbe(0.02, 0.02, 9, 40).plane(Pose([0, 1e-3, 0.01]))
+    slicer = ScanConversion(volume, nodes, tetrahedra, threads=2)
+    single = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
+    np.testing.assert_array_equal(
+        slicer.image(nodes * 1.01, plane), single.image(mesh.nodes * 1.01, plane)
+    )
+    assert slicer._used.max() > plane.columns
+
+
+def test_nodes_of_any_kind_are_taken_and_none_are_kept():
+    volume, mesh = volume_around_the_box(), box()
+    slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
+    plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
+    nodes = (mesh.nodes * 1.1).astype(np.float32)
+    expected = slicer.image(nodes.astype(np.float64), plane)
+    kernels = len(clusters._near.signatures)
+    wide = np.zeros((len(nodes), 6))
+    wide[:, ::2] = nodes
+    for given_nodes in (nodes, np.asfortranarray(nodes), nodes.tolist(), wide[:, ::2]):
+        np.testing.assert_array_equal(slicer.image(given_nodes, plane), expected)
+    assert len(clusters._near.signatures) == kernels
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_one_node_that_is_not_finite_is_found_wherever_it_is(bad):
+    mesh = box()
+    slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
+    plane = LinearProbe(0.03, 0.03, 8, 8).plane(Pose())
+    for node, axis in ((0, 0), (100, 1), (len(mesh.nodes) - 1, 2)):
+        nodes = mesh.nodes.copy()
+        nodes[node, axis] = bad
+        with pytest.raises(MeshError, match=f"node {node} is not finite"):
+            slicer.image(nodes, plane)
+    with pytest.raises(MeshError, match="so far away"):
+        slicer.image(mesh.nodes + np.array([0.0, 1e306, 0.0]), plane)
+
+
+def test_a_volume_beyond_the_numbers_of_the_kernel_is_refused():
+    long = np.broadcast_to(np.uint8(0), (2, 2, span_sampling.MOST_VOXELS_A_SIDE + 1))
+    mesh = box((2, 2, 2))
+    with pytest.raises(VolumeError, match="at most 16384 a side"):
+        ScanConversion(Volume(long, np.diag([1e-3] * 3 + [1.0])), mesh.nodes, mesh.tetrahedra)
+
+
+def test_grey_values_keep_within_a_level_along_the_longest_row():
+    """A map over 4096 pixels through voxels that alternate between black and white."""
+    voxels = np.zeros((64, 64, 64), dtype=np.uint8)
+    voxels[(np.indices(voxels.shape).sum(axis=0) % 2).astype(bool)] = 255
+    volume = Volume(voxels, np.diag([1e-3] * 3 + [1.0]))
+    mesh = box_mesh([1e-3, 0.062], [1e-3, 0.062], [1e-3, 0.062])
+    plane = SlicePlane([0.0015, 0.002, 0.0022], [1.4e-5, 9e-6, 1.2e-5], [1e-5, -3e-7, 1e-6],
+                       columns=4096, rows=3)  # fmt: skip
+    slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
+    index = plane.pixels() * 1e3
+    expected = np.zeros(index.shape[:2])
+    lower = np.floor(index).astype(int)
+    way = index - lower
+    for side in np.ndindex(2, 2, 2):
+        weight = np.where(side, way, 1 - way).prod(axis=-1)
+        expected += weight * voxels[tuple(np.moveaxis(lower + side, -1, 0))]
+    found = slicer.image(mesh.nodes, plane)
+    assert np.abs(found - expected).max() < 0.5 + 0.2
+
+
+def test_nothing_is_left_to_compile_after_warming_up():
+    warm_up("scan_conversion")
+    kernels = (
+        clusters._near,
+        cut_polygons.cut_tetrahedra,
+        spans.convert_cuts,
+        rest_outline._cut,
+        span_sampling.sample_spans,
+        span_sampling.fill_elements,
+        resampling.sample_nearest,
+    )
+    before = [len(kernel.signatures) for kernel in kernels]
+    assert min(before) >= 1
+    mesh = box()
+    slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, threads=2)
+    plane = LinearProbe(0.08, 0.04, 30, 20).plane(Pose([0, 0, -1e-3]))
+    slicer.image(mesh.nodes * 1.1, plane)
+    slicer.labels(mesh.nodes, plane)
+    slicer.rest_coordinates(mesh.nodes, plane)
+    assert [len(kernel.signatures) for kernel in kernels] == before

@@ -1,0 +1,222 @@
+"""What is drawn over an image stands at its millimetres, is legible, and stays in the picture."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.slicing.drawing.annotation import Annotation, Badge
+from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.drawing.lettering import lettering
+from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe.probe import LinearProbe
+
+LINEAR = LinearProbe(aperture=0.04, depth=0.04, columns=512, rows=512, focus=0.02)
+CONVEX = ConvexProbe(
+    radius=0.06, opening_angle=math.radians(60), depth=0.14, columns=640, rows=480, focus=0.06
+)
+SECTOR = SectorProbe(
+    aperture=0.02, opening_angle=math.radians(90), depth=0.16, columns=600, rows=500, focus=0.08
+)
+PROBES = pytest.mark.parametrize("probe", [LINEAR, CONVEX, SECTOR], ids=lambda p: type(p).__name__)
+AMBER = (255, 176, 0)
+
+
+def black(probe):
+    return np.zeros((probe.rows, probe.columns), np.uint8)
+
+
+def runs(lit):
+    """Middles of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lit, [False]]).astype(int)))
+    return (edges[::2] + edges[1::2] - 1) / 2
+
+
+def disk(labels, column, row, radius, number):
+    y, x = np.mgrid[: labels.shape[0], : labels.shape[1]]
+    labels[np.hypot(x - column, y - row) <= radius] = number
+    return labels
+
+
+@PROBES
+@pytest.mark.parametrize(("inset", "apart_mm"), [(2, {1, 5, 10}), (-1, {5, 10, 20})])
+def test_ticks_of_the_depth_scale_stand_at_whole_steps_below_the_face(probe, inset, apart_mm):
+    picture = Annotation(probe, {}).draw(black(probe))
+    text = round(min(probe.rows, probe.columns) / 40)  # labelled ticks are as long as letters
+    rows = runs(picture[:, probe.columns - (text if inset < 0 else inset)].min(axis=-1) > 150)
+    ends = (rows == 0) | (rows == probe.rows - 1)
+    depths = 1e3 * (probe.image_to_probe[2, 1] * rows + probe.image_to_probe[2, 3])
+    apart = round(np.median(np.diff(depths)))
+    assert apart in apart_mm
+    off = np.abs(depths / apart - np.round(depths / apart)) * apart
+    spacing = 1e3 * probe.pixel_spacing[1]
+    assert (off[~ends] <= 0.51 * spacing).all()
+    assert (off <= 1.01 * spacing).all()
+    assert depths[0] == pytest.approx(0.0, abs=1.01 * spacing)
+    assert len(rows) == 1 + math.floor(1e3 * probe.depth / apart + 1e-6)
+
+
+@PROBES
+def test_ticks_of_the_width_scale_stand_at_whole_steps_from_the_middle(probe):
+    picture = Annotation(probe, {}).draw(black(probe))
+    columns = runs(picture[-2, : probe.columns - 80].min(axis=-1) > 150)
+    x = 1e3 * (probe.image_to_probe[0, 0] * columns + probe.image_to_probe[0, 3])
+    apart = round(np.median(np.diff(x)))
+    assert apart in {1, 5, 10}
+    off = np.abs(x / apart - np.round(x / apart)) * apart
+    assert (off <= 0.51e3 * probe.pixel_spacing[0]).all()
+    assert len(columns) >= 6
+
+
+@PROBES
+def test_the_focus_is_marked_at_its_depth(probe):
+    picture = Annotation(probe, {}).draw(black(probe)).astype(int)
+    yellow = (picture[:, :, 0] > 200) & (picture[:, :, 2] < 120)
+    rows = np.nonzero(yellow)[0]
+    assert len(rows) > 10
+    depth = probe.image_to_probe[2, 1] * rows.mean() + probe.image_to_probe[2, 3]
+    assert depth == pytest.approx(probe.focus, abs=probe.pixel_spacing[1])
+
+
+@pytest.mark.parametrize("radius", [6.0, 25.3, 140.7])
+def test_the_outline_of_a_disk_is_its_circle(radius):
+    labels = disk(np.zeros((400, 420), np.uint8), 200.3, 190.6, radius, 7)
+    (outline,) = label_outlines(labels, 7, smoothing=3.0)
+    distance = np.hypot(*(outline - [200.3, 190.6]).T)
+    assert distance.mean() == pytest.approx(radius, abs=0.15)
+    assert np.abs(distance - radius).max() < 0.5
+
+
+def test_holes_are_outlined_and_specks_are_not():
+    labels = disk(np.zeros((200, 200), np.uint8), 100, 100, 60, 3)
+    labels = disk(labels, 100, 100, 30, 9)
+    labels[5, 5] = 3
+    outer, inner = label_outlines(labels, 3)
+    assert np.hypot(*(outer - 100).T).mean() == pytest.approx(60, abs=0.3)
+    assert np.hypot(*(inner - 100).T).mean() == pytest.approx(30, abs=0.3)
+    assert label_outlines(labels, 4) == []
+
+
+def test_each_structure_is_outlined_in_its_colour_and_named_once():
+    annotation = Annotation(
+        LINEAR, {6: ("vein", (0.25, 0.4, 0.85)), 5: ("artery", (0.85, 0.15, 0.15))}
+    )
+    labels = disk(disk(black(LINEAR), 120, 200, 40, 6), 300, 200, 20, 6)
+    blue_once = annotation.draw(black(LINEAR), labels).astype(int)
+    blue = blue_once[:, :, 2] - blue_once[:, :, 0] > 60
+    row, column = np.nonzero(blue)
+    first, second = np.hypot(column - 120, row - 200), np.hypot(column - 300, row - 200)
+    assert (np.abs(first - 40) < 1.6).sum() > 200
+    assert (np.abs(second - 20) < 1.6).sum() > 100
+    name = (np.abs(first - 40) > 2) & (np.abs(second - 20) > 2)
+    assert 30 < name.sum() < 200
+    assert np.ptp(column[name]) < 60  # in one place
+    assert np.ptp(row[name]) < 20
+    labels = disk(labels, 200, 350, 30, 5)
+    both = annotation.draw(black(LINEAR), labels).astype(int)
+    red = both[:, :, 0] - both[:, :, 2] > 60
+    row, column = np.nonzero(red & (np.indices(red.shape)[1] < 420))  # the focus is yellow
+    assert (np.abs(np.hypot(column - 200, row - 350) - 30) < 1.6).sum() > 150
+    np.testing.assert_array_equal(both[:300], blue_once[:300])
+
+
+def test_names_of_neighbours_do_not_cover_one_another_nor_their_outlines():
+    colours = {4: (1.0, 0.0, 0.0), 5: (0.0, 1.0, 0.0), 6: (0.0, 0.0, 1.0)}
+    structures = {number: (f"label {number}", colour) for number, colour in colours.items()}
+    places = {4: (200, 250), 5: (232, 250), 6: (216, 280)}
+    labels = black(LINEAR)
+    for number, (column, row) in places.items():
+        disk(labels, column, row, 13, number)
+    alone = {
+        number: Annotation(LINEAR, {number: structures[number]}).draw(
+            black(LINEAR), np.where(labels == number, labels, 0).astype(np.uint8)
+        )
+        for number in structures
+    }
+    together = Annotation(LINEAR, structures).draw(black(LINEAR), labels)
+    for number, colour in colours.items():
+        channel = int(np.argmax(colour))
+        own = [
+            (picture[..., channel].astype(int) - picture[..., (channel + 1) % 3] > 60)
+            & (picture[..., channel].astype(int) - picture[..., (channel + 2) % 3] > 60)
+            for picture in (alone[number], together)
+        ]
+        assert own[1].sum() == pytest.approx(own[0].sum(), rel=0.06)
+
+
+def test_the_badge_stands_in_a_frame_of_its_colour_and_the_image_stays():
+    annotation = Annotation(LINEAR, {})
+    image = np.random.default_rng(1).integers(0, 256, (512, 512), dtype=np.uint8)
+    before = image.copy()
+    live = annotation.draw(image)
+    stale = annotation.draw(image, badge=Badge("STALE 0.6 s", AMBER))
+    for edge in (stale[:3], stale[-3:], stale[:, :3], stale[:, -3:]):
+        assert (edge == AMBER).all()
+    text = stale[4:40, 100:412].astype(int)
+    assert (np.abs(text - AMBER).max(axis=-1) < 30).sum() > 300
+    np.testing.assert_array_equal(stale[50:-8, 8:-8], live[50:-8, 8:-8])
+    np.testing.assert_array_equal(image, before)
+    assert (live[100:400, 50:400] == image[100:400, 50:400, None]).all()
+
+
+@pytest.mark.parametrize(("size", "letters"), [(256, 8), (512, 13), (1024, 26)])
+def test_letters_grow_with_the_picture(size, letters):
+    probe = LinearProbe(aperture=0.05, depth=0.05, columns=size, rows=size)
+    picture = Annotation(probe, {}).draw(black(probe), badge=Badge("LOST", AMBER))
+    inner = picture[letters // 2 : 4 * letters, size // 4 : 3 * size // 4].astype(int)
+    height = np.ptp(np.nonzero((np.abs(inner - AMBER).max(axis=-1) < 60).any(axis=1))[0]) + 1
+    assert height == pytest.approx(2 * letters, abs=0.2 * letters + 2)
+
+
+@pytest.mark.parametrize("height", [8, 13, 26, 48])
+def test_letters_are_as_high_as_asked_on_a_dark_halo(height):
+    label = lettering("20 mm", height, AMBER)
+    assert label.height == pytest.approx(height + 4, abs=0.1 * height + 1)
+    assert label.width < 6 * height + 4
+    picture = np.full((100, 300, 3), 255, np.uint8)
+    assert label.draw(picture, 10, 10)
+    assert picture[:10].min() == picture[:, :10].min() == 255
+    assert picture.min() < 80  # letters on white stand out
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(1, 400),
+    st.integers(1, 400),
+    st.floats(5e-3, 0.2),
+    st.floats(5e-3, 0.4),
+    st.sampled_from(["", "LOST", "NO PROBE POSE", "STALE 1234567890.0 s"]),
+    st.integers(0, 2**32 - 1),
+)
+def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, depth, text, seed):
+    probe = LinearProbe(aperture=aperture, depth=depth, columns=columns, rows=rows, focus=4e-3)
+    labels = np.random.default_rng(seed).integers(0, 3, (rows, columns), dtype=np.uint8)
+    labels[rows // 3 : rows // 2, columns // 3 :] = 1
+    annotation = Annotation(probe, {1: ("artery", (1.0, 0.0, 0.0)), 2: ("bone", (0.0, 1.0, 0.0))})
+    badge = Badge(text, AMBER) if text else None
+    picture = annotation.draw(black(probe), labels, badge)
+    assert picture.shape == (rows, columns, 3)
+    assert picture.dtype == np.uint8
+    if badge:
+        assert (picture[0] == AMBER).all()
+        assert (picture[:, -1] == AMBER).all()
+    again = annotation.draw(black(probe), labels, badge)
+    np.testing.assert_array_equal(picture, again)
+
+
+def test_a_picture_of_512_by_512_is_drawn_within_two_milliseconds():
+    structures = {n: (f"label {n}", (0.2, 0.5, 0.8)) for n in range(1, 7)}
+    annotation = Annotation(LINEAR, structures)
+    image = np.random.default_rng(2).integers(0, 256, (512, 512), dtype=np.uint8)
+    labels = black(LINEAR)
+    for n in range(1, 7):
+        disk(labels, 70 + 130 * (n % 3), 130 + 200 * (n // 4), 15 + 8 * n, n)
+    seconds = []
+    for _ in range(60):
+        start = time.thread_time()
+        annotation.draw(image, labels)
+        seconds.append(time.thread_time() - start)
+    assert min(seconds) < 2e-3

@@ -1,0 +1,142 @@
+"""The parts together: what is off costs nothing, what is on happens in order."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import ProbeError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.formation.image_formation import ImageFormation
+from us_sim.slicing.formation.imaging import GREY_MAPS, Imaging
+from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe.probe import LinearProbe
+
+PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=48, rows=64, lines=24, samples=64)
+FAN = ConvexProbe(
+    radius=0.04, opening_angle=1.0, depth=0.05, columns=60, rows=50, lines=24, samples=64
+)
+PHASED = SectorProbe(aperture=0.02, opening_angle=1.2, depth=0.05, columns=40, rows=50)
+PIXEL = LinearProbe(aperture=0.04, depth=0.04, columns=1, rows=1, lines=1, samples=1)
+SPECKLE = np.random.Generator(np.random.PCG64(2)).integers(0, 256, (64, 48), dtype=np.uint8)
+
+
+def test_by_default_the_slice_itself_is_the_picture():
+    formation = ImageFormation(PROBE, Imaging())
+    assert formation.form([SPECKLE], None) is SPECKLE
+    assert not formation.needs_contact
+    (plane,) = formation.planes(Pose([0, 0, 0.01]))
+    np.testing.assert_array_equal(plane.origin, PROBE.plane(Pose([0, 0, 0.01])).origin)
+    assert ImageFormation(PROBE, Imaging(time_gain=[0.0, 0.0])).form([SPECKLE]) is SPECKLE
+
+
+def test_what_is_off_is_not_imported():
+    parts = ["elevation", "resolution", "reverberation", "grey_levels", "coupling"]
+    code = (
+        "import sys\n"
+        "from us_sim.slicing.formation.image_formation import ImageFormation\n"
+        "from us_sim.slicing.formation.imaging import Imaging\n"
+        "from us_sim.slicing.probe.probe import LinearProbe\n"
+        "ImageFormation(LinearProbe(0.04, 0.04), Imaging())\n"
+        f"print([p for p in {parts} if 'us_sim.slicing.' + p in sys.modules], 'cv2' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[] False"
+
+
+def test_a_fan_is_cut_whole_where_beams_are_resampled():
+    assert ImageFormation(FAN, Imaging()).planes(Pose())[0].spans is not None
+    blurred = ImageFormation(FAN, Imaging(lateral_resolution=1e-3, elevation_planes=3))
+    planes = blurred.planes(Pose())
+    assert len(planes) == 3
+    assert all(plane.spans is None for plane in planes)
+
+
+def test_gain_comes_after_air():
+    formation = ImageFormation(PROBE, Imaging(contact=True, gain=6.0, reverberation=-60.0))
+    assert formation.needs_contact
+    picture = formation.form([SPECKLE], np.full(24, 0.5, np.float32))
+    dimmed = np.maximum(SPECKLE.astype(int) - 26, 0)
+    np.testing.assert_array_equal(picture[dimmed == 0], 0)
+    bright = dimmed >= 17  # fainter ones fade
+    np.testing.assert_array_equal(picture[bright], dimmed[bright] + 26)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    imaging=st.builds(
+        Imaging,
+        gain=st.floats(-60, 60),
+        time_gain=st.lists(st.floats(-60, 60), max_size=3).map(tuple),
+        dynamic_range=st.floats(10, 120),
+        grey_map=st.sampled_from(GREY_MAPS),
+        elevation_planes=st.integers(1, 15),
+        elevation_width=st.floats(1e-4, 0.02),
+        lateral_resolution=st.sampled_from([0.0, 1e-5, 1e-3, 0.01]),
+        axial_resolution=st.sampled_from([0.0, 1e-5, 1e-3, 0.01]),
+        contact=st.booleans(),
+        reverberation=st.floats(-60, 0),
+    ),
+    probe=st.sampled_from([PROBE, FAN, dataclasses.replace(FAN, lines=1), PHASED, PIXEL]),
+    seed=st.integers(0, 9),
+)
+def test_any_settings_give_a_picture_the_same_one_every_time(imaging, probe, seed):
+    random = np.random.Generator(np.random.PCG64(seed))
+    formation = ImageFormation(probe, imaging)
+    planes = formation.planes(Pose([0.1, 0.2, 0.3], [0.1, 0.2, 0.3, 0.9]))
+    assert len(planes) == imaging.elevation_planes
+    images = [random.integers(0, 256, (probe.rows, probe.columns), np.uint8) for _ in planes]
+    before = [image.copy() for image in images]
+    coupling = random.random(probe.lines, dtype=np.float32)
+    picture = formation.form(images, coupling)
+    assert picture.shape == (probe.rows, probe.columns)
+    assert picture.dtype == np.uint8
+    if imaging.lateral_resolution or imaging.axial_resolution:  # else slices are black there
+        assert not picture[np.isnan(probe.pixel_beams[0])].any()
+    np.testing.assert_array_equal(ImageFormation(probe, imaging).form(images, coupling), picture)
+    np.testing.assert_array_equal(images, before)  # slices are not drawn on
+
+
+def test_black_stays_black():
+    imaging = Imaging(
+        gain=60.0, dynamic_range=120.0, elevation_planes=3, lateral_resolution=1e-3, contact=True
+    )
+    black = np.zeros((64, 48), dtype=np.uint8)
+    assert not ImageFormation(PROBE, imaging).form([black] * 3, np.ones(24, np.float32)).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"gain": 61}, r"imaging.gain: 61 dB is outside -60 to 60 dB"),
+        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level: its units are dB"),
+        ({"gain": float("nan")}, "imaging.gain: nan is not finite"),
+        ({"time_gain": 3.0}, "imaging.time_gain: 3.0 is not a list"),
+        ({"time_gain": [0, 99]}, "imaging.time_gain: 99 dB is outside"),
+        ({"dynamic_range": 5}, "imaging.dynamic_range: 5 dB is outside 10 to 120 dB"),
+        ({"elevation_planes": 2.5}, "imaging.elevation_planes: 2.5 is not a whole number"),
+        ({"elevation_planes": 16}, "imaging.elevation_planes: 16 is outside 1 to 15"),
+        ({"elevation_width": 3}, "imaging.elevation_width: .* did you mean '3 mm'"),
+        ({"lateral_resolution": -1e-3}, "imaging.lateral_resolution: -0.001 m is outside"),
+        ({"axial_resolution": "5 cm"}, "imaging.axial_resolution: 0.05 m is outside"),
+        ({"contact": 1}, "imaging.contact: 1 is not true or false"),
+        ({"reverberation": 1}, "imaging.reverberation: 1 dB is outside -60 to 0 dB"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_refused(change, words):
+    with pytest.raises(ProbeError, match=words):
+        Imaging(**change)
+
+
+def test_units_may_be_written():
+    imaging = Imaging(gain="6 dB", elevation_width="3 mm", time_gain=["1 dB", 2])
+    assert (imaging.gain, imaging.elevation_width, imaging.time_gain) == (6.0, 0.003, (1.0, 2.0))
+
+
+def test_every_setting_says_what_it_is():
+    for field in dataclasses.fields(Imaging):
+        assert len(field.metadata["description"]) > 10, field.name

@@ -1,0 +1,382 @@
+"""Where the pixels and beams of each kind of transducer lie, in millimetres."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import ProbeError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.cutting.slicer import create_slicer
+from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
+
+DEGREE = math.pi / 180
+
+pixel_count = st.integers(1, 90)
+numbers = {
+    "depth": st.floats(0.01, 0.3),
+    "columns": pixel_count,
+    "rows": pixel_count,
+    "lines": st.integers(1, 40),
+    "samples": st.integers(1, 40),
+}
+
+
+def sector(radius, room, **others):
+    """A sector whose face is as large as its virtual apex needs, and some more."""
+    used = 2 * radius * math.tan(others["opening_angle"] / 2)
+    assume(used < 0.05)
+    return SectorProbe(aperture=max(used, 3e-3) + room * (0.05 - used), radius=radius, **others)
+
+
+linear = st.builds(LinearProbe, aperture=st.floats(0.01, 0.15), **numbers)
+convex = st.builds(
+    ConvexProbe,
+    radius=st.floats(5e-3, 0.1),
+    opening_angle=st.floats(5 * DEGREE, math.pi),
+    **numbers,
+)
+phased = st.builds(
+    sector,
+    radius=st.one_of(st.just(0.0), st.floats(0.0, 0.03)),
+    room=st.floats(0.0, 0.5),
+    opening_angle=st.floats(5 * DEGREE, 140 * DEGREE),
+    **numbers,
+)
+probe = st.one_of(linear, convex, phased)
+fan = st.one_of(convex, phased)
+
+
+def pixel_positions(probe):
+    """(rows, columns) m: x and z of the pixel centres, by the map that is published."""
+    column, row = np.meshgrid(np.arange(probe.columns), np.arange(probe.rows))
+    pixels = np.stack([column, row, 0 * row, 0 * row + 1], -1) @ probe.image_to_probe.T
+    assert not pixels[..., 1].any()
+    return pixels[..., 0], pixels[..., 2]
+
+
+def beam_through(probe, x, z):
+    """Angle of the beam through points, and the way along it from the face, written down anew."""
+    if isinstance(probe, LinearProbe):
+        return x, z
+    apex = probe.radius
+    angle = np.arctan2(x, z + apex)
+    start = apex if isinstance(probe, ConvexProbe) else apex / np.cos(angle)
+    return angle, np.hypot(x, z + apex) - start
+
+
+def mask(probe, slack):
+    """Which pixel centres lie in the outline, made wider by a share ``slack`` of it."""
+    x, z = pixel_positions(probe)
+    across, way = beam_through(probe, x, z)
+    widest = probe.aperture if isinstance(probe, LinearProbe) else probe.opening_angle
+    return (
+        (np.abs(across) <= widest * (0.5 + slack))
+        & (way >= -slack * probe.depth)
+        & (way <= (1 + slack) * probe.depth)
+    )
+
+
+@settings(deadline=None, max_examples=150)
+@given(probe)
+def test_shown_pixels_are_those_in_the_outline(probe):
+    shown = probe.plane(Pose()).is_shown()
+    assert (mask(probe, -1e-7) <= shown).all()
+    assert (shown <= mask(probe, 1e-7)).all()
+    np.testing.assert_array_equal(np.isfinite(probe.pixel_beams), [shown, shown])
+
+
+@settings(deadline=None, max_examples=100)
+@given(fan)
+def test_runs_of_columns_are_in_order_and_within_the_image(probe):
+    runs = probe.plane(Pose()).spans
+    assert runs.shape == (probe.rows, 2, 2)
+    assert runs.dtype == np.int32
+    first, end = runs[..., 0], runs[..., 1]
+    assert (first <= end).all()
+    assert runs.min() >= 0
+    assert runs.max() <= probe.columns
+    both = end[:, 1] > first[:, 1]
+    assert (end[both, 0] < first[both, 1]).all()
+
+
+def test_pixels_whose_centre_is_on_the_edge_are_shown():
+    # The edges, at 60 degrees, pass through the centre of a pixel of each row as far as the arc.
+    probe = SectorProbe(0.02, 120 * DEGREE, 0.1, columns=100, rows=100)
+    width = probe.plane(Pose()).is_shown().sum(axis=1)
+    np.testing.assert_array_equal(width[:50], 2 * (np.arange(50) + 1))
+
+
+@settings(deadline=None, max_examples=60)
+@given(probe)
+def test_the_outline_fills_the_image(probe):
+    """The rectangle is the smallest: its four sides are touched."""
+    probe = dataclasses.replace(probe, lines=4096)
+    ends = probe.beam_starts + probe.depth * probe.beam_directions
+    outline = np.concatenate([probe.beam_starts, ends])
+    corner = (probe.image_to_probe @ [-0.5, -0.5, 0, 1])[[0, 2]]
+    size = np.array([probe.width, probe.height])
+    # The outermost lines are half a line within the edges: by less than a thousandth of the size.
+    assert (np.abs(outline.min(axis=0) - corner) < 1e-3 * size.max()).all()
+    assert (np.abs(outline.max(axis=0) - corner - size) < 1e-3 * size.max()).all()
+    np.testing.assert_allclose(probe.pixel_spacing * [probe.columns, probe.rows], size)
+
+
+@pytest.mark.parametrize(
+    ("probe", "area", "perimeter"),
+    [
+        (LinearProbe(0.04, 0.05, 80, 90), 0.04 * 0.05, 0.0),
+        # A ring's sixth between radii 50 and 200 mm.
+        (
+            ConvexProbe(0.05, 60 * DEGREE, 0.15, 700, 500),
+            math.pi / 6 * (0.2**2 - 0.05**2),
+            math.pi / 3 * 0.25 + 0.3,
+        ),
+        # A quarter disc.
+        (
+            SectorProbe(0.02, 90 * DEGREE, 0.16, 500, 400),
+            math.pi / 4 * 0.16**2,
+            math.pi / 2 * 0.16 + 0.32,
+        ),
+        # From an apex r behind the face a beam of length d sweeps d**2 / 2 + d r / cos(angle).
+        (
+            SectorProbe(0.02, 90 * DEGREE, 0.16, 500, 400, radius=0.01),
+            math.pi / 4 * 0.16**2 + 2 * 0.01 * 0.16 * math.asinh(1.0),
+            math.pi / 2 * 0.175 + 0.34,
+        ),
+    ],
+)
+def test_the_shown_area_is_the_analytic_one_within_a_pixel_all_around(probe, area, perimeter):
+    pixel = probe.pixel_spacing
+    found = probe.plane(Pose()).is_shown().sum() * pixel[0] * pixel[1]
+    assert abs(found - area) <= 1e-12 + 0.5 * perimeter * pixel.max()
+
+
+def test_beams_of_a_convex_array_radiate_from_its_centre():
+    probe = ConvexProbe(0.06, 60 * DEGREE, 0.14, 640, 480, lines=3)
+    # The middles of three parts of 20 degrees: -20, 0 and 20 degrees.
+    sine, cosine = math.sin(20 * DEGREE), math.cos(20 * DEGREE)
+    np.testing.assert_allclose(
+        probe.beam_directions, [[-sine, cosine], [0, 1], [sine, cosine]], atol=1e-15
+    )
+    np.testing.assert_allclose(
+        probe.beam_starts,
+        [[-0.06 * sine, 0.06 * (cosine - 1)], [0, 0], [0.06 * sine, 0.06 * (cosine - 1)]],
+        atol=1e-15,
+    )
+    assert probe.width == pytest.approx(0.2)
+    assert probe.height == pytest.approx(0.14 + 0.06 * (1 - math.sqrt(0.75)))
+
+
+def test_beams_of_a_phased_array_leave_the_middle_of_its_face_or_spread_over_it():
+    probe = SectorProbe(0.02, 90 * DEGREE, 0.16, 640, 480, lines=2)
+    np.testing.assert_array_equal(probe.beam_starts, np.zeros((2, 2)))
+    assert (probe.width, probe.height) == pytest.approx((0.16 * math.sqrt(2), 0.16))
+    probe = SectorProbe(0.02, 90 * DEGREE, 0.16, 640, 480, radius=0.01, lines=2)
+    spread = 0.01 * math.tan(22.5 * DEGREE)
+    np.testing.assert_allclose(probe.beam_starts, [[-spread, 0], [spread, 0]])
+    assert probe.width == pytest.approx(0.02 + 0.16 * math.sqrt(2))
+
+
+@settings(deadline=None, max_examples=60)
+@given(probe)
+def test_beams_start_on_the_face_and_are_spread_evenly_about_the_middle(probe):
+    starts, directions = probe.beam_starts, probe.beam_directions
+    np.testing.assert_allclose(np.hypot(*directions.T), 1.0)
+    np.testing.assert_allclose(starts, starts[::-1] * [-1, 1], atol=1e-15)
+    np.testing.assert_allclose(directions, directions[::-1] * [-1, 1], atol=1e-15)
+    if isinstance(probe, ConvexProbe):
+        np.testing.assert_allclose(
+            np.hypot(starts[:, 0], starts[:, 1] + probe.radius), probe.radius
+        )
+    else:
+        assert not starts[:, 1].any()
+        assert np.abs(starts[:, 0]).max() <= probe.aperture / 2
+
+
+@settings(deadline=None, max_examples=60)
+@given(probe)
+def test_each_pixel_lies_where_its_beam_says(probe):
+    line, way = (beams.astype(float) for beams in probe.pixel_beams)
+    shown = np.isfinite(line)
+    x, z = (positions[shown] for positions in pixel_positions(probe))
+    across, expected = beam_through(probe, x, z)
+    widest = probe.aperture if isinstance(probe, LinearProbe) else probe.opening_angle
+    part = (line[shown] + 0.5) / probe.lines
+    np.testing.assert_allclose((part - 0.5) * widest, across, atol=1e-6 * widest)  # of float32
+    np.testing.assert_allclose(way[shown], expected, atol=1e-6 * probe.depth)
+
+
+@settings(deadline=None, max_examples=60)
+@given(probe)
+def test_each_sample_of_a_beam_lies_at_its_pixel(probe):
+    column, row = probe.beam_pixels.astype(float)
+    assert column.shape == (probe.samples, probe.lines)
+    image = np.stack([column, row, 0 * row, 0 * row + 1], -1)
+    way = (np.arange(probe.samples) + 0.5) * probe.depth / probe.samples
+    expected = probe.beam_starts + way[:, None, None] * probe.beam_directions
+    found = (image @ probe.image_to_probe.T)[..., [0, 2]]
+    np.testing.assert_allclose(found, expected, atol=3e-6 * (probe.depth + probe.width))
+    assert column.min() >= -0.5 - 1e-3
+    assert column.max() <= probe.columns - 0.5 + 1e-3
+
+
+@settings(deadline=None, max_examples=30)
+@given(probe)
+def test_left_and_right_are_mirror_images(probe):
+    line, way = probe.pixel_beams
+    np.testing.assert_array_equal(np.isfinite(line), np.isfinite(line[:, ::-1]))
+    np.testing.assert_allclose(line, probe.lines - 1 - line[:, ::-1], atol=1e-3)
+    np.testing.assert_allclose(way, way[:, ::-1], atol=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(probe, st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(0.1, 1)] * 4))
+def test_the_plane_is_the_image_to_probe_map_moved_by_the_pose(probe, position, orientation):
+    pose = Pose(position, orientation)
+    x, z = pixel_positions(probe)
+    expected = pose.apply(np.stack([x, 0 * x, z], -1).reshape(-1, 3))
+    np.testing.assert_allclose(probe.plane(pose).pixels().reshape(-1, 3), expected, atol=1e-12)
+    scale = probe.image_to_probe[:3, :3] / np.append(probe.pixel_spacing, 1.0)
+    np.testing.assert_allclose(scale.T @ scale, np.eye(3), atol=1e-12)
+    assert np.linalg.det(scale) == pytest.approx(1.0)
+
+
+def test_square_pixels_are_square():
+    geometry = {"radius": 0.05, "opening_angle": 60 * DEGREE, "depth": 0.15}
+    probe = ConvexProbe.with_square_pixels(600, **geometry)
+    assert probe.rows == 600
+    assert probe.columns == 766  # 200 mm of 156.699 mm / 600 are 765.8
+    assert abs(probe.pixel_spacing[0] / probe.pixel_spacing[1] - 1) < 0.5 / 765
+
+
+# What one sees of wires stretched across the image plane, at known places in millimetres.
+
+# Of the beams: across is the angle in degrees (mm for the linear array), way is in mm.
+WIRES = {
+    "linear": (
+        LinearProbe(0.04, 0.06, columns=150, rows=180, lines=80),
+        [(-15, 8), (-4, 21), (0, 30), (12, 42), (-9, 52)],
+    ),
+    "convex": (
+        ConvexProbe.with_square_pixels(
+            200, radius=0.03, opening_angle=60 * DEGREE, depth=0.06, lines=96
+        ),
+        [(-24, 6), (0, 12), (12, 31), (20, 50), (-15, 44)],
+    ),
+    "convex with other pixels": (
+        ConvexProbe(0.015, 110 * DEGREE, 0.045, columns=300, rows=140, lines=64),
+        [(-48, 6), (0, 12), (32, 24), (45, 30), (-30, 33)],
+    ),
+    "sector": (
+        SectorProbe.with_square_pixels(
+            220, aperture=0.015, opening_angle=80 * DEGREE, depth=0.06, lines=128
+        ),
+        [(-30, 20), (0, 9), (12, 31), (33, 45), (-15, 53)],
+    ),
+    "sector from behind the face": (
+        SectorProbe(
+            0.02, 80 * DEGREE, 0.055, columns=260, rows=200, radius=0.01, lines=100, samples=64
+        ),
+        [(-30, 20), (0, 6), (33, 8), (28, 40), (-15, 47)],
+    ),
+}
+
+
+def wire_at(probe, across, way):
+    """x and z (mm) of a wire, from the geometry as a textbook has it."""
+    if isinstance(probe, LinearProbe):
+        return across, way
+    sine, cosine, radius = math.sin(across * DEGREE), math.cos(across * DEGREE), 1e3 * probe.radius
+    if isinstance(probe, ConvexProbe):
+        return (radius + way) * sine, (radius + way) * cosine - radius
+    return radius * sine / cosine + way * sine, way * cosine
+
+
+def wire_phantom(pose, wires):
+    """Wires along y of the probe at ``pose``: 1.2 mm thick (standard deviation), 0.6 mm voxels."""
+    to_patient = np.diag([0.6e-3, 0.8e-3, 0.6e-3, 1.0])
+    to_patient[:3, 3] = [-0.054, -0.008, -0.012]
+    shape = (181, 21, 141)
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+    at = (
+        pose.inverse()
+        .apply(index.reshape(-1, 3) @ to_patient[:3, :3].T + to_patient[:3, 3])
+        .reshape(*shape, 3)
+    )
+    squared = np.min(
+        [(1e3 * at[..., 0] - x) ** 2 + (1e3 * at[..., 2] - z) ** 2 for x, z in wires], axis=0
+    )
+    return Volume(np.round(250 * np.exp(-squared / (2 * 1.2**2))).astype(np.uint8), to_patient)
+
+
+@pytest.mark.parametrize("name", WIRES)
+def test_wires_appear_at_their_millimetre(name):
+    probe, places = WIRES[name]
+    wires = [wire_at(probe, *place) for place in places]
+    pose = Pose([2e-3, -1e-3, 1.5e-3], [0.02, 0.06, -0.03, 1.0])
+    volume = wire_phantom(pose, wires)
+    mesh = box_mesh(*(uniform_planes(-0.06, 0.06, 3) for _ in range(2)), uniform_planes(0, 0.08, 3))
+    slicer = create_slicer("scan_conversion", volume, mesh.nodes, mesh.tetrahedra)
+    image = slicer.image(mesh.nodes, probe.plane(pose)).astype(float)
+    assert not image[~probe.plane(pose).is_shown()].any()
+    x, z = 1e3 * np.array(pixel_positions(probe))
+    line, way = probe.pixel_beams.astype(float)
+    for (across, depth), (wire_x, wire_z) in zip(places, wires, strict=True):
+        weight = image * (np.hypot(x - wire_x, z - wire_z) < 4.0)
+        column = (weight.sum(axis=0) @ np.arange(probe.columns)) / weight.sum()
+        row = (weight.sum(axis=1) @ np.arange(probe.rows)) / weight.sum()
+        found = 1e3 * (probe.image_to_probe @ [column, row, 0, 1])[[0, 2]]
+        off = (found - [wire_x, wire_z]) / (1e3 * probe.pixel_spacing)
+        assert np.abs(off).max() < 0.5
+        # By the beams: at the pixel nearest to the wire, and so within a pixel's diagonal.
+        nearest = round(row), round(column)
+        diagonal = 1e3 * math.hypot(*probe.pixel_spacing)
+        assert abs(1e3 * way[nearest] - depth) < diagonal
+        part = (line[nearest] + 0.5) / probe.lines - 0.5
+        if isinstance(probe, LinearProbe):
+            assert abs(1e3 * probe.aperture * part - across) < diagonal
+        else:
+            angle = probe.opening_angle * part
+            from_apex = 1e3 * probe.radius + depth
+            assert abs(angle - across * DEGREE) * from_apex < diagonal
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ConvexProbe(2e-3, 1.0, 0.1), "probe.radius: 0.002 m is outside 0.003 to 0.3 m"),
+        (lambda: ConvexProbe(0.05, 3.2, 0.1), "probe.opening_angle: 3.2 rad is outside"),
+        (lambda: ConvexProbe(0.05, 60.0, 0.1), "did you mean '60 deg'"),
+        (lambda: ConvexProbe(0.05, 1.0, float("nan")), "probe.depth: nan is not finite"),
+        (lambda: ConvexProbe(0.05, 1.0, 0.1, 0, 5), "probe.image: the image has 0 columns"),
+        (lambda: ConvexProbe(0.05, 1.0, 0.1, lines=0), "probe.lines: 0 is outside 1 to 4096"),
+        (lambda: ConvexProbe(0.05, 1.0, 0.1, lines=1.5), "probe.lines: 1.5 is not a whole number"),
+        (lambda: LinearProbe(0.04, 0.1, 5, 5, samples=0), "probe.samples: 0 is outside"),
+        (lambda: LinearProbe(0.04, 0.1, 5, 5, focus=0.0), "probe.focus: 0 m is outside"),
+        (lambda: LinearProbe.with_square_pixels(4096, aperture=0.1, depth=0.05), "8192 columns"),
+        (lambda: SectorProbe(0.06, 1.5, 0.1), "probe.aperture: 0.06 m is outside 0.003 to 0.05 m"),
+        (lambda: SectorProbe(0.02, 3.0, 0.1), "probe.opening_angle: 3 rad is outside"),
+        (
+            lambda: SectorProbe(0.02, 90 * DEGREE, 0.1, radius=0.02),
+            r"probe.aperture: 20 mm is less than the 40 mm .* over 90 degrees .* 20 mm behind it",
+        ),
+    ],
+)
+def test_a_geometry_that_cannot_be_is_refused(make, words):
+    with pytest.raises(ProbeError, match=words):
+        make()
+
+
+@settings(deadline=None, max_examples=20)
+@given(probe)
+def test_shared_arrays_cannot_be_changed(probe):
+    for array in (probe.pixel_beams, probe.beam_pixels, probe.image_to_probe, probe.beam_starts):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0

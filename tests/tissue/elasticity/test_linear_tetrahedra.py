@@ -1,0 +1,139 @@
+"""The assembled stiffness against the laws of elasticity and against scikit-fem."""
+
+import numpy as np
+import pytest
+from scipy.sparse.linalg import spsolve
+from tissue_block import SOFT, block_mesh
+
+from us_sim.errors import SolverError
+from us_sim.tissue.elasticity.linear_tetrahedra import (
+    free_stiffness,
+    require_held,
+    shape_gradients,
+    stiffness,
+)
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+
+
+def irregular() -> TetrahedralMesh:
+    """A block whose inner nodes are shifted by up to a fifth of a cell."""
+    mesh = block_mesh((6, 5, 4))
+    inner = np.ones(len(mesh.nodes), dtype=bool)
+    inner[mesh.boundary] = False
+    nodes = mesh.nodes.copy()
+    nodes[inner] += np.random.default_rng(0).uniform(-0.005, 0.005, (inner.sum(), 3))
+    return TetrahedralMesh(nodes, mesh.tetrahedra)
+
+
+MESH = irregular()
+MATRIX = stiffness(MESH, uniform_material(MESH, SOFT))
+ON_BOUNDARY = np.isin(np.arange(len(MESH.nodes)), MESH.boundary)
+
+
+def test_gradients_reproduce_a_linear_field():
+    slope = np.array([1.0, -2.0, 3.0])
+    values = (MESH.nodes @ slope)[MESH.tetrahedra]
+    found = np.einsum("ma,mad->md", values, shape_gradients(MESH))
+    np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), atol=1e-9)
+
+
+def test_rigid_motion_costs_nothing():
+    scale = abs(MATRIX.data).max()
+    for axis in range(3):
+        translation = np.tile(np.eye(3)[axis], len(MESH.nodes))
+        assert abs(MATRIX @ translation).max() < 1e-9 * scale
+        rotation = np.cross(np.eye(3)[axis], MESH.nodes).ravel()
+        assert abs(MATRIX @ rotation).max() < 1e-9 * scale
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_constant_strain_patch(seed):
+    gradient = np.random.default_rng(seed).uniform(-0.1, 0.1, (3, 3))
+    exact = MESH.nodes @ gradient.T
+    held = np.repeat(ON_BOUNDARY, 3)
+    matrix = MATRIX.tocsr()
+    found = np.zeros(exact.size)
+    found[held] = exact.ravel()[held]
+    found[~held] = spsolve(matrix[~held][:, ~held].tocsc(), -matrix[~held][:, held] @ found[held])
+    np.testing.assert_allclose(found.reshape(-1, 3), exact, atol=1e-9 * abs(exact).max())
+
+    strain = (gradient + gradient.T) / 2
+    modulus, ratio = SOFT.young_modulus, SOFT.poisson_ratio
+    first = modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
+    second = modulus / (2 * (1 + ratio))
+    density = first / 2 * np.trace(strain) ** 2 + second * (strain * strain).sum()
+    assert found @ (MATRIX @ found) / 2 == pytest.approx(density * 0.002, rel=1e-9)
+
+
+def test_symmetric_and_positive_definite_once_held():
+    dense = free_stiffness(MATRIX, MESH.nodes[:, 2] == 0.1).toarray()
+    np.testing.assert_allclose(dense, dense.T, atol=1e-12 * abs(dense).max())
+    assert np.linalg.eigvalsh(dense)[0] > 0
+    modes = np.linalg.eigvalsh(MATRIX.toarray())
+    assert abs(modes[:6]).max() < 1e-9 * modes[-1] < 1e-3 * modes[6]
+
+
+def test_columns_are_sorted_and_only_neighbours_couple():
+    for i in range(len(MESH.nodes)):
+        columns = MATRIX.indices[MATRIX.indptr[i] : MATRIX.indptr[i + 1]]
+        assert (np.diff(columns) > 0).all()
+    assert len(MATRIX.indices) == 2 * len(MESH.edges) + len(MESH.nodes)
+
+
+def test_held_nodes_are_removed_from_the_equations():
+    fixed = MESH.nodes[:, 2] == 0.1
+    free = np.repeat(~fixed, 3)
+    expected = MATRIX.tocsr()[free][:, free].toarray()
+    np.testing.assert_array_equal(free_stiffness(MATRIX, fixed).toarray(), expected)
+
+
+def test_agrees_with_scikit_fem():
+    skfem = pytest.importorskip("skfem")
+    elasticity = pytest.importorskip("skfem.models.elasticity")
+    random = np.random.default_rng(5)
+    count = len(MESH.tetrahedra)
+    materials = TissueMaterials(
+        random.uniform(300, 2e4, count), random.uniform(0.1, 0.49, count), np.ones(count)
+    )
+    basis = skfem.Basis(
+        skfem.MeshTet(MESH.nodes.T, MESH.tetrahedra.T.astype(np.int64)),
+        skfem.ElementVector(skfem.ElementTetP1()),
+    )
+    first, second = elasticity.lame_parameters(materials.young_modulus, materials.poisson_ratio)
+    theirs = elasticity.linear_elasticity(first[:, None], second[:, None]).assemble(basis)
+    order = basis.nodal_dofs.T.ravel()
+    expected = theirs.tocsr()[order][:, order].toarray()
+    ours = stiffness(MESH, materials).toarray()
+    np.testing.assert_allclose(ours, expected, atol=1e-10 * abs(expected).max())
+
+
+def test_stiffness_is_proportional_to_the_modulus():
+    twice = Material(2 * SOFT.young_modulus, SOFT.poisson_ratio, SOFT.density)
+    ours = stiffness(MESH, uniform_material(MESH, twice))
+    np.testing.assert_allclose(ours.data, 2 * MATRIX.data)
+
+
+@pytest.mark.parametrize(
+    ("held", "words"),
+    [
+        ([], "has 0 fixed nodes"),
+        ([0, 1], "has 2 fixed nodes"),
+        ([0, 2, 4], "has 3 fixed nodes"),  # on one line
+    ],
+)
+def test_tissue_that_can_move_as_a_whole_is_refused(held, words):
+    mesh = box_mesh([0.0, 1.0], [0.0, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0])
+    with pytest.raises(SolverError, match=words):
+        require_held(mesh, np.isin(np.arange(len(mesh.nodes)), held))
+
+
+def test_every_part_must_be_held():
+    one = box_mesh([0.0, 1.0], [0.0, 1.0], [0.0, 1.0])
+    both = TetrahedralMesh(
+        np.vstack([one.nodes, one.nodes + 5]), np.vstack([one.tetrahedra, one.tetrahedra + 8])
+    )
+    fixed = np.arange(16) < 4
+    with pytest.raises(SolverError, match="around node 8 has 0 fixed nodes"):
+        require_held(both, fixed)
+    require_held(both, fixed | (np.arange(16) > 11))

@@ -1,0 +1,146 @@
+"""Algorithm 1, the fitted springs and the Voigt element against what theory says."""
+
+import math
+
+import numpy as np
+import pytest
+from tissue_block import SOFT, block_mesh
+
+from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+MESH = block_mesh((4, 3, 3))
+SPRINGS = springs_of(MESH, uniform_material(MESH, SOFT))
+
+
+def one_spring() -> SpringNetwork:
+    """Of 1 m, 100 N/m and 7 N s/m."""
+    edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
+    return SpringNetwork(edges, 100 * one, 7 * one, one)
+
+
+def test_algorithm_1_on_two_tetrahedra_that_share_a_face():
+    nodes = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]
+    mesh = TetrahedralMesh(nodes, [[0, 1, 2, 3], [4, 2, 1, 3]])
+    materials = TissueMaterials(np.array([1e3, 5e3]), np.zeros(2), np.ones(2))
+    springs = springs_of(mesh, materials)
+    found = {tuple(edge): k for edge, k in zip(springs.edges, springs.stiffness, strict=True)}
+    # 0.002 of Young's modulus an edge; the shared face's three edges have both.
+    expected = dict.fromkeys([(0, 1), (0, 2), (0, 3)], 2.0)
+    expected |= dict.fromkeys([(1, 2), (1, 3), (2, 3)], 12.0)
+    expected |= dict.fromkeys([(1, 4), (2, 4), (3, 4)], 10.0)
+    assert found == pytest.approx(expected)
+    np.testing.assert_allclose(springs.damping, 0.1 * springs.stiffness)
+    assert springs.rest_length.max() == pytest.approx(math.sqrt(2))
+
+
+def test_nothing_is_lost_in_merging():
+    total = 6 * 0.002 * SOFT.young_modulus * len(MESH.tetrahedra)
+    assert SPRINGS.stiffness.sum() == pytest.approx(total)
+    assert len(SPRINGS.edges) == len(np.unique(SPRINGS.edges, axis=0)) == len(MESH.edges)
+
+
+def test_voigt_element_has_the_force_of_equation_1():
+    positions = np.array([[0.0, 0, 0], [0.0, 1.2, 0]])
+    velocity = np.array([[0.0, 0, 0], [0.3, 0.5, 0.0]])  # 0.5 m/s along the spring
+    force = one_spring().forces(positions, velocity)
+    pull = 100 * 0.2 + 7 * 0.5
+    np.testing.assert_allclose(force, [[0, pull, 0], [0, -pull, 0]])
+
+
+def test_coincident_nodes_are_not_a_division_by_zero():
+    np.testing.assert_array_equal(one_spring().forces(np.zeros((2, 3)), np.ones((2, 3))), 0)
+
+
+def test_at_rest_nothing_pulls_at_all():
+    np.testing.assert_array_equal(SPRINGS.forces(MESH.nodes, np.zeros_like(MESH.nodes)), 0)
+
+
+def test_forces_balance_in_any_state():
+    random = np.random.default_rng(2)
+    positions = MESH.nodes + random.normal(0, 0.02, MESH.nodes.shape)
+    force = SPRINGS.forces(positions, random.normal(0, 1, MESH.nodes.shape))
+    scale = abs(force).max()
+    np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-12 * scale)
+    np.testing.assert_allclose(np.cross(positions, force).sum(axis=0), 0, atol=1e-12 * scale)
+
+
+def test_springs_between_held_nodes_are_dropped():
+    fixed = MESH.nodes[:, 2] == 0.1
+    kept = SPRINGS.without(fixed)
+    assert not fixed[kept.edges].all(axis=1).any()
+    assert len(SPRINGS.edges) - len(kept.edges) == fixed[MESH.edges].all(axis=1).sum()
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_factor_gives_the_derivative_of_the_forces(held):
+    fixed = (MESH.nodes[:, 2] == 0.1) & held
+    springs = SPRINGS.without(fixed)
+    factor = springs.factor(MESH.nodes)
+    move = np.random.default_rng(3).normal(0, 1e-7, MESH.nodes.shape)
+    still = np.zeros_like(move)
+    change = springs.forces(MESH.nodes - move, still) - springs.forces(MESH.nodes + move, still)
+    linear = (factor.T @ (factor @ move.ravel())).reshape(-1, 3)
+    np.testing.assert_allclose(linear, change / 2, atol=1e-6 * abs(linear).max())
+
+
+def test_fitted_springs_on_a_regular_tetrahedron():
+    # Edge a = 0.1 m: V = a**3 / 72**0.5, six edges, k = 15 mu V / 6 a**2 = mu a 15 / 6 / 72**0.5.
+    nodes = 0.1 / math.sqrt(8) * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    mesh = TetrahedralMesh(
+        nodes, [[0, 1, 2, 3]] if np.linalg.det(nodes[1:] - nodes[0]) > 0 else [[0, 1, 3, 2]]
+    )
+    materials = uniform_material(mesh, Material(10e3, 0.25, 1000.0))
+    springs = fitted_springs(mesh, materials)
+    np.testing.assert_allclose(springs.stiffness, 4e3 * 0.1 * 15 / 6 / math.sqrt(72))
+    np.testing.assert_allclose(springs.lame_constant, 4e3)
+    # There springs and elasticity agree on a swelling exactly, node by node.
+    swollen = (1e-6 * nodes).ravel()
+    factor = springs.factor(mesh.nodes)
+    elastic = stiffness(mesh, materials) @ swollen
+    np.testing.assert_allclose(factor.T @ (factor @ swollen), elastic, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.45, 0.4999])
+@pytest.mark.parametrize("shape", [(4, 3, 3), (9, 5, 7)])
+def test_fitted_springs_store_the_energy_of_elasticity_whatever_the_spacing(shape, ratio):
+    mesh = block_mesh(shape)
+    springs = fitted_springs(mesh, uniform_material(mesh, Material(10e3, ratio, 1000.0)))
+    shear = 10e3 / (2 * (1 + max(ratio, 0.25)))
+    quarter = uniform_material(mesh, Material(2.5 * shear, 0.25, 1000.0))
+    matrix, factor = stiffness(mesh, quarter), springs.factor(mesh.nodes)
+    swollen = 1e-3 * mesh.nodes.ravel()
+    energy = ((factor @ swollen) ** 2).sum()
+    assert energy == pytest.approx(swollen @ (matrix @ swollen), rel=1e-9)
+    random = np.random.default_rng(0)
+    ratios = []
+    for _ in range(50):  # any other strain on average over its orientations
+        turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        strained = 1e-3 * (mesh.nodes @ turn @ np.diag([1.0, -0.4, 0.0]) @ turn.T).ravel()
+        ratios.append(((factor @ strained) ** 2).sum() / (strained @ (matrix @ strained)))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
+
+
+def test_without_a_volume_term_the_fit_keeps_youngs_modulus():
+    soft, quarter = (uniform_material(MESH, Material(10e3, nu, 1e3)) for nu in (0.45, 0.25))
+    kept = fitted_springs(MESH, soft, with_volume=False)
+    np.testing.assert_allclose(kept.stiffness, fitted_springs(MESH, quarter).stiffness)
+
+
+def test_what_algorithm_1_hides_is_a_length():
+    # The same block in cells half as large: fitted springs halve, Algorithm 1's stay.
+    coarse, fine = block_mesh((5, 3, 3)), block_mesh((9, 5, 5))
+    total = []
+    for mesh in (coarse, fine):
+        materials = uniform_material(mesh, SOFT)
+        total.append(
+            (
+                springs_of(mesh, materials).lame_constant @ mesh.volumes,
+                fitted_springs(mesh, materials).lame_constant @ mesh.volumes,
+            )
+        )
+    assert total[1][0] == pytest.approx(2 * total[0][0], rel=0.01)
+    assert total[1][1] == pytest.approx(total[0][1], rel=1e-9)
+    assert total[1][1] == pytest.approx(10e3 / 2.9 * 0.002, rel=1e-9)  # mu times 2 l

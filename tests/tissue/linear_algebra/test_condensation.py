@@ -1,0 +1,108 @@
+"""The condensed compliance against a sparse direct solver (SuperLU), and the stiffness's laws."""
+
+import numpy as np
+import pytest
+from scipy.sparse.linalg import splu
+from tissue_block import block, block_mesh
+
+from us_sim.errors import SolverError
+from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.linear_algebra.condensation import condense
+from us_sim.tissue.linear_algebra.nested_dissection import nested_dissection
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+
+def gathered(condensed, count):
+    """(3N, 3K) fields of all nodes."""
+    whole = np.zeros((count, 3, len(condensed.compliance)))
+    seen = np.zeros(count, dtype=int)
+    for nodes, moved in condensed.fields():
+        whole[nodes] = moved.reshape(len(nodes), 3, -1)
+        seen[nodes] += 1
+    return whole.reshape(3 * count, -1), seen
+
+
+def mixed(mesh):
+    """Moduli over four decades; Poisson's ratios with and without averaged pressures."""
+    random = np.random.default_rng(1)
+    count = len(mesh.tetrahedra)
+    return TissueMaterials(
+        10 ** random.uniform(3, 7, count), random.uniform(-0.2, 0.4999, count), np.ones(count)
+    )
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.45, 0.499, None])
+def test_agrees_with_a_sparse_solver(ratio):
+    mesh = block_mesh((9, 6, 7))
+    model = block((9, 6, 7))
+    materials = mixed(mesh) if ratio is None else uniform_material(mesh, Material(1e4, ratio))
+    system = averaged_pressure(mesh, materials)
+    kept = np.random.default_rng(0).permutation(model.movable_contact_nodes)[:30]
+    condensed = condense(mesh, system, model.fixed, kept)
+    whole, seen = gathered(condensed, len(mesh.nodes))
+    np.testing.assert_array_equal(seen, ~model.fixed)
+
+    free = np.repeat(~model.fixed, 3)
+    unknowns = (3 * kept[:, None] + np.arange(3)).ravel()
+    loads = np.zeros((3 * len(mesh.nodes), len(unknowns)))
+    loads[unknowns, np.arange(len(unknowns))] = 1.0
+    expected = np.zeros_like(loads)
+    expected[free] = splu(system.stiffness[free][:, free].tocsc()).solve(loads[free])
+    scale = abs(expected).max()
+    np.testing.assert_allclose(whole, expected, atol=1e-8 * scale)
+    np.testing.assert_allclose(condensed.compliance, expected[unknowns], atol=1e-8 * scale)
+    np.testing.assert_array_equal(condensed.compliance, condensed.compliance.T)
+
+
+def test_every_node_is_in_one_part_whose_boundary_separates_it():
+    mesh = block_mesh((11, 6, 7))
+    kept = mesh.nodes[:, 2] == 0
+    above = np.zeros(len(mesh.nodes), dtype=int)
+
+    def walk(part, outside):
+        above[part.own] += 1
+        assert np.isin(part.boundary, outside).all()
+        for below in part.parts:
+            walk(below, np.union1d(outside, part.own))
+
+    root = nested_dissection(mesh.nodes, mesh.edges, kept, largest=20)
+    walk(root, np.empty(0, int))
+    np.testing.assert_array_equal(above, 1)
+    np.testing.assert_array_equal(root.own, np.flatnonzero(kept))
+
+
+def test_up_to_a_moderate_poisson_ratio_it_is_the_ordinary_linear_element():
+    mesh = block_mesh((5, 4, 4))
+    for ratio in (-0.3, 0.0, 0.4):
+        materials = uniform_material(mesh, Material(10e3, ratio))
+        system = averaged_pressure(mesh, materials)
+        assert len(system.pressure_nodes) == 0
+        ordinary = stiffness(mesh, materials).toarray()
+        np.testing.assert_allclose(system.stiffness.toarray(), ordinary, atol=1e-9 * 10e3)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.45, 0.4999])
+def test_constant_strain_patch(ratio):
+    mesh = block_mesh((6, 5, 5))
+    inner = np.ones(len(mesh.nodes), dtype=bool)
+    inner[mesh.boundary] = False
+    shifted = mesh.nodes.copy()
+    shifted[inner] += np.random.default_rng(0).uniform(-0.005, 0.005, (inner.sum(), 3))
+    mesh = TetrahedralMesh(shifted, mesh.tetrahedra)
+    gradient = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 3))
+    exact = (mesh.nodes @ gradient.T).ravel()
+    matrix = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, ratio))).stiffness
+    free = np.repeat(inner, 3)
+    load = -(matrix[free][:, ~free] @ exact[~free])
+    found = splu(matrix[free][:, free].tocsc()).solve(load)
+    assert abs(found - exact[free]).max() <= 1e-10 * abs(exact).max()
+
+
+def test_a_stiffness_that_is_not_positive_definite_is_refused():
+    mesh = block_mesh((4, 4, 4))
+    system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.3)))
+    nothing = np.zeros(len(mesh.nodes), dtype=bool)
+    with pytest.raises(SolverError, match="not positive definite to rounding"):
+        condense(mesh, system, nothing, np.array([0], np.int32))

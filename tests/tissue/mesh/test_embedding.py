@@ -1,0 +1,148 @@
+"""Embedded surfaces: affine maps exact, normals of a sphere, trimming, and what is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tissue_block import block_mesh
+
+from us_sim.errors import MeshError
+from us_sim.tissue.mesh.embedding import EmbeddedSurface
+
+MESH = block_mesh((9, 6, 6))
+CENTRE = np.array([0.0, 0.0, 0.05])
+
+
+def sphere(radius, rings=40, centre=CENTRE):
+    """Vertices and outward triangles of a sphere, a single vertex at each pole."""
+    polar, around = np.pi * np.arange(1, rings) / rings, np.pi * np.arange(2 * rings) / rings
+    points = np.stack(
+        [
+            np.outer(np.sin(polar), np.cos(around)),
+            np.outer(np.sin(polar), np.sin(around)),
+            np.repeat(np.cos(polar)[:, None], len(around), axis=1),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    n = len(around)
+    i, j = np.meshgrid(np.arange(rings - 2), np.arange(n), indexing="ij")
+    a, b, c, d = (1 + k for k in (i * n + j, i * n + (j + 1) % n, (i + 1) * n + (j + 1) % n,
+                                  (i + 1) * n + j))  # fmt: skip
+    j = np.arange(n)
+    last = (rings - 1) * n + 1
+    triangles = np.concatenate(
+        [
+            np.stack([a, d, c], -1).reshape(-1, 3),
+            np.stack([a, c, b], -1).reshape(-1, 3),
+            np.column_stack([np.zeros(n, int), 1 + j, 1 + (j + 1) % n]),
+            np.column_stack([np.full(n, last), last - n + (j + 1) % n, last - n + j]),
+        ]
+    )
+    vertices = np.vstack([[0.0, 0, 1], points, [0, 0, -1]])
+    return vertices * radius + centre, triangles
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_affine_maps_of_the_tissue_are_affine_maps_of_the_surface(seed):
+    random = np.random.default_rng(seed)
+    vertices, triangles = sphere(0.048, rings=12)
+    surface = EmbeddedSurface(MESH, vertices, triangles)
+    matrix = np.eye(3) + random.uniform(-0.3, 0.3, (3, 3))
+    shift = random.uniform(-0.05, 0.05, 3)
+    carried, normals = surface.deform(MESH.nodes @ matrix.T + shift)
+    np.testing.assert_allclose(carried, vertices @ matrix.T + shift, atol=5e-8)
+    a, b, c = np.moveaxis((vertices @ matrix.T)[triangles], 1, 0)
+    expected = np.zeros_like(vertices)
+    for corner in triangles.T:
+        np.add.at(expected, corner, np.cross(b - a, c - a))
+    expected /= np.linalg.norm(expected, axis=1)[:, None]
+    np.testing.assert_allclose(normals, expected, atol=2e-5)
+
+
+def test_at_rest_the_surface_is_its_own_to_the_last_bit():
+    vertices, triangles = sphere(0.04)
+    surface = EmbeddedSurface(MESH, vertices, triangles)
+    np.testing.assert_array_equal(surface.carry(MESH.nodes), vertices.astype(np.float32))
+    np.testing.assert_array_equal(surface.triangles, triangles)
+
+
+def test_normals_of_a_sphere_are_its_radii():
+    vertices, triangles = sphere(0.04, rings=60)
+    _, normals = EmbeddedSurface(MESH, vertices, triangles).deform(MESH.nodes)
+    radii = (vertices - CENTRE) / 0.04
+    angles = np.degrees(np.arccos((normals * radii).sum(axis=1).clip(-1, 1)))
+    # Facets are 3 degrees wide. Only next to the poles are those around a vertex lopsided.
+    assert angles.max() < 1.0
+    assert np.median(angles) < 0.05
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+
+
+def test_volume_follows_the_tissues():
+    vertices, triangles = sphere(0.04)
+    surface = EmbeddedSurface(MESH, vertices, triangles)
+    squeezed = MESH.nodes * [1.2, 1.2, 0.7]
+
+    def volume(points):
+        a, b, c = np.moveaxis(points[triangles].astype(float), 1, 0)
+        return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+
+    ratio = volume(surface.carry(squeezed)) / volume(surface.carry(MESH.nodes))
+    assert ratio == pytest.approx(1.2 * 1.2 * 0.7, rel=1e-4)
+
+
+def test_a_little_outside_is_carried_and_counted():
+    vertices, triangles = sphere(0.052)  # 2 mm beyond the block's sides, top and bottom
+    surface = EmbeddedSurface(MESH, vertices, triangles)
+    beyond = (np.abs(vertices[:, 1]) > 0.05 + 1e-6) | (np.abs(vertices[:, 2] - 0.05) > 0.05 + 1e-6)
+    assert surface.outside == beyond.sum() > 0
+    carried = surface.carry(MESH.nodes * 1.1)
+    np.testing.assert_allclose(carried, vertices * 1.1, atol=5e-8)
+
+
+def test_far_outside_is_refused_or_trimmed():
+    vertices, triangles = sphere(0.09)
+    with pytest.raises(MeshError, match=r"vertices lie outside the tissue mesh, vertex \d+ by 40"):
+        EmbeddedSurface(MESH, vertices, triangles)
+    trimmed = EmbeddedSurface.trimmed(MESH, vertices, triangles)
+    assert 0 < len(trimmed.triangles) < len(triangles)
+    assert np.abs(trimmed.vertices[:, 2] - 0.05).max() < 0.05 + 0.02
+    whole, kept = vertices[triangles], trimmed.vertices[trimmed.triangles]
+    same = (np.abs(whole[:, None, 0] - kept[None, :5, 0]) < 1e-8).all(axis=2).any(axis=0)
+    assert same.all()
+    with pytest.raises(MeshError, match="the surface lies outside the tissue mesh"):
+        EmbeddedSurface.trimmed(MESH, vertices + 1.0, triangles)
+
+
+def test_the_same_nodes_give_the_same_bytes():
+    surface = EmbeddedSurface(MESH, *sphere(0.04))
+    nodes = MESH.nodes + 1e-3 * np.sin(40 * MESH.nodes)
+    first, second = surface.deform(nodes), surface.deform(nodes)
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
+
+
+def test_a_triangle_without_area_has_no_normal():
+    surface = EmbeddedSurface(MESH, np.array([[0.0, 0, 0.01 * i] for i in (1, 2, 3)]), [[0, 1, 2]])
+    np.testing.assert_array_equal(surface.deform(MESH.nodes)[1], np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "words"),
+    [
+        (np.zeros((3, 2)), [[0, 1, 2]], r"surface vertices have shape \(3, 2\)"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "surface vertex 0 is not finite"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "name vertices 0 to 3, but there are only 3"),
+        (np.zeros((3, 3)), [[-1, 1, 2]], "name vertices -1 to 2"),
+        (np.zeros((3, 3)), np.zeros((0, 3), int), "T > 0"),
+        (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "float64 of shape"),
+    ],
+)
+def test_what_is_no_surface_is_refused(vertices, triangles, words):
+    with pytest.raises(MeshError, match=words):
+        EmbeddedSurface(MESH, vertices, triangles)
+
+
+def test_the_nodes_of_another_mesh_are_refused():
+    surface = EmbeddedSurface(MESH, *sphere(0.04))
+    with pytest.raises(MeshError, match="embedded in a mesh of shape"):
+        surface.deform(np.zeros((5, 3)))

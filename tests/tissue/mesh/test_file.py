@@ -1,0 +1,164 @@
+"""Meshes of organs from real files of several makers, and files that are no such thing."""
+
+import sys
+
+import meshio
+import numpy as np
+import pytest
+from tissue_block import block_mesh
+
+from us_sim.errors import MeshError
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.mesh.file import read_mesh
+
+GMSH = """$NOD
+4
+11 0 0 0
+12 30 0 0
+5 0 30 0
+9 0 0 30
+$ENDNOD
+$ELM
+2
+1 2 1 1 3 11 12 5
+2 4 1 1 4 11 12 5 9
+$ENDELM
+"""
+
+
+# Counts as stated by the makers (SOURCE.txt); the volume by Gauss's theorem on the boundary.
+@pytest.mark.parametrize(
+    ("name", "nodes", "tetrahedra", "report"),
+    [
+        ("liver.msh", 181, 596, ()),
+        ("liver2.msh", 507, 1493, ()),
+        ("truthcylinder1.msh", 642, 2524, ()),
+        ("volumetricTongue.vtu", 2238, 10980, ()),
+        ("Ossicles.vtu", 1733, 5058, ()),
+        ("Armadillo_Tetra_4406.vtu", 1446, 4406, ()),
+        ("raptorTetra_8418.vtu", 2993, 8418, ("left out 3 nodes that no tetrahedron uses",)),
+    ],
+)
+def test_real_meshes_are_read(shared_data, name, nodes, tetrahedra, report):
+    mesh, said = read_mesh(shared_data / "meshes-sofa" / name, metres_per_unit=0.01)
+    assert (len(mesh.nodes), len(mesh.tetrahedra)) == (nodes, tetrahedra)
+    assert said == report
+    a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
+    enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert mesh.volumes.sum() == pytest.approx(enclosed, rel=1e-9)
+
+
+def test_the_cylinder_has_the_volume_of_a_cylinder(shared_data):
+    mesh, _ = read_mesh(shared_data / "meshes-sofa" / "truthcylinder1.msh", metres_per_unit=1e-3)
+    size = np.ptp(mesh.nodes, axis=0)
+    radius, length = size.min() / 2, size.max()
+    assert mesh.volumes.sum() == pytest.approx(np.pi * radius**2 * length, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("liver.vtk", "not a tetrahedral mesh that can be read"),
+        ("skull.vtp", "not a tetrahedral mesh that can be read"),
+        ("head.obj", "not a tetrahedral mesh that can be read"),
+        ("liver.obj", "the file has no tetrahedra"),
+        ("SOURCE.txt", "not a tetrahedral mesh that can be read"),
+        ("nowhere.msh", "there is no such mesh file"),
+    ],
+)
+def test_real_files_of_other_things_are_refused_by_name(shared_data, name, words):
+    with pytest.raises(MeshError, match=f"{name}: .*{words}"):
+        read_mesh(shared_data / "meshes-sofa" / name)
+
+
+def test_a_truncated_real_mesh_is_refused(shared_data, tmp_path):
+    for name in ("liver2.msh", "Ossicles.vtu"):
+        whole = (shared_data / "meshes-sofa" / name).read_bytes()
+        file = tmp_path / name
+        file.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(MeshError, match=name):
+            read_mesh(file)
+
+
+@pytest.mark.parametrize("suffix", [".vtk", ".vtu", ".msh", ".mesh", ".inp"])
+def test_units_pose_and_formats(tmp_path, suffix):
+    block = block_mesh((3, 3, 3))
+    file = tmp_path / f"block{suffix}"
+    meshio.Mesh(block.nodes * 1000, [("tetra", block.tetrahedra)]).write(file)
+    quarter = np.sqrt(0.5)
+    pose = Pose(np.array([0.0, 0.0, 0.3]), np.array([quarter, 0.0, 0.0, quarter]))
+    mesh, report = read_mesh(file, 0.001, pose)
+    assert report == ()
+    x, y, z = block.nodes.T
+    np.testing.assert_allclose(mesh.nodes, np.column_stack([x, -z, y + 0.3]), atol=1e-6)
+
+
+def test_quadratic_tetrahedra_lose_their_middle_nodes(tmp_path):
+    ends = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    pairs = [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
+    points = np.vstack([ends, [(ends[a] + ends[b]) / 2 for a, b in pairs]])
+    file = tmp_path / "curved.vtu"
+    meshio.Mesh(points, [("tetra10", np.arange(10)[None])]).write(file)
+    mesh, report = read_mesh(file)
+    np.testing.assert_allclose(mesh.nodes, ends)
+    assert report == (
+        "straightened the edges of 1 quadratic tetrahedra",
+        "left out 6 nodes that no tetrahedron uses",
+    )
+
+
+def test_cells_that_would_leave_holes_are_refused(tmp_path):
+    file = tmp_path / "brick.vtu"
+    points = np.array(
+        [[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float
+    )
+    meshio.Mesh(points, [("hexahedron", np.arange(8)[None])]).write(file)
+    with pytest.raises(MeshError, match=r"brick\.vtu: the file has 1 cells of type hexahedron"):
+        read_mesh(file)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("$ENDNOD", ""), r"no whole part \$NOD"),
+        (("$NOD\n4", "$NOD\n5"), r"part \$NOD of the file has 4 lines, but says 5"),
+        (("12 30 0 0", "12 30 0"), "a node of the file is not a number and three coordinates"),
+        (("12 30 0 0", "12 30 x 0"), "something else where a number should be"),
+        (("2 4 1 1 4 11 12 5 9", "2 4 1 1 4 11 12 5"), "more or fewer nodes than it says"),
+        (("4 11 12 5 9", "4 11 12 5 8"), "names node 8, which is not there"),
+        (("12 30 0 0", "11 30 0 0"), "two nodes of the file have the number 11"),
+        (("11 0 0 0", "99999999999999999999 0 0 0"), "something else where a number should be"),
+        (("11 12 5 9", "11 12 5 99999999999999999999"), "should be: 9{20} is no node"),
+        (("2 4 1 1 4 11 12 5 9", "2 5 1 1 4 11 12 5 9"), "elements of Gmsh's type 5"),
+        (("2 4 1 1 4 11 12 5 9", "2 2 1 1 3 11 12 5"), "the file has no tetrahedra"),
+        (("12 30 0 0", "12 nan 0 0"), "mesh node is not finite"),
+        (("12 30 0 0", "12 0 30 0"), "tetrahedron names a node|M > 0"),
+        (("12 30 0 0", "12 0 -40 0"), "1 tetrahedron is flat"),
+    ],
+)
+def test_what_is_wrong_in_an_old_gmsh_file_is_said(tmp_path, change, words):
+    file = tmp_path / "small.msh"
+    file.write_text(GMSH.replace(*change))
+    with pytest.raises(MeshError, match=rf"small\.msh: .*({words})"):
+        read_mesh(file, 0.001)
+
+
+def test_a_unit_that_cannot_be_meant_is_refused(tmp_path):
+    file = tmp_path / "small.msh"
+    file.write_text(GMSH)
+    assert read_mesh(file, 0.001)[0].volumes.sum() == pytest.approx(4.5e-6)
+    with pytest.raises(MeshError, match="30 m long: give its unit"):
+        read_mesh(file)
+    with pytest.raises(MeshError, match="metres_per_unit is 0"):
+        read_mesh(file, 0)
+
+
+def test_a_missing_meshio_is_named_where_it_is_needed(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    old = tmp_path / "small.msh"
+    old.write_text(GMSH)
+    assert len(read_mesh(old, 0.001)[0].tetrahedra) == 1
+    other = tmp_path / "small.vtu"
+    other.write_text("<VTKFile/>")
+    with pytest.raises(MeshError, match=r"reading a \.vtu file needs meshio; install it"):
+        read_mesh(other)

@@ -1,0 +1,122 @@
+"""Box meshes against the paper's counts, and what a mesh refuses."""
+
+import numpy as np
+import pytest
+from tissue_block import block_mesh
+
+from us_sim.errors import MeshError
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+
+CORNER = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+ONE = np.array([[0, 1, 2, 3]])
+FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+TWO_ABOVE = np.vstack([CORNER, [[0.2, 0.2, 0.5]]])
+THREE = np.vstack([CORNER, [[0.2, 0.2, 0.5], [0, 0, -1]]])
+AT_A_FACE = [[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]]
+# A second corner beyond the tip of the first.
+BOTH = np.vstack([CORNER, CORNER[3] + CORNER[1:]])
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tetrahedra"),
+    [
+        ((5, 5, 5), 320),  # section IV
+        ((20, 10, 10), 7_695),  # table I
+        ((24, 12, 12), 13_915),
+        ((28, 14, 14), 22_815),
+        ((32, 16, 16), 34_875),
+    ],
+)
+def test_as_many_tetrahedra_as_in_the_paper(nodes, tetrahedra):
+    mesh = block_mesh(nodes)
+    assert len(mesh.nodes) == np.prod(nodes)
+    assert len(mesh.tetrahedra) == tetrahedra
+    assert mesh.volumes.sum() == pytest.approx(0.002)
+    assert mesh.volumes.min() > 0
+
+
+def test_planes_may_be_graded_and_cells_conform():
+    mesh = box_mesh([0.0, 0.1, 0.4], [0.0, 0.5, 0.6, 1.0], [-1.0, 0.0, 2.0])
+    assert mesh.volumes.sum() == pytest.approx(0.4 * 1.0 * 3.0)
+    # A surface without gaps: of a closed box of 2 x 3 x 2 cells, two triangles a cell face.
+    assert len(mesh.boundary) == 2 * 2 * (2 * 3 + 3 * 2 + 2 * 2)
+
+
+def test_boundary_encloses_the_volume_with_outward_triangles():
+    mesh = block_mesh((4, 3, 3))
+    a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(0.002)
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), (a + b + c) / 3 - [0, 0, 0.05])
+    assert (outward > 0).all()
+
+
+def test_edges_satisfy_eulers_formula():
+    mesh = block_mesh((5, 4, 3))
+    faces = (4 * len(mesh.tetrahedra) + len(mesh.boundary)) // 2
+    assert len(mesh.nodes) - len(mesh.edges) + faces - len(mesh.tetrahedra) == 1
+    assert (mesh.edges[:, 0] < mesh.edges[:, 1]).all()
+
+
+def test_node_order_is_x_then_y_then_z():
+    mesh = box_mesh([0.0, 1.0], [0.0, 2.0, 3.0], [0.0, 4.0])
+    np.testing.assert_array_equal(mesh.nodes[(1 * 3 + 2) * 2 + 1], [1.0, 3.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tetrahedra", "words"),
+    [
+        (CORNER[:, :2], ONE, r"nodes have shape \(4, 2\)"),
+        (CORNER, [[0, 1, 2]], r"tetrahedra have shape \(1, 3\)"),
+        (CORNER, np.empty((0, 4), int), "M > 0"),
+        (CORNER, ONE.astype(float), "float64: give integer"),
+        (
+            np.where(CORNER == 1, np.nan, CORNER),
+            ONE,
+            "3 mesh nodes are not finite, such as node 1 at",
+        ),
+        (CORNER * 1e300, ONE, "3 mesh nodes are farther than 1e.06 m away, such as node 1"),
+        (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
+        (CORNER, [[-1, 1, 2, 3]], "name nodes -1 to 3"),
+        (
+            np.vstack([CORNER, [5.0, 5, 5]]),
+            ONE,
+            "1 mesh node belongs to no tetrahedron, such as node 4",
+        ),
+        (CORNER, [[0, 2, 1, 3]], "1 tetrahedron is inverted, such as tetrahedron 0"),
+        (FLAT, ONE, "1 tetrahedron is flat, such as tetrahedron 0"),
+        (CORNER, [[0, 1, 2, 2]], "1 mesh node belongs to no tetrahedron, such as node 3"),
+        (CORNER[[0, 1, 2, 3, 3]], [[0, 1, 2, 3], [0, 1, 2, 4]], "such as node 4 on node 3"),
+        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "repeated, such as tetrahedron 1, which has"),
+        (TWO_ABOVE, [[0, 1, 2, 3], [0, 1, 2, 4]], "same side of the face they share, such as 0"),
+        (THREE, AT_A_FACE, "1 face belongs to more than two .* one of tetrahedra 0, 1, 2"),
+        (BOTH, [[0, 1, 2, 3], [3, 4, 5, 6]], "2 parts .* 1 node in all, such as node 3 between"),
+        (BOTH[:6], [[0, 1, 2, 3], [2, 4, 5, 3]], "by nodes or edges only, 2 nodes"),
+        (np.zeros((2**21 + 1, 3)), ONE, "give a coarser one, of 2097152 at most"),
+    ],
+)
+def test_bad_meshes_are_refused(nodes, tetrahedra, words):
+    with pytest.raises(MeshError, match=words):
+        TetrahedralMesh(nodes, np.asarray(tetrahedra))
+
+
+def test_parts_are_allowed_and_told_apart():
+    one = block_mesh((3, 3, 3))
+    mesh = TetrahedralMesh(
+        np.vstack([one.nodes, np.add(one.nodes, [1.0, 0, 0])]),
+        np.vstack([one.tetrahedra, one.tetrahedra + 27]),
+    )
+    np.testing.assert_array_equal(mesh.parts, np.repeat([0, 1], 27))
+    assert len(mesh.boundary) == 2 * len(one.boundary)
+
+
+@pytest.mark.parametrize(
+    "planes", [[0.0], [0.0, 0.0], [1.0, 0.0], [0.0, np.nan], [[0.0, 1.0]], [0.0, np.inf]]
+)
+def test_bad_planes_are_refused(planes):
+    with pytest.raises(MeshError, match="planes along y"):
+        box_mesh([0.0, 1.0], planes, [0.0, 1.0])
+
+
+def test_one_plane_is_not_enough():
+    with pytest.raises(MeshError, match="1 planes"):
+        uniform_planes(0.0, 1.0, 1)

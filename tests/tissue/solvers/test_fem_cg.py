@@ -1,0 +1,230 @@
+"""Linear contact against exact solutions, and how it behaves under rough handling."""
+
+import numpy as np
+import pytest
+from scipy.sparse import block_array, csr_array
+from scipy.sparse.linalg import spsolve
+from tissue_block import SOFT, block, block_mesh
+
+from us_sim.errors import SolverError
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.solvers.fem_cg import FemCg
+
+PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
+
+
+def at(x=0.0, y=0.0, z=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
+    return Pose(np.array([x, y, z]), np.array(orientation))
+
+
+def settle(solver, pose, frames=120):
+    for _ in range(frames):
+        deformation = solver.deform(pose)
+        if solver.deform(pose) is deformation:
+            return deformation
+    raise AssertionError(f"not settled after {frames} frames: residual {deformation.residual}")
+
+
+def test_uniaxial_compression_has_hookes_force_and_a_linear_field():
+    spongy = Material(young_modulus=10e3, poisson_ratio=0.0, density=1000.0)
+    model = block((9, 5, 5), PLATE, materials=uniform_material(block_mesh((9, 5, 5)), spongy))
+    deformation = settle(FemCg(model, tolerance=1e-10), at(x=0.01, z=0.005))
+    # E A d / L = 10 kPa * 0.02 m2 * 5 mm / 100 mm
+    np.testing.assert_allclose(deformation.force, [0, 0, -10], atol=1e-6)
+    # The block's centre is 10 mm behind the probe's origin along x.
+    np.testing.assert_allclose(deformation.torque, [0, -0.1, 0], atol=1e-6)
+    expected = model.mesh.nodes.copy()
+    expected[:, 2] += 0.005 * (1 - expected[:, 2] / 0.1)
+    np.testing.assert_allclose(deformation.nodes, expected, atol=1e-9)
+    assert len(deformation.contact_nodes) == 9 * 5
+
+
+@pytest.mark.parametrize("collider", [Sphere(0.03), RoundedBox(0.06, 0.03, 0.1, 0.004)])
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_converges_to_the_direct_solution_of_its_contact_set(collider, tilt):
+    model = block((13, 7, 6), collider)
+    pose = at(x=0.013, y=0.004, z=0.012, orientation=(tilt / 2, tilt / 3, 0.0, 1.0))
+    deformation = settle(FemCg(model, tolerance=1e-10), pose)
+    assert len(deformation.contact_nodes) > 3
+    assert deformation.residual <= 1e-10
+
+    # Minimise u K u / 2 with the touched nodes' normal displacements as found.
+    displacement = deformation.nodes - model.mesh.nodes
+    touched = deformation.contact_nodes
+    _, normal = push_out(collider, pose, deformation.nodes[touched], model.contact_spacing)
+    count = len(touched)
+    rows = np.repeat(np.arange(count), 3)
+    columns = (3 * touched[:, None] + np.arange(3)).ravel()
+    constraint = csr_array((normal.ravel(), (rows, columns)), shape=(count, displacement.size))
+    free = np.repeat(~model.fixed, 3)
+    matrix = stiffness(model.mesh, model.materials).tocsr()[free][:, free]
+    constraint = constraint[:, free]
+    system = block_array([[matrix, constraint.T], [constraint, None]], format="csc")
+    right = np.zeros(system.shape[0])
+    right[-count:] = constraint @ displacement.ravel()[free]
+    solution = spsolve(system, right)
+    # The solver lets normals lag by up to a milliradian behind a sliding node.
+    scale = abs(displacement).max()
+    np.testing.assert_allclose(
+        displacement.ravel()[free], solution[:-count], atol=2e-3 * scale, rtol=0
+    )
+    pushes = -solution[-count:]
+    assert (pushes > 0).all()
+    total = -(pushes[:, None] * normal).sum(axis=0) @ pose.rotation
+    np.testing.assert_allclose(deformation.force, total, atol=5e-3 * np.linalg.norm(total))
+
+
+def test_with_flat_contact_the_direct_solution_is_met_to_the_tolerance():
+    model = block((9, 5, 5), PLATE)
+    deformation = settle(FemCg(model, tolerance=1e-11), at(z=0.006))
+    displacement = deformation.nodes - model.mesh.nodes
+    known = np.zeros(displacement.shape, dtype=bool)
+    known[model.fixed] = True
+    known[model.contact_nodes, 2] = True
+    values = np.zeros(displacement.shape)
+    values[model.contact_nodes, 2] = 0.006
+    free, matrix = ~known.ravel(), stiffness(model.mesh, model.materials).tocsr()
+    values = values.ravel()
+    values[free] = spsolve(matrix[free][:, free].tocsc(), -matrix[free][:, ~free] @ values[~free])
+    np.testing.assert_allclose(displacement.ravel(), values, atol=1e-9 * 0.006)
+    assert -deformation.force[2] == pytest.approx(
+        (matrix @ values).reshape(-1, 3)[model.contact_nodes, 2].sum(), rel=1e-8
+    )
+
+
+def test_the_residual_reported_is_the_true_one():
+    model = block((13, 7, 6))
+    solver, matrix = FemCg(model), stiffness(model.mesh, model.materials)
+    for frame in range(6):
+        deformation = solver.deform(at(z=0.002 * frame))
+        force = (matrix @ (deformation.nodes - model.mesh.nodes).ravel()).reshape(-1, 3)
+        force[model.fixed] = 0.0
+        pose = at(z=0.002 * frame)
+        touched = deformation.contact_nodes
+        _, normal = push_out(
+            model.collider, pose, deformation.nodes[touched], model.contact_spacing
+        )
+        push = np.maximum(np.einsum("ij,ij->i", force[touched], normal), 0.0)
+        force[touched] -= push[:, None] * normal
+        if len(touched):
+            honest = np.linalg.norm(force) / np.linalg.norm(push)
+            # Normals may lag by 0.05 rad during the search.
+            assert deformation.residual == pytest.approx(honest, rel=0.2, abs=0.05)
+
+
+def test_a_release_ends_at_rest():
+    solver = FemCg(block((13, 7, 6)))
+    settle(solver, at(z=0.02))
+    for _ in range(30):
+        deformation = solver.deform(at(z=-0.05))
+    np.testing.assert_array_equal(deformation.nodes, solver.model.mesh.nodes)
+    assert deformation.residual == 0
+    assert len(deformation.contact_nodes) == 0
+    np.testing.assert_array_equal(deformation.force, 0)
+
+
+@pytest.mark.parametrize(
+    "collider", [Sphere(0.03), Capsule(0.01, 0.04), RoundedBox(0.05, 0.015, 0.1, 0.003)]
+)
+def test_rough_handling_is_survived_and_forgotten(collider):
+    model = block((13, 7, 6), collider)
+    solver, fresh = FemCg(model), FemCg(model)
+    slanted = (0.0, 0.25, 0.0, 1.0)
+    aside = at(x=0.05, y=0.03, z=0.02, orientation=slanted)
+    presses = [at(z=0.03), at(z=0.002), at(x=0.02, z=0.025), None, at(z=0.06), at(z=0.3)]
+    handling = [*presses, aside, at(z=-1.0), at(z=0.15)]
+    for pose in handling:
+        for _ in range(4):
+            deformation = solver.deform(pose)
+            assert np.isfinite(deformation.nodes).all()
+            assert np.isfinite(deformation.residual)
+            np.testing.assert_array_equal(
+                deformation.nodes[model.fixed], model.mesh.nodes[model.fixed]
+            )
+    settle(solver, None)
+    found = settle(solver, at(x=0.01, z=0.01))
+    expected = settle(fresh, at(x=0.01, z=0.01))
+    np.testing.assert_allclose(found.nodes, expected.nodes, atol=5e-5)
+    np.testing.assert_allclose(found.force, expected.force, atol=0.02)
+
+
+@pytest.mark.parametrize("collider", [Sphere(0.03), RoundedBox(0.05, 0.04, 0.1, 0.003)])
+def test_no_node_stays_inside_the_probe_and_none_is_pulled(collider):
+    model = block((13, 7, 6), collider)
+    deformation = settle(FemCg(model), at(z=0.015))
+    reachable = deformation.nodes[model.contact_nodes]
+    distance, _ = signed_distance(collider, at(z=0.015), reachable)
+    assert distance.min() > -2e-5
+    touched = np.isin(model.contact_nodes, deformation.contact_nodes)
+    assert abs(distance[touched]).max() < 2e-5
+    assert deformation.force[2] < 0
+
+
+def test_a_collapsing_vein_beside_bone_converges():
+    mesh = block_mesh((20, 10, 10))
+    centre = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    modulus, ratio = np.full(len(centre), 15e3), np.full(len(centre), 0.45)
+    vein = np.hypot(centre[:, 0], centre[:, 2] - 0.03) < 0.012
+    bone = np.hypot(centre[:, 0] - 0.04, centre[:, 2] - 0.06) < 0.015
+    modulus[vein], ratio[vein] = 300.0, 0.1
+    modulus[bone], ratio[bone] = 3e6, 0.3
+    materials = TissueMaterials(modulus, ratio, np.full(len(centre), 1000.0))
+    solver = FemCg(block((20, 10, 10), RoundedBox(0.05, 0.02, 0.1, 0.003), materials=materials))
+    residuals = [solver.deform(at(z=0.012)).residual for _ in range(30)]
+    assert residuals[-1] < 1e-3
+    nodes = solver.deform(at(z=0.012)).nodes
+    a, b, c, d = np.moveaxis(nodes[mesh.tetrahedra], 1, 0)
+    volume = np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
+    assert volume[vein].sum() < 0.9 * mesh.volumes[vein].sum()
+    assert volume[bone].sum() == pytest.approx(mesh.volumes[bone].sum(), rel=1e-3)
+    released = [solver.deform(None).residual for _ in range(30)]
+    assert released[-1] < 1e-3
+
+
+def test_more_iterations_leave_a_smaller_residual():
+    few, many = (
+        FemCg(block((13, 7, 6)), iterations=n).deform(at(z=0.01)).residual for n in (5, 60)
+    )
+    assert many < 0.1 * few
+
+
+def test_without_reachable_nodes_nothing_moves():
+    model = block()
+    object.__setattr__(model, "contact_nodes", np.empty(0, np.int32))
+    deformation = FemCg(model).deform(at(z=0.02))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+
+
+def test_a_held_node_is_passed_by():
+    model = block(held=("bottom", "top"))
+    deformation = FemCg(model).deform(at(z=0.02))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+    assert len(deformation.contact_nodes) == 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("iterations", 0),
+        ("iterations", 2.5),
+        ("iterations", True),
+        ("contact_updates", 0),
+        ("tolerance", 0.0),
+        ("tolerance", 1.0),
+        ("tolerance", "1e-6"),
+        ("tolerance", float("nan")),
+    ],
+)
+def test_settings_out_of_range_are_refused(setting, value):
+    with pytest.raises(SolverError, match=f"fem_cg.{setting} is "):
+        FemCg(block((3, 3, 3)), **{setting: value})
+
+
+def test_a_free_tissue_is_refused():
+    assert SOFT.poisson_ratio < 0.5
+    with pytest.raises(SolverError, match="can move as a whole"):
+        FemCg(block((3, 3, 3), held=()))

@@ -1,0 +1,368 @@
+"""Large deformation against closed forms and another minimiser, and under rough handling."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from tissue_block import block, block_mesh
+
+from us_sim.errors import SolverError
+from us_sim.evaluation.stability.independent_residual import IndependentResidual, neo_hookean_forces
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.elasticity.bulk_shares import bulk_shares
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.fem import Fem
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+
+PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
+FINE = (13, 7, 6)
+
+
+def at(x=0.0, y=0.0, z=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
+    return Pose(np.array([x, y, z]), np.array(orientation))
+
+
+def made_of(ratio, nodes=FINE, modulus=10e3):
+    return uniform_material(block_mesh(nodes), Material(modulus, ratio, 1000.0))
+
+
+def settle(solver, pose, frames=150):
+    for _ in range(frames):
+        deformation = solver.deform(pose)
+        if solver.deform(pose) is deformation:
+            return deformation
+    raise AssertionError(f"not settled after {frames} frames: residual {deformation.residual}")
+
+
+def deformation_gradients(mesh, nodes):
+    return np.einsum("eai,eaj->eij", nodes[mesh.tetrahedra], shape_gradients(mesh))
+
+
+def smallest_volume_ratio(model, nodes):
+    return np.linalg.det(deformation_gradients(model.mesh, nodes)).min()
+
+
+def energy(model, nodes):
+    """As the solver's docstring says it, in NumPy."""
+    mesh, shares = model.mesh, bulk_shares(model.materials)
+    gradient = deformation_gradients(mesh, nodes)
+    growth = np.linalg.det(gradient) - 1
+    density = shares.shear * (((gradient**2).sum((1, 2)) - 3) / 2 - growth)
+    density += shares.element * growth**2 / 2
+    weight = np.repeat(shares.nodal * mesh.volumes / 4, 4)
+    total = np.bincount(mesh.tetrahedra.ravel(), weight)
+    mean = np.bincount(mesh.tetrahedra.ravel(), weight * np.repeat(growth, 4))
+    averaged = np.divide(mean**2, total, out=np.zeros_like(total), where=total > 0).sum() / 2
+    return (mesh.volumes * density).sum() + averaged
+
+
+def checker(model):
+    return IndependentResidual(
+        model, lambda u: neo_hookean_forces(model.mesh, model.materials, u), 1e-9
+    )
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.48])
+def test_a_press_by_a_plate_is_what_another_minimiser_finds(ratio):
+    model = block((5, 4, 4), PLATE, materials=made_of(ratio, (5, 4, 4)))
+    depth = 0.02
+    found = settle(FemNonlinear(model, tolerance=1e-9), at(z=depth))
+    rest = model.mesh.nodes
+    low = np.full(rest.shape, -np.inf)
+    low[model.contact_nodes, 2] = depth
+    low, free = low[~model.fixed].ravel(), ~model.fixed
+
+    def value(flat):
+        nodes = rest.copy()
+        nodes[free] = flat.reshape(-1, 3)
+        return energy(model, nodes), neo_hookean_forces(model.mesh, model.materials, nodes - rest)[
+            free
+        ].ravel()
+
+    start = rest.copy()
+    start[:, 2] += depth * (1 - rest[:, 2] / 0.1)
+    best = minimize(
+        value,
+        start[free].ravel(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(b if np.isfinite(b) else None, None) for b in low],
+        options={"maxiter": 20_000, "maxfun": 40_000, "ftol": 1e-16, "gtol": 1e-9},
+    )
+    np.testing.assert_allclose(found.nodes[free].ravel(), best.x, atol=2e-6)
+    assert energy(model, found.nodes) == pytest.approx(best.fun, rel=1e-7)
+
+
+def test_a_small_press_has_hookes_force():
+    model = block(FINE, PLATE, materials=made_of(0.0))
+    deformation = settle(FemNonlinear(model), at(x=0.01, z=5e-5))
+    # E A d / L = 10 kPa * 0.02 m2 * 50 um / 100 mm, at 10 mm from the probe's origin; the strain is
+    # 5e-4, and so is what is not linear.
+    np.testing.assert_allclose(deformation.force, [0, 0, -0.1], atol=2e-4)
+    np.testing.assert_allclose(deformation.torque, [0, -1e-3, 0], atol=2e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.49])
+def test_a_small_press_is_that_of_linear_elasticity(ratio):
+    model = block(FINE, materials=made_of(ratio))
+    pose = at(z=5e-5)
+    found, linear = settle(FemNonlinear(model), pose), Fem(model).deform(pose)
+    displacement = linear.nodes - model.mesh.nodes
+    error = np.linalg.norm(found.nodes - linear.nodes) / np.linalg.norm(displacement)
+    assert error < 3e-3  # the strain is 5e-4, and more under the probe
+    np.testing.assert_allclose(found.force, linear.force, atol=5e-3 * -linear.force[2])
+
+
+@pytest.mark.parametrize(
+    "collider", [Sphere(0.05), Capsule(0.06, 0.04), RoundedBox(0.06, 0.04, 0.1, 0.004)]
+)
+@pytest.mark.parametrize("ratio", [0.45, 0.49])
+def test_a_settled_press_is_balanced_and_keeps_the_law_of_contact(collider, ratio):
+    model = block(FINE, collider, materials=made_of(ratio))
+    pose = at(x=0.013, y=0.004, z=0.025, orientation=(0.05, 0.03, 0.0, 1.0))
+    deformation = settle(FemNonlinear(model), pose)
+    assert deformation.residual <= 1e-5
+    assert checker(model).check(deformation, pose)[0] < 2e-5
+    assert smallest_volume_ratio(model, deformation.nodes) > 0.3
+    assert len(deformation.contact_nodes) > 3
+    distance, _ = signed_distance(collider, pose, deformation.nodes[model.contact_nodes])
+    assert distance.min() > -2e-5
+    touched = np.isin(model.contact_nodes, deformation.contact_nodes)
+    assert abs(distance[touched]).max() < 2e-5
+
+
+def test_action_is_reaction():
+    model = block(FINE)
+    pose = at(x=0.01, z=0.02, orientation=(0.1, 0.05, 0.0, 1.0))
+    deformation = settle(FemNonlinear(model, tolerance=1e-8), pose)
+    holding = neo_hookean_forces(model.mesh, model.materials, deformation.nodes - model.mesh.nodes)
+    np.testing.assert_allclose(
+        pose.rotation @ deformation.force, holding[model.fixed].sum(axis=0), atol=1e-6
+    )
+    arms = deformation.nodes[model.fixed] - pose.position
+    np.testing.assert_allclose(
+        pose.rotation @ deformation.torque,
+        np.cross(arms, holding[model.fixed]).sum(axis=0),
+        atol=1e-7,
+    )
+
+
+@pytest.mark.parametrize("ratio", [0.45, 0.49])
+def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(ratio):
+    model = block((20, 10, 10), materials=made_of(ratio, (20, 10, 10)))
+    solver, exact = FemNonlinear(model), FemNonlinear(model, iterations=200, most_iterations=400)
+    for frame in range(1, 11):
+        solver.deform(at(z=0.0025 * frame))
+    errors = []
+    for frame in range(5):
+        pose = at(x=0.0025 * frame, z=0.025)
+        found = solver.deform(pose).nodes
+        for _ in range(4):
+            expected = exact.deform(pose).nodes
+        error = np.linalg.norm(found - expected)
+        errors.append(error / np.linalg.norm(expected - model.mesh.nodes))
+    assert np.mean(errors) < 0.01
+    assert max(errors) < 0.02
+
+
+@pytest.mark.parametrize("ratio", [0.45, 0.49])
+def test_after_a_jump_and_a_sudden_change_the_nodes_are_right_within_five_frames(ratio):
+    model = block(FINE, Sphere(0.05), materials=made_of(ratio))
+    solver = FemNonlinear(model)
+    settle(solver, at(z=0.025))
+    for pose in (at(x=0.01, z=0.025), at(x=0.01, z=0.004), at(x=-0.02, z=0.025)):
+        for _ in range(5):
+            deformation = solver.deform(pose)
+            assert smallest_volume_ratio(model, deformation.nodes) > 0
+        expected = settle(FemNonlinear(model), pose).nodes
+        error = np.linalg.norm(deformation.nodes - expected)
+        assert error < 0.01 * np.linalg.norm(expected - model.mesh.nodes)
+
+
+def test_a_release_ends_at_rest_at_once():
+    model = block(FINE)
+    solver = FemNonlinear(model)
+    settle(solver, at(z=0.025))
+    deformation = solver.deform(at(z=-0.05))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+    assert deformation.residual == 0
+    np.testing.assert_array_equal(deformation.force, 0)
+
+
+def test_energy_falls_as_the_probe_withdraws_and_while_it_waits():
+    model = block(FINE, Sphere(0.05))
+    solver = FemNonlinear(model)
+    before = energy(model, settle(solver, at(z=0.025)).nodes)
+    for frame in range(1, 6):
+        for _ in range(3):
+            after = energy(model, solver.deform(at(z=0.025 - 0.005 * frame)).nodes)
+        assert after < before
+        before = after
+    assert before == pytest.approx(0.0, abs=1e-12)
+
+
+violent = st.lists(
+    st.one_of(
+        st.none(),
+        st.tuples(
+            st.floats(-0.12, 0.12),
+            st.floats(-0.07, 0.07),
+            st.sampled_from([-0.05, 0.005, 0.015, 0.03, 0.06, 0.12, 0.5]),
+            st.floats(-0.6, 0.6),
+            st.floats(-0.6, 0.6),
+        ),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+@pytest.mark.parametrize(
+    ("collider", "ratio"),
+    [(Sphere(0.06), 0.45), (RoundedBox(0.05, 0.03, 0.1, 0.004), 0.49), (Sphere(0.06), 0.4999)],
+)
+def test_nothing_turns_inside_out_whatever_the_probe_does(collider, ratio):
+    model = block((9, 5, 5), collider, materials=made_of(ratio, (9, 5, 5)))
+    solver = FemNonlinear(model)
+
+    @settings(max_examples=12, deadline=None, derandomize=True)
+    @given(violent)
+    def handle(poses):
+        solver.reset()
+        check = checker(model)
+        for given_pose in poses:
+            pose = None
+            if given_pose is not None:
+                x, y, z, a, b = given_pose
+                pose = at(x, y, z, (a, b, 0.0, 1.0))
+            for _ in range(2):
+                deformation = solver.deform(pose)
+                assert np.isfinite(deformation.nodes).all()
+                assert smallest_volume_ratio(model, deformation.nodes) > 0
+                checked, rounding = check.check(deformation, pose)
+                assert checked == pytest.approx(deformation.residual, rel=0.5, abs=1e-5 + rounding)
+        released = solver.deform(None)
+        np.testing.assert_array_equal(released.nodes, model.mesh.nodes)
+
+    handle()
+
+
+def test_the_same_poses_give_the_same_bytes():
+    poses = [at(z=0.01), at(z=0.02), at(x=0.02, z=0.025), at(x=-0.03, z=0.01)]
+    first, second = FemNonlinear(block(FINE)), FemNonlinear(block(FINE))
+    for pose in poses:
+        assert first.deform(pose).nodes.tobytes() == second.deform(pose).nodes.tobytes()
+
+
+def test_a_closing_vein_is_followed_as_a_box_slides_over_it():
+    nodes = (21, 11, 11)
+    mesh = block_mesh(nodes)
+    centres = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    vein = (np.abs(centres[:, 0]) < 0.03) & (np.abs(centres[:, 2] - 0.02) < 0.01)
+    materials = TissueMaterials(
+        np.where(vein, 2e3, 50e3), np.where(vein, 0.1, 0.48), np.full(len(vein), 1000.0)
+    )
+    box = RoundedBox(0.014, 0.046, 0.04, 0.004)  # pushes along one direction: less than two cells
+    model = block(nodes, box, materials=materials)
+    solver = FemNonlinear(model)
+    press = [at(z=0.0005 * frame) for frame in range(41)]
+    slide = [at(x=0.0005 * frame, z=0.02) for frame in range(60)]
+    residuals, smallest, behind = [], 1.0, 0
+    for pose in press + slide:
+        deformation = solver.deform(pose)
+        residuals.append(deformation.residual)
+        smallest = min(smallest, smallest_volume_ratio(model, deformation.nodes))
+        behind += bool(deformation.action)
+    assert 0.0 < smallest < 0.25  # the vein does close
+    assert behind == 0
+    assert np.mean(np.array(residuals) < 0.05) > 0.95
+    assert max(residuals) < 0.5
+    assert settle(solver, slide[-1]).residual < 1e-5
+    np.testing.assert_array_equal(solver.deform(None).nodes, mesh.nodes)
+
+
+def test_stiff_bone_in_soft_tissue_hardly_deforms():
+    mesh = block_mesh((20, 10, 10))
+    centre = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    modulus, ratio = np.full(len(centre), 10e3), np.full(len(centre), 0.45)
+    bone = np.hypot(centre[:, 0], centre[:, 2] - 0.06) < 0.02
+    modulus[bone], ratio[bone] = 10e9, 0.3
+    materials = TissueMaterials(modulus, ratio, np.full(len(centre), 1000.0))
+    model = block((20, 10, 10), Sphere(0.05), materials=materials)
+    solver, pose = FemNonlinear(model), at(z=0.02)
+    for _ in range(60):
+        deformation = solver.deform(pose)
+    assert deformation.residual < 1e-3
+    stretch = np.linalg.svd(deformation_gradients(mesh, deformation.nodes)[bone])[1]
+    assert abs(stretch - 1).max() < 1e-3
+
+
+def test_another_solvers_state_is_taken_over_even_when_inside_out():
+    model = block(FINE, Sphere(0.05))
+    pose = at(z=0.02)
+    expected = settle(FemNonlinear(model), pose)
+    linear = Fem(model)
+    linear.deform(pose)
+    tangled = np.random.default_rng(0).normal(0, 0.02, model.mesh.nodes.shape)
+    tangled[model.fixed] = 0.0
+    for state in (linear.state, TissueState(tangled, np.zeros_like(tangled))):
+        solver = FemNonlinear(model)
+        solver.take_over(state)
+        found = settle(solver, pose)
+        np.testing.assert_allclose(found.nodes, expected.nodes, atol=2e-5)
+
+
+def test_a_single_tetrahedron_with_one_free_corner():
+    nodes = np.array([[0.05, 0, 0.1], [-0.05, 0.05, 0.1], [-0.05, -0.05, 0.1], [0, 0, 0.0]])
+    mesh = TetrahedralMesh(nodes, np.array([[0, 2, 1, 3]]))
+    materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+    fixed = nodes[:, 2] > 0.05
+    model = TissueModel(mesh, materials, fixed, Sphere(0.05), np.array([3]))
+    pose = at(z=0.02)
+    deformation = settle(FemNonlinear(model), pose)
+    assert checker(model).check(deformation, pose)[0] < 1e-5
+    distance, _ = signed_distance(model.collider, pose, deformation.nodes[3:])
+    assert abs(distance[0]) < 1e-5
+
+
+@pytest.mark.parametrize("held", [("top",), ("bottom", "top")])
+def test_held_nodes_are_passed_by(held):
+    model = block(FINE, held=held)
+    deformation = FemNonlinear(model).deform(at(z=0.02))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+
+
+def test_everything_fixed_stays():
+    model = block((3, 3, 3))
+    object.__setattr__(model, "fixed", np.ones(27, dtype=bool))
+    deformation = FemNonlinear(model).deform(at(z=0.02))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("iterations", 0),
+        ("iterations", 2.5),
+        ("most_iterations", 0),
+        ("most_iterations", True),
+        ("tolerance", 0.0),
+        ("tolerance", float("nan")),
+        ("frame_tolerance", 1.0),
+        ("frame_tolerance", "0.1"),
+    ],
+)
+def test_settings_out_of_range_are_refused(setting, value):
+    with pytest.raises(SolverError, match=f"fem_nonlinear.{setting} is "):
+        FemNonlinear(block((3, 3, 3)), **{setting: value})
+
+
+def test_a_free_tissue_is_refused():
+    with pytest.raises(SolverError, match="can move as a whole"):
+        FemNonlinear(block((3, 3, 3), held=()))

@@ -1,0 +1,93 @@
+"""A stylus' tip from poses about a fixed point: known tips, noise, outliers and refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from us_sim.errors import CalibrationError
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.pivot import calibrate_pivot
+
+TIP = np.array([0.0086, -0.0023, 0.1085])
+HOLE = np.array([0.3, -0.1, 0.9])
+coordinate = st.floats(-0.3, 0.3)
+
+
+def pivoting(rotations, tip=TIP, hole=HOLE):
+    """(K, 3) positions and orientations of a body whose tip stays in the hole."""
+    return [Pose(hole - rotation.apply(tip), rotation.as_quat()) for rotation in rotations]
+
+
+def tilts(rng, count, degrees=25.0):
+    """Rotations about all axes, after one that no axis is special for."""
+    turned = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3)))
+    return turned * Rotation.from_rotvec([0.4, 1.0, -0.3])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    tip=st.tuples(coordinate, coordinate, coordinate),
+    hole=st.tuples(coordinate, coordinate, coordinate),
+    seed=st.integers(0, 1000),
+)
+def test_exact_poses_give_the_tip_exactly(tip, hole, seed):
+    tip, hole = np.array(tip), np.array(hole)
+    poses = pivoting(tilts(np.random.default_rng(seed), 20), tip, hole)
+    found = calibrate_pivot(poses)
+    np.testing.assert_allclose(found.tip, tip, atol=1e-12)
+    np.testing.assert_allclose(found.pivot, hole, atol=1e-12)
+    assert found.rms < 1e-12
+    assert found.rejected == 0
+
+
+def test_errors_are_as_large_as_the_deviations_say():
+    rng = np.random.default_rng(4)
+    noise = 0.3e-3
+    errors = []
+    for _ in range(120):
+        exact = pivoting(tilts(rng, 60, 12.0))
+        poses = [Pose(p.position + noise * rng.standard_normal(3), p.orientation) for p in exact]
+        found = calibrate_pivot(poses)
+        errors.append((found.tip - TIP) / found.deviations)
+        assert found.rms == pytest.approx(noise * np.sqrt(3), rel=0.4)
+    # 360 normal deviates: their root mean square is 1 with a standard deviation of 0.04.
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.13)
+
+
+def test_a_third_of_wrong_poses_is_left_out_and_counted():
+    rng = np.random.default_rng(8)
+    exact = pivoting(tilts(rng, 90))
+    poses = [Pose(p.position + 2e-4 * rng.standard_normal(3), p.orientation) for p in exact]
+    for k in range(0, 90, 3):
+        poses[k] = Pose(poses[k].position + rng.uniform(0.01, 0.1, 3), poses[k].orientation)
+    found = calibrate_pivot(poses)
+    assert 30 <= found.rejected <= 32
+    assert not found.inliers[::3].any()
+    np.testing.assert_allclose(found.tip, TIP, atol=2e-4)
+
+
+def test_a_stylus_turned_about_its_own_axis_only_is_refused():
+    spins = Rotation.from_euler("z", np.linspace(0, 5, 50)[:, None]) * Rotation.from_rotvec(
+        [0.4, 1, 0]
+    )
+    with pytest.raises(CalibrationError, match="about one axis only"):
+        calibrate_pivot(pivoting(spins))
+
+
+def test_a_stylus_rocked_in_one_plane_is_refused():
+    rocked = Rotation.from_euler("x", np.linspace(-0.6, 0.6, 50)[:, None])
+    shaken = rocked * Rotation.from_rotvec(np.random.default_rng(1).normal(0, 1e-3, (50, 3)))
+    with pytest.raises(CalibrationError, match="about one axis only"):
+        calibrate_pivot(pivoting(shaken))
+
+
+def test_a_stylus_that_stood_still_is_refused():
+    with pytest.raises(CalibrationError, match="about one axis only"):
+        calibrate_pivot(pivoting(Rotation.identity(30)))
+
+
+def test_too_few_poses_are_refused():
+    with pytest.raises(CalibrationError, match="at least 10 poses, not 9"):
+        calibrate_pivot(pivoting(tilts(np.random.default_rng(0), 9)))

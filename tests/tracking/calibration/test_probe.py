@@ -1,0 +1,173 @@
+"""Probe calibration from wires and points whose place is known, with errors, and refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from us_sim.errors import CalibrationError
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
+
+SPACING = np.array([1.9e-4, 1.4e-4])
+IMAGE = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+CORNER = np.array([0.03, -0.08, 0.05])  # m, pixel (0, 0) in the body's frame
+NWIRES = {
+    f"{layer}{side}": 1e-3
+    * np.array([[x + shift, 0.0, 10.0 * layer], [x + end * (layer % 2 * 2 - 1), 40, 10 * layer]])
+    for layer in range(3)
+    for side, x, shift, end in (("left", 30, 0, 0), ("oblique", 45, 0, 10), ("right", 60, 0, 0))
+}
+
+
+def image_to_body(corner=CORNER, spacing=SPACING):
+    matrix = np.eye(4)
+    matrix[:3, :3] = IMAGE * [*spacing, 1.0]
+    matrix[:3, 3] = corner
+    return matrix
+
+
+def sightings(rng, features, count, *, pixel_noise=0.0, pose_noise=0.0, turn=0.5):
+    """Each of a random pixel that shows a random place of a random feature.
+
+    The body is turned anyhow, and put where the pixel falls on the feature.
+    """
+    names = sorted(features)
+    made = []
+    for k in range(count):
+        name = names[k % len(names)]
+        feature = np.reshape(features[name], (-1, 3))
+        place = feature[0] + rng.uniform(0.2, 0.8) * (feature[-1] - feature[0])
+        pixel = rng.uniform([50, 60], [550, 440])
+        body = image_to_body()[:3] @ [*pixel, 0.0, 1.0]
+        turned = Pose(orientation=Rotation.from_rotvec(turn * rng.standard_normal(3)).as_quat())
+        position = place - turned.apply(body) + pose_noise * rng.standard_normal(3)
+        pixel = pixel + pixel_noise * rng.standard_normal(2)
+        made.append(PixelSighting(name, *pixel, Pose(position, turned.orientation)))
+    return made
+
+
+def deviations(found):
+    """(8,) of position, rotation and spacing."""
+    return np.sqrt(np.diag(found.covariance))
+
+
+def errors(found):
+    """(8,) what the deviations are of."""
+    directions = found.image_to_body[:3, :3] / [*found.spacing, 1.0]
+    turn = Rotation.from_matrix(directions @ IMAGE.T).as_rotvec()
+    return np.concatenate([found.image_to_body[:3, 3] - CORNER, turn, found.spacing - SPACING])
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_exact_n_wires_give_the_image_exactly(seed):
+    found = calibrate_probe(sightings(np.random.default_rng(seed), NWIRES, 36), NWIRES)
+    np.testing.assert_allclose(found.image_to_body, image_to_body(), atol=1e-9)
+    np.testing.assert_allclose(found.spacing, SPACING, rtol=1e-6)
+    assert found.rms < 1e-9
+
+
+def test_a_point_at_an_unknown_place_is_found_too():
+    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
+    found = calibrate_probe(sightings(np.random.default_rng(2), pin, 40), {})
+    np.testing.assert_allclose(found.image_to_body, image_to_body(), atol=1e-9)
+    np.testing.assert_allclose(found.points["pin"], [0.2, -0.1, 0.4], atol=1e-9)
+
+
+def test_known_pixels_stay_as_they_are():
+    rng = np.random.default_rng(5)
+    made = sightings(rng, NWIRES, 60, pixel_noise=1.0)
+    found = calibrate_probe(made, NWIRES, spacing=SPACING)
+    np.testing.assert_array_equal(found.spacing, SPACING)
+    assert (deviations(found)[6:] == 0).all()
+    assert np.abs(errors(found)[:3]).max() < 3e-4
+
+
+@pytest.mark.parametrize("noise", [{"pixel_noise": 2.0}, {"pose_noise": 4e-4}])
+def test_errors_are_as_large_as_the_covariance_says(noise):
+    rng = np.random.default_rng(11)
+    normal = []
+    for _ in range(40):
+        found = calibrate_probe(sightings(rng, NWIRES, 90, **noise), NWIRES)
+        normal.append(errors(found) / deviations(found))
+    # 320 correlated deviates, at most a few per cent beyond what few sightings let them scatter.
+    assert np.sqrt(np.mean(np.square(normal))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_wrong_sightings_are_left_out():
+    rng = np.random.default_rng(6)
+    made = sightings(rng, NWIRES, 120, pose_noise=2e-4)
+    for k in range(0, 120, 8):
+        wrong = made[k]
+        made[k] = PixelSighting(wrong.feature, wrong.column + 150.0, wrong.row, wrong.pose)
+    found = calibrate_probe(made, NWIRES)
+    assert not found.inliers[::8].any()
+    assert (~found.inliers).sum() <= 17
+    assert np.abs(errors(found)[:3]).max() < 3e-4
+
+
+def test_the_probes_frame_has_its_origin_at_the_transducer_and_z_along_rows():
+    found = calibrate_probe(sightings(np.random.default_rng(1), NWIRES, 36), NWIRES)
+    pose = found.probe_pose(300.0, 12.0)
+    np.testing.assert_allclose(
+        pose.position, image_to_body()[:3] @ [300.0, 12.0, 0.0, 1.0], atol=1e-9
+    )
+    deeper = image_to_body()[:3] @ [310.0, 62.0, 0.0, 1.0]
+    np.testing.assert_allclose(
+        pose.apply(np.array([[10 * SPACING[0], 0.0, 50 * SPACING[1]]])), [deeper], atol=1e-9
+    )
+    assert np.linalg.det(pose.rotation) == pytest.approx(1.0)
+
+
+def parallel(rng):
+    """Wires of one direction, and a body that does not turn."""
+    wires = {k: np.array([[x, 0.0, z], [x, 0.04, z]]) for k, x, z in _grid()}
+    return sightings(rng, wires, 60, turn=0.0), wires
+
+
+def _grid():
+    return [(f"{i}{j}", 0.02 * i, 0.01 * j) for i in range(3) for j in range(3)]
+
+
+def test_wires_of_one_direction_without_turning_are_refused():
+    with pytest.raises(CalibrationError, match="do not determine where the image is"):
+        calibrate_probe(*parallel(np.random.default_rng(0)))
+
+
+def test_an_unknown_point_without_turning_is_refused():
+    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
+    made = sightings(np.random.default_rng(0), pin, 60, turn=1e-3, pose_noise=2e-4)
+    with pytest.raises(CalibrationError, match="turn the probe about all axes"):
+        calibrate_probe(made, {})
+
+
+def test_one_pixel_seen_again_and_again_is_refused():
+    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
+    made = [
+        PixelSighting("pin", 300.0, 200.0, seen.pose)
+        for seen in sightings(np.random.default_rng(0), pin, 60)
+    ]
+    with pytest.raises(CalibrationError, match="all over the image"):
+        calibrate_probe(made, pin)
+
+
+def test_millimetres_in_place_of_metres_are_refused():
+    made = [
+        PixelSighting(
+            seen.feature,
+            seen.column,
+            seen.row,
+            Pose(1000 * seen.pose.position, seen.pose.orientation),
+        )
+        for seen in sightings(np.random.default_rng(3), NWIRES, 60)
+    ]
+    scaled = {name: 1000 * wire for name, wire in NWIRES.items()}
+    with pytest.raises(CalibrationError, match="in metres"):
+        calibrate_probe(made, scaled)
+
+
+def test_too_few_sightings_are_refused():
+    with pytest.raises(CalibrationError, match="at least 8 sightings, not 7"):
+        calibrate_probe(sightings(np.random.default_rng(0), NWIRES, 7), NWIRES)

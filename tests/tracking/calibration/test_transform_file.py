@@ -1,0 +1,101 @@
+"""A transform's file gives back what was written, and says what is wrong with it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import CalibrationError
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.transform_file import (
+    read_transform,
+    read_transform_file,
+    write_transform,
+)
+
+HALF_TURN = "orientation: [1, 0, 0, 0]\n"
+numbers = st.floats(-10.0, 10.0)
+
+
+def read(tmp_path, text):
+    file = tmp_path / "given.yaml"
+    file.write_text(text, encoding="utf-8")
+    return read_transform(file)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    position=st.tuples(numbers, numbers, numbers),
+    orientation=st.tuples(numbers, numbers, numbers, numbers).filter(
+        lambda q: np.linalg.norm(q) > 1e-3
+    ),
+)
+def test_what_is_written_is_read_to_the_last_bit(tmp_path_factory, position, orientation):
+    file = tmp_path_factory.mktemp("files") / "t.yaml"
+    pose = Pose(position, orientation)
+    write_transform(file, pose, from_frame="a", to_frame="b", method="by hand")
+    read = read_transform(file)
+    np.testing.assert_array_equal(read.position, pose.position)
+    np.testing.assert_allclose(read.orientation, pose.orientation, rtol=0, atol=3e-16)
+
+
+def test_residuals_frames_and_method_are_kept(tmp_path):
+    file = tmp_path / "registration.yaml"
+    write_transform(
+        file,
+        Pose([0.1, 0.2, 0.3]),
+        from_frame="tracker",
+        to_frame="patient",
+        method="point registration",
+        residuals={"fre": np.float64(3e-4), "landmarks": {"#1": np.array([1e-5, 2.0, 0.0])}},
+        more={"pixel_spacing": np.array([1e-4, 2e-4])},
+    )
+    read = read_transform_file(file)
+    assert (read.from_frame, read.to_frame, read.method) == (
+        "tracker",
+        "patient",
+        "point registration",
+    )
+    assert read.residuals == {"fre": 3e-4, "landmarks": {"#1": [1e-5, 2.0, 0.0]}}
+    assert read.more == {"pixel_spacing": [1e-4, 2e-4]}
+    assert read.date.startswith("20")
+
+
+def test_a_file_is_never_overwritten(tmp_path):
+    file = tmp_path / "t.yaml"
+    file.write_text("mine")
+    with pytest.raises(CalibrationError, match="exists already"):
+        write_transform(file, Pose(), from_frame="a", to_frame="b", method="m")
+    assert file.read_text() == "mine"
+
+
+def test_a_person_may_write_units_and_exponents(tmp_path):
+    pose = read(tmp_path, "position: [10 mm, 1e-3, 0]\n" + HALF_TURN)
+    np.testing.assert_allclose(pose.position, [0.01, 0.001, 0.0], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "holds no transform"),
+        ("- 1\n", "holds no transform"),
+        ("position: [0, 0, 0]\n", "orientation: is missing"),
+        (HALF_TURN, "position: is missing"),
+        ("position: [0, 0]\n" + HALF_TURN, "position: must be 3 numbers"),
+        ("position: [0, 0, .nan]\n" + HALF_TURN, "not finite"),
+        ("position: [0, 0, true]\n" + HALF_TURN, "position: True is not a length"),
+        ("position: [0, 0, 0]\norientation: [0, 0, 0, 0]\n", "quaternion is zero"),
+        ("position: [0, 0\n", "line 2: is not YAML"),
+        ("position: [0, 0, 0]\nresiduals: 3\n" + HALF_TURN, "residuals: must be a mapping"),
+    ],
+)
+def test_a_file_that_is_no_transform_is_refused_with_a_sentence(tmp_path, text, problem):
+    with pytest.raises(CalibrationError, match=problem) as refused:
+        read(tmp_path, text)
+    assert "given.yaml" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(CalibrationError, match=r"nowhere\.yaml: there is no such file"):
+        read_transform(tmp_path / "nowhere.yaml")

@@ -1,0 +1,114 @@
+"""Printed sheets have their true size, and are found again."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from us_sim.command.main import main
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera.fiducial_detector import detect_corners
+from us_sim.tracking.camera.marker_print import print_markers, sheets
+from us_sim.tracking.camera.rigid_body import RigidBody
+
+
+def dots_per_metre(path):
+    content = path.read_bytes()
+    at = content.index(b"pHYs") + 4
+    across, down, unit = struct.unpack(">IIB", content[at : at + 9])
+    assert (across, unit) == (down, 1)
+    return across
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        RigidBody.single("APRILTAG_36h11", 7, 0.04),
+        RigidBody.grid("6X6_1000", 4, 5, 0.0375, 0.005),
+        RigidBody.charuco("6X6_250", 5, 7, 0.03, 0.015),
+        RigidBody.charuco("5X5_250", 6, 8, 0.025, 0.018),
+        RigidBody.charuco("5X5_250", 6, 8, 0.025, 0.018, legacy=True),
+    ],
+)
+def test_a_printed_body_has_its_size(body, tmp_path):
+    path = tmp_path / "sheet.png"
+    print_markers(body, path)
+    points, pixels = detect_corners(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), body)
+    wanted = len(body.ids) * 4 if body.chessboard is None else len(body.chessboard.corners)
+    assert len(points) == wanted
+    printed = pixels / dots_per_metre(path)
+    design = np.column_stack([points[:, :2], np.ones(len(points))])
+    shape, *_ = np.linalg.lstsq(design, printed, rcond=None)
+    assert np.allclose(np.abs(shape[:2]), np.eye(2), atol=5e-4)
+    assert np.abs(design @ shape - printed).max() < 0.03e-3
+
+
+def test_markers_of_a_body_that_is_not_flat_are_printed_one_by_one():
+    corners = np.concatenate([RigidBody.single("4X4_50", 0, 0.05).corners] * 20)
+    corners += np.arange(20.0)[:, None, None] * [0.0, 0.0, 0.01]
+    pages = sheets(RigidBody("4X4_50", np.arange(20), corners))
+    # With their margins two of 66.7 mm go beside each other, and three of these rows on a sheet.
+    ids = [tuple(range(first, min(first + 6, 20))) for first in (0, 6, 12, 18)]
+    assert [page.ids for page in pages] == ids
+    for page in pages:
+        edges = np.roll(page.marked, -1, axis=1) - page.marked
+        assert np.allclose(np.linalg.norm(edges, axis=2), 50.0)
+
+
+def test_a_pdf_has_the_papers_size_and_the_markers_as_outlines(tmp_path):
+    path = tmp_path / "sheet.pdf"
+    print_markers(RigidBody.single("4X4_50", 7, 0.04), path, "letter")
+    content = path.read_bytes()
+    assert b"/MediaBox [ 0 0 612 792 ]" in content
+    assert b"/Subtype /Image" not in content
+
+
+def test_nothing_is_overwritten_and_what_cannot_be_is_said(tmp_path):
+    marker = RigidBody.single("4X4_50", 7, 0.04)
+    path = tmp_path / "sheet.png"
+    path.write_bytes(b"kept")
+    with pytest.raises(TrackingError, match=r"sheet.png: exists already"):
+        print_markers(marker, path)
+    assert path.read_bytes() == b"kept"
+    with pytest.raises(TrackingError, match=r"ends in .pdf or .png"):
+        print_markers(marker, tmp_path / "sheet.jpg")
+    with pytest.raises(TrackingError, match="there are A4, A3, letter"):
+        print_markers(marker, tmp_path / "other.png", "B5")
+    with pytest.raises(TrackingError, match="A4 has room for 190 × 255"):
+        sheets(RigidBody.grid("4X4_50", 5, 7, 0.04, 0.01))
+    with pytest.raises(TrackingError, match=r"make (it|them) larger"):
+        print_markers(RigidBody.single("4X4_50", 7, 0.002), tmp_path / "small.png")
+    assert [each.name for each in tmp_path.iterdir()] == ["sheet.png"]
+
+
+def test_the_command_prints(tmp_path, capsys):
+    out = tmp_path / "board.png"
+    options = ["--board", "charuco", "--size", "5x7", "--square", "30mm", "--marker", "15mm"]
+    assert main(["print-marker", *options, "--dictionary", "6X6_250", "--out", str(out)]) == 0
+    assert "ChArUco 5x7, squares 30 mm, markers 15 mm, 6X6_250; 1 sheet of A4" in (
+        capsys.readouterr().out
+    )
+    assert out.exists()
+    grip = tmp_path / "grip.yaml"
+    grip.write_text(
+        "{dictionary: 4X4_50, markers: [{id: 1, size: 30 mm}, {id: 2, size: 30 mm, "
+        "position: [0, 40 mm, 0], orientation: [0.6, 0, 0, 0.8]}]}"
+    )
+    assert main(["print-marker", str(grip), "--out", str(tmp_path / "grip.pdf")]) == 0
+    assert "4X4_50, 1, 2: 30 mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--board", "grid"], "--board grid needs --size"),
+        (["--board", "charuco", "--size", "5x7"], "--board charuco needs --square"),
+        (["--board", "grid", "--size", "five", "--separation", "5mm"], "write columns and rows"),
+        (["--marker", "40"], "--marker: 40 m is outside"),
+        (["--id", "99"], "dictionary 4X4_50 has only markers 0 to 49"),
+    ],
+)
+def test_bad_options_are_one_sentence(options, sentence, tmp_path, capsys):
+    assert main(["print-marker", *options, "--out", str(tmp_path / "a.pdf")]) == 1
+    assert sentence in capsys.readouterr().err

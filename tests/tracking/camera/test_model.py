@@ -1,0 +1,168 @@
+"""Lens models against OpenCV's, their derivatives and inverses, and camera info files."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera.info import read_camera_info, write_camera_info
+from us_sim.tracking.camera.model import CameraModel
+
+MATRIX = np.array([[600.0, 0, 320], [0, 610, 240], [0, 0, 1]])
+LENSES = {
+    "plumb_bob": [-0.3, 0.1, 0.01, -0.02, 0.05],
+    "rational_polynomial": [0.1, 0.02, 0.001, 0.002, 0.01, 0.05, 0.02, 0.01],
+    "equidistant": [0.1, 0.02, 0.01, 0.001],
+}
+
+
+def camera(model, lens=None):
+    return CameraModel(640, 480, MATRIX, LENSES[model] if lens is None else lens, model)
+
+
+def opencv_pixels(model, points):
+    still = np.zeros(3)
+    if model == "equidistant":
+        lens = np.array(LENSES[model])
+        return cv2.fisheye.projectPoints(points[:, None], still, still, MATRIX, lens)[0][:, 0]
+    return cv2.projectPoints(points, still, still, MATRIX, np.array(LENSES[model]))[0][:, 0]
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).uniform([-0.3, -0.3, 0.7], [0.3, 0.3, 1.3], (50, 3))
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_points_are_where_opencv_sees_them(model, points):
+    assert np.allclose(camera(model).project(points), opencv_pixels(model, points), atol=1e-9)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_derivative_is_that_of_the_pixels(model, points):
+    slopes = camera(model).linearise(points)[1]
+    steps = 1e-6 * np.eye(3)
+    measured = [
+        (camera(model).project(points + step) - camera(model).project(points - step)) / 2e-6
+        for step in steps
+    ]
+    assert np.allclose(slopes, np.stack(measured, axis=-1), atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from(sorted(LENSES)), st.floats(-0.5, 0.5), st.floats(-0.4, 0.4), st.floats(0.1, 9)
+)
+def test_the_ray_of_a_pixel_leads_back_to_the_point(model, x, y, depth):
+    pixel = camera(model).project(np.array([[x * depth, y * depth, depth]]))
+    assert np.allclose(camera(model).rays(pixel), [[x, y]], atol=1e-9)
+
+
+def test_a_fisheye_sees_beyond_a_right_angles_half():
+    wide = CameraModel(
+        1000, 1000, [[300, 0, 500], [0, 300, 500], [0, 0, 1]], np.zeros(4), "equidistant"
+    )
+    # 80 degrees from the axis: 300 × 80° in radians from the middle.
+    pixel = np.array([[500 + 300 * np.radians(80), 500.0]])
+    assert np.allclose(wide.rays(pixel), [[np.tan(np.radians(80)), 0.0]], atol=1e-6)
+
+
+def test_what_is_behind_the_camera_or_beyond_its_lens_is_nowhere():
+    assert np.isnan(camera("plumb_bob").project(np.array([[0.0, 0.0, -1.0]]))).all()
+    # With k1 = -0.3 alone radii grow up to 1 / sqrt(0.9), where they are 0.703.
+    folded = camera("plumb_bob", [-0.3, 0, 0, 0])
+    assert np.isfinite(folded.rays(np.array([[320 + 600 * 0.70, 240.0]]))).all()
+    assert np.isnan(folded.rays(np.array([[320 + 600 * 0.71, 240.0]]))).all()
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_file_gives_back_the_camera(model, tmp_path):
+    write_camera_info(tmp_path / "camera.yaml", camera(model))
+    again = read_camera_info(tmp_path / "camera.yaml")
+    assert (again.width, again.height, again.distortion_model) == (640, 480, model)
+    assert np.array_equal(again.matrix, MATRIX)
+    assert np.array_equal(again.distortion, LENSES[model])
+    with pytest.raises(TrackingError, match=r"camera.yaml: exists already"):
+        write_camera_info(tmp_path / "camera.yaml", camera(model))
+
+
+def test_the_file_of_ros_camera_calibration_is_read(tmp_path):
+    path = tmp_path / "head_camera.yaml"
+    path.write_text(
+        """image_width: 640
+image_height: 480
+camera_name: head_camera
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [452.5, 0.0, 317.7, 0.0, 456.8, 277.8, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.121, -1.085, 0.0001, -0.0005, 2.954]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [452.5, 0, 317.7, 0, 0, 456.8, 277.8, 0, 0, 0, 1, 0]
+"""
+    )
+    read = read_camera_info(path)
+    assert read.matrix[1].tolist() == [0.0, 456.8, 277.8]
+    assert read.distortion.tolist() == [0.121, -1.085, 0.0001, -0.0005, 2.954]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((640, 480, np.zeros(9), np.zeros(5)), "is not calibrated: its focal length is zero"),
+        ((0, 480, MATRIX, np.zeros(5)), "width is 0"),
+        ((640, 480, MATRIX[:2], np.zeros(5)), "has 6 numbers"),
+        ((640, 480, MATRIX.T, np.zeros(5)), r"must be \[\[fx, skew, cx\]"),
+        ((640, 480, MATRIX, np.zeros(3)), "has 3 coefficients; plumb_bob has 4 or 5"),
+        ((640, 480, MATRIX, np.zeros(4), "omnidirectional"), "'omnidirectional' is not known"),
+        ((640, 480, MATRIX, [np.nan, 0, 0, 0]), "the distortion is not finite"),
+        ((640, 480, "wide", np.zeros(5)), "the camera matrix must be numbers"),
+    ],
+)
+def test_what_is_no_camera_is_refused(arguments, sentence):
+    with pytest.raises(TrackingError, match=sentence):
+        CameraModel(*arguments)
+
+
+def test_a_driver_without_calibration_data_is_an_ideal_pinhole():
+    assert CameraModel(640, 480, MATRIX, [], "").distortion.tolist() == [0.0] * 5
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("- 1", "it must be a mapping"),
+        ("a: [", "not a YAML file"),
+        ("image_width: 640", "image_height is missing"),
+        (
+            "{image_width: 640, image_height: 48.5, camera_matrix: 0, distortion_coefficients: 0}",
+            "must be whole",
+        ),
+        (
+            "{image_width: 640, image_height: 48, camera_matrix: 0, distortion_coefficients: 0}",
+            "camera_matrix must be a mapping",
+        ),
+    ],
+)
+def test_a_bad_file_is_refused(text, sentence, tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(TrackingError, match=f"camera.yaml: .*{sentence}"):
+        read_camera_info(path)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(TrackingError, match=r"none.yaml: No such file"):
+        read_camera_info(tmp_path / "none.yaml")

@@ -1,0 +1,124 @@
+"""Rendered camera views, against OpenCV's projection and known amounts of light and noise."""
+
+import cv2
+import numpy as np
+import pytest
+
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.rendered_views import SHARP, Conditions, RenderedView
+from us_sim.tracking.camera.rigid_body import RigidBody
+
+MATRIX = np.array([[600.0, 0, 322.3], [0, 604.0, 238.1], [0, 0, 1]])
+LENS = np.array([-0.25, 0.08, 0.0012, -0.0009, 0.01])
+FACING = [1.0, 0.0, 0.0, 0.0]  # of a single marker's frame, whose z comes out of the paper
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return CameraModel(640, 480, MATRIX, LENS)
+
+
+@pytest.fixture(scope="module")
+def marker(camera):
+    return RenderedView(camera, RigidBody.single("4X4_50", 7, 0.04))
+
+
+@pytest.mark.parametrize("turn", [[0.05, 0.02, 0.2], [0.4, -0.2, 0.3], [-0.1, 0.5, -2.0]])
+def test_corners_are_where_opencv_projects_them(camera, turn):
+    body = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.012)  # no marker near a corner
+    rotation, _ = cv2.Rodrigues(np.array(turn))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, [0.01, -0.02, 0.35]
+    matrix[:3, 3] -= rotation @ body.chessboard.corners.mean(axis=0)
+    # OpenCV finds corners best where the lens is a little out of focus.
+    soft = Conditions(defocus=1.0, read_noise=0, shot_noise=0)
+    image = RenderedView(camera, body).render(Pose.from_matrix(matrix), soft)
+    expected, _ = cv2.projectPoints(
+        body.chessboard.corners, np.array(turn), matrix[:3, 3], MATRIX, LENS
+    )
+    expected = expected.reshape(-1, 2)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    found = cv2.cornerSubPix(image, np.float32(expected), (8, 8), (-1, -1), stop)
+    assert len(found) == 12
+    np.testing.assert_allclose(found, expected, atol=0.05)
+    assert np.abs((found - expected).mean(axis=0)).max() < 0.01
+
+
+def test_the_black_of_a_marker_covers_its_projected_area():
+    camera = CameraModel(200, 200, [[500, 0, 99.6], [0, 500, 98.9], [0, 0, 1]])
+    body = RigidBody.single("4X4_50", 7, 0.04)
+    view = RenderedView(camera, body)
+    code = cv2.aruco.generateImageMarker(
+        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6
+    )
+    tilted = Pose([0.003, 0.001, 0.4], [np.cos(0.3), 0.0, np.sin(0.3), 0.0])
+    for pose in (Pose([0.0, 0.0, 0.4], FACING), tilted):
+        image = view.render(pose, SHARP)[50:150, 50:150].astype(float)
+        corners = camera.project(pose.apply(body.corners[0])).astype(np.float32)
+        margin = camera.project(pose.apply(body.corners[0] * 8 / 6)).astype(np.float32)
+        # Within the white margin there are two greys only, so their mean tells the black area.
+        inside = cv2.fillConvexPoly(
+            np.zeros((200, 200)), np.int32(np.round(0.97 * margin + 0.03 * margin.mean(0))), 1
+        )[50:150, 50:150]
+        white, black = image[inside > 0].max(), image[inside > 0].min()
+        area = ((white - image) * inside).sum() / (white - black)
+        # Perspective shrinks far cells by as much as it enlarges near ones, but for 1 %.
+        expected = cv2.contourArea(corners) * (code == 0).mean()
+        assert area == pytest.approx(expected, rel=0.012)
+
+
+def test_the_noise_is_as_strong_as_it_is_said_to_be(marker):
+    pose = Pose([0.0, 0.0, 0.3], FACING)
+    clean = marker.render(pose, SHARP).astype(float)
+    noisy = marker.render(pose, Conditions(defocus=0, read_noise=2.0, shot_noise=0.03), seed=3)
+    squares = (noisy - clean) ** 2
+    for low, high in ((20, 30), (60, 90), (120, 160)):
+        here = (clean >= low) & (clean < high)
+        # Rounding to grey levels adds a twelfth to each of the two.
+        expected = 4.0 + 0.03 * clean[here].mean() + 1 / 12 + 1 / 12
+        assert squares[here].mean() == pytest.approx(expected, rel=0.05)
+
+
+def test_the_same_arguments_give_the_same_bytes(camera, marker):
+    pose = Pose([0.01, 0.0, 0.3], FACING)
+    worst = Conditions(gradient=0.5, occlusion=0.3)
+    motion = np.array([0.003, 0, 0, 0, 0, 0.02])
+    first = marker.render(pose, worst, 5, motion)
+    again = RenderedView(camera, marker.body).render(pose, worst, 5, motion)
+    np.testing.assert_array_equal(first, again)
+    assert (first != marker.render(pose, worst, 6, motion)).mean() > 0.5
+
+
+def test_the_light_falls_by_the_gradient(marker):
+    pose = Pose([0.0, 0.0, 0.3], FACING)
+    even = Conditions(defocus=0, read_noise=0, shot_noise=0)
+    full = marker.render(pose, even).astype(float)
+    dimmed = marker.render(pose, Conditions(0, 0, 0, gradient=0.6), seed=2)
+    share = (dimmed / full)[full > 60]
+    assert share.min() == pytest.approx(0.4, abs=0.02)
+    assert share.max() == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_hand_covers_a_share_of_the_marker(camera, marker):
+    pose = Pose([0.0, 0.0, 0.25], FACING)
+    corners = camera.project(pose.apply(marker.body.corners[0]))
+    inside = cv2.fillConvexPoly(np.zeros((480, 640)), np.int32(corners), 1) > 0
+    free = marker.render(pose, SHARP)[inside]
+    shares = []
+    for seed in range(12):
+        covered = marker.render(pose, Conditions(0, 0, 0, occlusion=0.5), seed)[inside]
+        shares.append((covered != free).mean())
+    assert np.mean(shares) == pytest.approx(0.45, abs=0.15)
+
+
+def test_motion_smears_edges_over_the_way_that_they_go(marker):
+    pose = Pose([0.0, 0.0, 0.3], FACING)
+    still = marker.render(pose, SHARP)[240].astype(float)
+    moved = marker.render(pose, SHARP, motion=np.array([0.003, 0, 0, 0, 0, 0]))[240]
+    edge = int(np.argmax(still[280:330] - still[281:331])) + 280  # from margin to black
+    half = (moved[edge - 12 : edge + 12] > moved[edge - 12 : edge + 12].min() + 3).argmin()
+    ramp = np.diff(moved[edge - 12 : edge + 12].astype(float))
+    assert half > 12  # black begins later than it does at rest
+    # 3 mm at 0.3 m are 6 pixels.
+    assert 5 <= (ramp < -5).sum() <= 8

@@ -1,0 +1,158 @@
+"""Bodies of markers and the files that describe them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera.markers import dictionary, family, proper_name
+from us_sim.tracking.camera.rigid_body import RigidBody
+from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+
+
+def test_boards_are_where_opencv_has_them():
+    board = cv2.aruco.GridBoard((4, 5), 0.0375, 0.005, dictionary("6X6_1000"))
+    ours = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
+    assert np.allclose(ours.corners, np.array(board.getObjPoints()), atol=1e-7)
+    assert np.array_equal(ours.ids, np.ravel(board.getIds()))
+
+
+def test_a_markers_normal_points_to_who_sees_its_front():
+    # Of a single marker y is up and z out of the paper; of a board y is down and z into it.
+    assert np.allclose(RigidBody.single("4X4_50", 3, 0.04).normals, [[0, 0, 1]])
+    assert np.allclose(RigidBody.grid("4X4_50", 2, 1, 0.04, 0.01).normals, [[0, 0, -1]] * 2)
+    assert np.allclose(RigidBody.charuco("4X4_50", 3, 3, 0.04, 0.02).normals, [[0, 0, -1]] * 4)
+
+
+def test_dictionaries_are_known_by_opencvs_names():
+    assert proper_name("DICT_APRILTAG_36H11") == "APRILTAG_36h11"
+    assert family("6X6_250") == "6X6_1000"
+    assert family("APRILTAG_36h11") == "APRILTAG_36h11"
+    small, large = dictionary("5X5_50").bytesList, dictionary("5X5_1000").bytesList
+    assert np.array_equal(small, large[:50])
+    with pytest.raises(TrackingError, match="no marker dictionary '8X8_50'; choose one of 4X4_50"):
+        RigidBody.single("8X8_50", 0, 0.04)
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        (lambda: RigidBody.single("4X4_50", 50, 0.04), "only markers 0 to 49"),
+        (lambda: RigidBody.single("4X4_50", 0, 40), r"did you mean '40 mm'"),
+        (lambda: RigidBody.grid("4X4_50", 8, 7, 0.04, 0.01), "marker 50: dictionary"),
+        (lambda: RigidBody.grid("4X4_50", 0, 7, 0.04, 0.01), "columns are 0"),
+        (lambda: RigidBody.grid("4X4_50", 2, 2, 0.04, -1), "separation of a board's markers is -1"),
+        (lambda: RigidBody.charuco("4X4_50", 5, 7, 0.02, 0.04), "must be smaller than its squares"),
+        (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((1, 4, 3))), "length of an edge"),
+        (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((4, 3))), "4 corners of 3"),
+    ],
+)
+def test_an_impossible_body_is_refused(body, sentence):
+    with pytest.raises(TrackingError, match=sentence):
+        body()
+
+
+def test_corners_out_of_order_or_plane_are_refused():
+    corners = RigidBody.single("4X4_50", 1, 0.04).corners[0]
+    with pytest.raises(TrackingError, match="marker 1: its corners are no convex quadrilateral"):
+        RigidBody("4X4_50", np.array([1]), corners[[0, 2, 1, 3]][None])
+    bent = corners.copy()
+    bent[[0, 2], 2] = 0.01
+    with pytest.raises(TrackingError, match="not in one plane"):
+        RigidBody("4X4_50", np.array([1]), bent[None])
+    with pytest.raises(TrackingError, match="marker 1 is in the body twice"):
+        RigidBody("4X4_50", np.array([1, 1]), np.stack([corners, corners]))
+
+
+def test_a_table_of_millimetres_is_read(tmp_path):
+    # The first marker of scikit-surgery's pointer, y downwards.
+    row = "208\t-17.5\t-8.75\t0\t-24.75\t-16\t0\t-10.25\t-16\t0\t-10.25\t-1.5\t0\t-24.75\t-1.5\t0\n"
+    path = tmp_path / "pointer.txt"
+    path.write_text(row)
+    body = read_rigid_body(path)
+    assert (body.dictionary, body.ids.tolist()) == ("ARUCO_ORIGINAL", [208])
+    assert np.allclose(body.corners[0, 0], [-0.02475, -0.016, 0.0])
+    assert np.allclose(body.centres[0], [-0.0175, -0.00875, 0.0])
+    assert np.allclose(body.normals[0], [0.0, 0.0, -1.0])
+
+
+def test_a_marker_map_as_plus_takes_it_is_read(tmp_path):
+    path = tmp_path / "map.yml"
+    path.write_text(
+        """%YAML:1.0
+---
+aruco_bc_dict: ARUCO_MIP_36h12
+aruco_bc_nmarkers: 1
+aruco_bc_mInfoType: 1
+aruco_bc_markers:
+   - { id:81, corners:[ [ -0.02, 0.02, 0. ], [ 0.02, 0.02, 0. ],
+       [ 0.02, -0.02, 0. ], [ -0.02, -0.02, 0. ] ] }
+""".replace("id:81", "id: 81").replace("corners:[", "corners: [")
+    )
+    body = read_rigid_body(path)
+    assert (body.dictionary, body.ids.tolist()) == ("ARUCO_MIP_36h12", [81])
+    assert np.allclose(body.corners, RigidBody.single("ARUCO_MIP_36h12", 81, 0.04).corners)
+    path.write_text(path.read_text().replace("InfoType: 1", "InfoType: 0"))
+    with pytest.raises(TrackingError, match="its markers are in pixels"):
+        read_rigid_body(path)
+
+
+def test_markers_are_placed_by_their_poses(tmp_path):
+    path = tmp_path / "grip.yaml"
+    path.write_text(
+        """dictionary: APRILTAG_36h11
+markers:
+  - {id: 4, size: 30 mm, position: [10 mm, 0, 0], orientation: [0, 0.70710678, 0, 0.70710678]}
+"""
+    )
+    body = read_rigid_body(path)
+    assert np.allclose(body.corners[0, 0], [0.01, 0.015, 0.015])
+    assert np.allclose(body.normals[0], [1.0, 0.0, 0.0])
+
+
+def test_boards_are_read(tmp_path):
+    path = tmp_path / "board.yaml"
+    path.write_text(
+        "{dictionary: 6X6_250, board: {kind: charuco, columns: 5, rows: 7, square: 40 mm, "
+        "size: 20 mm}}"
+    )
+    body = read_rigid_body(path)
+    assert len(body.chessboard.corners) == 24
+    assert np.allclose(body.chessboard.corners[0], [0.04, 0.04, 0.0])
+    path.write_text(
+        "board: {kind: grid, columns: 2, rows: 1, size: 30 mm, separation: 6 mm, first: 7}"
+    )
+    assert read_rigid_body(path, "4X4_50").ids.tolist() == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("a.txt", "", "there is no marker in it"),
+        ("a.txt", "1 2 3", "line 1: a marker has 16 numbers"),
+        ("a.txt", "# markers\none 2 3", "line 2: 'one 2 3' is not a row of numbers"),
+        ("a.yaml", "[1]", "must be a mapping"),
+        ("a.yaml", "{a: [", "not a YAML file"),
+        ("a.yaml", "dictionary: 4X4_50", "either markers or board"),
+        ("a.yaml", "{markers: [], sizes: 3}", "sizes is not known"),
+        ("a.yaml", "markers: []", "must be a list of markers"),
+        ("a.yaml", "markers: [{size: 30 mm}]", r"markers\[0\].id: None is not a marker's number"),
+        ("a.yaml", "markers: [{id: 1, size: 30}]", r"markers\[0\].size: .*did you mean '30 mm'"),
+        ("a.yaml", "markers: [{id: 1, size: 0.03, position: 3}]", "must be 3 lengths"),
+        ("a.yaml", "markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]", "is zero"),
+        ("a.yaml", "markers: [{id: 1, corners: [[0, 0, 0]]}]", "must be 4 × 3 numbers"),
+        ("a.yaml", "board: {kind: chess}", "'chess' is not one of grid, charuco"),
+        ("a.yaml", "board: {kind: grid, columns: 2}", "board: rows is missing"),
+        (
+            "a.yaml",
+            "board: {kind: grid, columns: 2.5, rows: 2, size: 0.03, separation: 0.01}",
+            "2.5 is not a whole number",
+        ),
+        ("a.yaml", "{dictionary: 9X9, markers: [{id: 1, size: 0.03}]}", "dictionary '9X9'"),
+    ],
+)
+def test_a_bad_file_is_refused(name, text, sentence, tmp_path):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(TrackingError, match=f"{name}: .*{sentence}"):
+        read_rigid_body(path)

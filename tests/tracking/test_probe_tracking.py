@@ -1,0 +1,328 @@
+"""From measurements to the probe: frames, covariances, order, outliers, and what restarts it."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import PoseError, TrackingError
+from us_sim.geometry import se3
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.filter.outlier_gate import OutlierGate
+from us_sim.tracking.filter.pose_filter import make_filter
+from us_sim.tracking.filter.settings import FILTER_METHODS, FilterSettings, GateSettings
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.probe_tracking import ProbeTracking
+from us_sim.tracking.state import TrackingState
+
+MS = 1_000_000
+START = 5_000_000_000
+
+
+def tracking(method="none", gate=None, **kwargs):
+    gate = OutlierGate(gate) if gate else None
+    return ProbeTracking(Pose(), Pose(), make_filter(FilterSettings(method)), gate, **kwargs)
+
+
+def at(ms, x=0.0, covariance=None):
+    return Measurement(START + round(ms * MS), Pose([x, 0.0, 0.0]), covariance)
+
+
+def take(tracked, *measurements):
+    return [tracked.take(m, m.stamp) for m in measurements]
+
+
+numbers = st.floats(-1.0, 1.0)
+twists = st.tuples(*[numbers] * 6).map(np.array)
+
+
+@settings(max_examples=40, deadline=None)
+@given(twists, twists, twists)
+def test_the_probe_is_where_registration_body_and_calibration_put_it(a, b, c):
+    registration, body, calibration = se3.exp(a), se3.exp(b), se3.exp(c)
+    tracked = ProbeTracking(registration, calibration, make_filter(FilterSettings()))
+    probe = tracked.take(Measurement(START, body), START)
+    expected = registration.matrix @ body.matrix @ calibration.matrix
+    np.testing.assert_allclose(probe.pose.matrix, expected, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_the_probe_in_patient():
+    """Against slopes by differences of the composed pose."""
+    rng = np.random.default_rng(3)
+    registration = Pose([0.3, -0.2, 0.5], [0.4, -0.2, 0.1, 0.8])
+    calibration = Pose([0.02, 0.01, 0.15], [0.1, 0.7, -0.3, 0.2])
+    body = Pose([0.1, 0.2, 0.6], [-0.3, 0.2, 0.5, 0.7])
+    root = np.diag([2e-4, 3e-4, 9e-4, 3e-3, 2e-3, 1e-3]) @ (
+        np.eye(6) + 0.4 * rng.normal(size=(6, 6))
+    )
+    covariance = root @ root.T
+    tracked = ProbeTracking(registration, calibration, make_filter(FilterSettings()))
+    told = tracked.take(Measurement(START, body, covariance, error=0.4), START)
+    slopes = np.empty((6, 6))
+    step = 1e-6
+    for k, way in enumerate(step * np.eye(6)):
+        ahead, behind = (
+            registration
+            @ Pose(
+                body.position + s * way[:3],
+                se3.product(se3.rotation_exp(s * way[3:]), body.orientation),
+            )
+            @ calibration
+            for s in (1, -1)
+        )
+        turn = se3.rotation_between(behind.orientation, ahead.orientation)
+        slopes[:, k] = np.r_[ahead.position - behind.position, turn] / (2 * step)
+    expected = slopes @ covariance @ slopes.T
+    np.testing.assert_allclose(told.covariance, expected, rtol=1e-6, atol=1e-12)
+    assert told.error == 0.4
+
+
+def test_the_time_offset_is_added_to_the_stamp_and_to_nothing_else():
+    tracked = tracking(time_offset=-0.0125)
+    probe = tracked.take(at(0), START + 3 * MS)
+    assert probe.stamp == START - 12_500_000
+    assert tracked.state(START + 302 * MS) is TrackingState.TRACKED
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(-2500, 1500), st.floats(-0.05, 0.05)), max_size=25),
+    st.sampled_from(FILTER_METHODS),
+)
+def test_no_pose_is_published_but_under_its_own_stamp(steps, method):
+    tracked, stamp, newest = tracking(method, GateSettings(), time_offset=0.5), START * 10, None
+    for step, x in steps:
+        stamp += step * MS
+        probe = tracked.take(Measurement(stamp, Pose([x, 0.0, 0.0])), stamp)
+        late = newest is not None and -1000 * MS < stamp - newest <= 0
+        if late:
+            assert probe is None
+        else:
+            newest = stamp
+        assert probe is None or probe.stamp == stamp + 500 * MS
+
+
+def test_what_is_not_newer_is_refused_and_counted():
+    tracked = tracking()
+    answers = take(tracked, at(0), at(0), at(-999), at(10), at(5))
+    assert [answer is None for answer in answers] == [False, True, True, False, True]
+    assert tracked.refused == {"order": 3}
+    assert tracked.last_problem == "the pose is not newer than the one before it"
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+def test_stamps_that_jump_back_start_everything_anew(method):
+    tracked = tracking(method, GateSettings())
+    take(tracked, *(at(10 * k, 0.001 * k) for k in range(300)))
+    again = at(-1000, 0.9)  # another place, which is no outlier: the source was started again
+    assert take(tracked, again)[0].pose.position[0] == 0.9
+    assert tracked.refused == {}
+    assert tracked.restarts == {"stamp": 1}
+    follow = take(tracked, at(-990, 0.9))[0]
+    assert follow.pose.position[0] == pytest.approx(0.9, abs=1e-9)
+
+
+def test_a_looping_recording_gives_the_same_poses_each_time():
+    rng = np.random.default_rng(6)
+    recording = [at(20 * k, x) for k, x in enumerate(np.cumsum(rng.normal(0, 1e-3, 100)))]
+    tracked = tracking("one_euro", GateSettings())
+    first, second = take(tracked, *recording), take(tracked, *recording)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.pose.matrix, b.pose.matrix)
+    assert tracked.restarts == {"stamp": 1}
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+def test_after_it_was_lost_it_starts_where_it_is_found(method):
+    tracked = tracking(method, GateSettings(), lost_after=0.5)
+    take(tracked, *(at(10 * k, 0.001 * k) for k in range(50)))
+    assert tracked.state(at(490 + 499).stamp) is TrackingState.COASTING
+    assert tracked.state(at(490 + 500).stamp) is TrackingState.LOST
+    found = at(1000, 3.0)
+    assert take(tracked, found)[0].pose.position[0] == 3.0
+    assert tracked.state(found.stamp) is TrackingState.TRACKED
+    assert tracked.restarts == {"gap": 1}
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+def test_a_real_jump_locks_nothing_out_and_is_not_smeared(method):
+    """Refused at first; then the filter starts at the new place and not between the two."""
+    tracked = tracking(method, GateSettings(accept_after=5))
+    take(tracked, *(at(10 * k) for k in range(100)))
+    answers = take(tracked, *(at(1000 + 10 * k, 0.8) for k in range(6)))
+    assert [answer is None for answer in answers] == [True] * 4 + [False] * 2
+    assert answers[4].pose.position[0] == 0.8
+    assert answers[5].pose.position[0] == pytest.approx(0.8, abs=1e-12)
+    assert tracked.refused == {"gate": 4}
+    assert tracked.restarts == {"place": 1}
+
+
+def test_while_all_is_refused_it_coasts():
+    tracked = tracking(gate=GateSettings(accept_after=1000))
+    take(tracked, *(at(10 * k) for k in range(10)))
+    states = []
+    for k in range(10, 60):
+        there = at(10 * k, 5.0 + k)
+        assert take(tracked, there) == [None]
+        states.append(tracked.state(there.stamp))
+    assert states[28] is TrackingState.TRACKED
+    assert states[29] is TrackingState.COASTING  # 0.3 s after the last that was believed
+
+
+def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
+    rng = np.random.default_rng(8)
+    tracked = tracking("one_euro", GateSettings())
+    take(tracked, *(at(20 * k) for k in range(10)))
+    nonsense = take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(200) + 1)))
+    assert nonsense == [None] * 200
+    assert tracked.state(at(4200).stamp) is TrackingState.LOST
+    answers = take(tracked, *(at(4200 + 20 * k, 0.3) for k in range(6)))
+    assert [answer is None for answer in answers] == [True] * 4 + [False] * 2
+    assert answers[4].pose.position[0] == 0.3
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+def test_after_nonsense_the_filter_starts_where_the_probe_is_found(method):
+    rng = np.random.default_rng(8)
+    tracked = tracking(method, GateSettings())
+    take(tracked, *(at(20 * k, 0.001 * k) for k in range(10)))
+    take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(100) + 1)))
+    found = take(tracked, at(2200, 0.02))[0]
+    assert found.pose.position[0] == 0.02
+    assert tracked.restarts == {"gap": 1}
+
+
+def test_zeros_for_a_covariance_mean_that_nothing_is_known():
+    assert take(tracking(), at(0, covariance=np.zeros((6, 6))))[0].covariance is None
+
+
+def test_after_a_reset_it_waits():
+    tracked = tracking("kalman", GateSettings())
+    take(tracked, at(0))
+    tracked.reset()
+    assert tracked.state(START) is TrackingState.WAITING
+    assert take(tracked, at(-500, 4.0))[0].pose.position[0] == 4.0
+
+
+def test_a_covariance_of_no_distribution_is_refused():
+    tracked = tracking("kalman", GateSettings())
+    bad = np.eye(6) * 1e-6
+    bad[0, 1] = bad[1, 0] = 2e-6
+    assert take(tracked, at(0, covariance=bad)) == [None]
+    assert tracked.refused == {"covariance": 1}
+    assert tracked.last_problem == "the pose's covariance has a negative variance"
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("unknown", [0.0, 1e9, 1.7e308])
+def test_covariances_that_say_nothing_do_no_harm(method, unknown):
+    tracked = tracking(method, GateSettings())
+    nothing = unknown * np.eye(6)
+    for k in range(20):
+        take(tracked, at(10 * k, 0.0005 * k, covariance=nothing))
+    known = np.diag([1e-8] * 3 + [1e-6] * 3)
+    for k in range(20, 80):
+        answer = take(tracked, at(10 * k, 0.0005 * k, covariance=known))[0]
+    assert answer.pose.position[0] == pytest.approx(0.0395, abs=1e-3)
+    assert tracked.refused == {}
+
+
+def test_a_plane_without_covariance_is_still_a_distribution():
+    """Drivers that know the position only leave zeros for the rotation."""
+    half_known = np.diag([1e-6] * 3 + [0.0] * 3)
+    tracked = tracking("kalman", GateSettings())
+    answers = take(tracked, *(at(10 * k, covariance=half_known) for k in range(50)))
+    assert all(answers)
+
+
+def test_poses_that_never_were_are_counted_beside_the_others():
+    tracked = tracking()
+    for position, orientation in (
+        ([np.nan, 0, 0], [0, 0, 0, 1]),
+        ([0, 0, 0], [0, 0, 0, 0]),
+        ([0, 0, 0], [0, 0, np.inf, 1]),
+    ):
+        with pytest.raises(PoseError) as error:
+            Pose(position, orientation)
+        tracked.refuse("pose", str(error.value))
+    assert tracked.refused == {"pose": 3}
+    assert "not finite" in tracked.last_problem
+    assert tracked.state(0) is TrackingState.WAITING
+
+
+def test_times_that_make_no_sense_are_refused():
+    with pytest.raises(TrackingError, match="time offset of a tracker is nan s"):
+        tracking(time_offset=float("nan"))
+    with pytest.raises(TrackingError, match="coasts after 2 s"):
+        tracking(coast_for=2.0, lost_after=1.0)
+
+
+@pytest.fixture(scope="module")
+def recorded(shared_data):
+    """Seconds and (4, 4) matrices, mm, of the transforms of a PLUS recording of 500 samples.
+
+    Sample 7 is invalid: its transforms are the identity. So is the first of the stylus.
+    """
+    file = shared_data / "plus-tracker-recordings" / "TransformInterpolationTest.igs.mha"
+    if not file.is_file():
+        pytest.skip(f"no recording: {file} is not there")
+    header = file.read_bytes().split(b"ElementDataFile")[0].decode("latin-1")
+    times = np.array(re.findall(r"_Timestamp = (\S+)", header), dtype=float)
+    matrices = {
+        name: np.array(
+            [row.split() for row in re.findall(rf"_{name} = ([^\n]*)", header)], dtype=float
+        ).reshape(-1, 4, 4)
+        for name in ("ProbeToTrackerTransform", "ReferenceToTrackerTransform", "Stylus")
+    }
+    return times, matrices
+
+
+@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize(
+    ("name", "refused"),
+    [
+        ("ProbeToTrackerTransform", [7]),
+        ("ReferenceToTrackerTransform", [7]),
+        ("Stylus", [1, 7]),  # 0 is believed, as nothing is known then, and outvoted by 1 and 2
+    ],
+)
+def test_outliers_of_a_real_tracker_are_refused_and_counted(recorded, method, name, refused):
+    times, matrices = recorded
+    assert len(times) == len(matrices[name]) == 500
+    tracked = tracking(method, GateSettings())
+    answers = []
+    for time, matrix in zip(times, matrices[name], strict=True):
+        pose = Pose(1e-3 * matrix[:3, 3], Pose.from_matrix(matrix).orientation)
+        stamp = round(1e9 * time)
+        answers.append(tracked.take(Measurement(stamp, pose), stamp))
+    assert [k for k, answer in enumerate(answers) if answer is None] == refused
+    assert tracked.refused == {"gate": len(refused)}
+    assert tracked.restarts == ({"place": 1} if name == "Stylus" else {})
+    raw = np.array([1e-3 * matrix[:3, 3] for matrix in matrices[name]])
+    off = [
+        np.linalg.norm(answer.pose.position - raw[k])
+        for k, answer in enumerate(answers)
+        if answer is not None
+    ]
+    assert max(off) < 0.02  # m: no filter drags an outlier along
+
+
+def test_a_matrix_of_zeros_is_no_pose(recorded):
+    """What PLUS writes where a transform could not be computed, in a real stream of poses."""
+    times, matrices = recorded
+    tracked = tracking("one_euro", GateSettings())
+    for k in range(8, 108):
+        matrix = matrices["ProbeToTrackerTransform"][k].copy()
+        if k % 10 == 0:
+            matrix[:] = 0.0
+        try:
+            pose = Pose.from_matrix(matrix)
+        except PoseError as error:
+            tracked.refuse("pose", str(error))
+            continue
+        pose = Pose(1e-3 * pose.position, pose.orientation)
+        stamp = round(1e9 * times[k])
+        assert tracked.take(Measurement(stamp, pose), stamp) is not None
+    assert tracked.refused == {"pose": 10}

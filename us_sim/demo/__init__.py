@@ -1,0 +1,1 @@
+"""The demo: the video its camera sees, what its session shows, one picture of it."""

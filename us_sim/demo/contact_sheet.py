@@ -1,0 +1,104 @@
+"""One picture of a session: images before, during and after the press, and the lumen areas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from us_sim.demo.session import LumenAreas, Session
+from us_sim.errors import BagError
+from us_sim.scene.building import probe_of
+from us_sim.scene.scene import Scene
+
+__all__ = ["contact_sheet"]
+
+COLOURS = {"vein": "tab:blue", "artery": "tab:red"}
+
+
+def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
+    """Write the picture as PNG.
+
+    Raises:
+        BagError: the session has no image.
+    """
+    moments = _moments(session)
+    figure = Figure(figsize=(15, 9 if areas is None else 12.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = 2 if areas is None else 3
+    grid = figure.add_gridspec(rows, 3, height_ratios=[1.0, 1.0, 0.55][:rows])
+    probe = probe_of(scene)
+    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
+    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
+    first = min(session.poses)
+    images = session.images_at({stamp for _, stamp in moments})
+    for i, (title, stamp) in enumerate(moments):
+        axes = figure.add_subplot(grid[divmod(i, 3)])
+        axes.imshow(
+            images[stamp],
+            cmap="gray",
+            vmin=0,
+            vmax=255,
+            extent=(left, right, bottom, top),
+        )
+        press = session.poses[stamp].position[2] * 1e3
+        axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, probe at {press:+.1f} mm")
+        axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
+        axes.tick_params(labelsize=8)
+        if i % 3 == 0:
+            axes.set_ylabel("depth, mm")
+    if areas is not None:
+        _plot_areas(figure.add_subplot(grid[2, :]), areas, [(s - first) * 1e-9 for _, s in moments])
+    figure.suptitle(f"us_sim: {scene.name} ({scene.volume_name})", fontsize=15)
+    figure.savefig(file, dpi=80)
+
+
+def _moments(session: Session) -> list[tuple[str, int]]:
+    """Six stamps of images that tell the story of the press."""
+    stamps = [stamp for stamp in session.images if stamp in session.poses]
+    if not stamps:
+        raise BagError("the session holds no image with a pose, so there is nothing to show")
+    depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
+    deepest = depth.max()
+    full = int(np.argmax(depth >= deepest - 1e-4))
+    last_full = len(depth) - 1 - int(np.argmax(depth[::-1] >= deepest - 1e-4))
+    half = int(np.argmin(np.abs(depth[: full + 1] - deepest / 2)))
+    touch = int(np.argmin(np.abs(depth[: full + 1])))
+    picked = [
+        ("before", 0),
+        ("touching", touch),
+        ("pressing", half),
+        ("full press", full),
+        ("sliding", (full + last_full) // 2 + (last_full - full) // 8),
+        ("after", len(stamps) - 1),
+    ]
+    return [(title, stamps[i]) for title, i in picked]
+
+
+def _caption(areas: LumenAreas | None, time: float) -> str:
+    if areas is None:
+        return "lateral, mm"
+    sample = int(np.argmin(np.abs(areas.time - time)))
+    return ",   ".join(
+        f"{name} {area[sample] * 1e6:.1f} mm² ({area[sample] / area[areas.rest] * 100:.0f} %)"
+        for name, area in areas.area.items()
+    )
+
+
+def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type: ignore[no-untyped-def]
+    for name, area in areas.area.items():
+        share = area / area[areas.rest] * 100
+        axes.plot(areas.time, share, color=COLOURS.get(name), label=f"{name} lumen", lw=2)
+    axes.set_ylabel("area, % of rest")
+    axes.set_xlabel("time, s")
+    axes.set_ylim(bottom=0)
+    axes.margins(x=0.01)
+    for time in moments:
+        axes.axvline(time, color="0.8", lw=1, zorder=0)
+    press = axes.twinx()
+    press.plot(areas.time, areas.depth * 1e3, color="0.5", ls="--", label="probe depth")
+    press.set_ylabel("probe depth, mm")
+    lines = axes.get_lines()[: len(areas.area)] + press.get_lines()
+    axes.legend(lines, [line.get_label() for line in lines], loc="lower left")

@@ -1,0 +1,241 @@
+"""What a recorded session shows: counts, latency, and the lumen areas over time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import BagError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.conversions import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.recording.reader import Bag, read_bag
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.scene import Scene
+from us_sim.volume.measure import label_area
+
+__all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
+
+VESSELS = ("vein", "artery")
+PLAYED = ("/tracker/pose", "/camera/camera_info")
+"""What comes in, of a path and of a camera."""
+STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
+OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
+MILLISECOND = 1e6
+"""In nanoseconds."""
+
+
+@dataclass(frozen=True)
+class LumenAreas:
+    """Cross-sections of vessels in the image plane."""
+
+    time: NDArray[np.float64]  # (K,) s since the first pose
+    depth: NDArray[np.float64]  # (K,) m, how deep the probe is pressed below the skin
+    area: dict[str, NDArray[np.float64]]  # (K,) m² by vessel
+
+    @property
+    def rest(self) -> int:
+        """The first sample, before the probe touches."""
+        return 0
+
+    @property
+    def pressed(self) -> int:
+        """The first sample within 1 % of the deepest press."""
+        return int(np.argmax(self.depth >= 0.99 * self.depth.max()))
+
+    def change(self, vessel: str, sample: int) -> float:
+        """Relative change of the area from rest; -0.5 is half closed."""
+        area = self.area[vessel]
+        return float(area[sample] / area[self.rest] - 1.0)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A recorded session, read once: everything but the images is kept."""
+
+    bag: Bag
+    poses: dict[int, Pose]  # by stamp, ns
+    nodes: dict[int, NDArray[np.float64]]  # (N, 3) m by stamp, ns
+    rest: NDArray[np.float64] | None  # (N, 3) m
+    tetrahedra: NDArray[np.int32] | None  # (M, 4)
+    sent: dict[str, list[tuple[int, int, int]]]  # topic: (stamp, publish time, log time), ns
+    reports: dict[str, dict[str, str]]  # last diagnostics by node
+
+    @property
+    def images(self) -> list[int]:
+        """Stamps of the images, ns."""
+        return [stamp for stamp, _, _ in self.sent.get("/ultrasound/image", [])]
+
+    def latency(self, topic: str) -> tuple[float, float]:
+        """Age of the pose when ``topic`` was published, ms: median and 99th percentile."""
+        ages = [(sent - stamp) / MILLISECOND for stamp, sent, _ in self.sent[topic]]
+        p50, p99 = np.percentile(ages, [50, 99])
+        return float(p50), float(p99)
+
+    def end_to_end(self) -> tuple[float, float]:
+        """Age of the pose when its image had arrived at the recorder, ms: median, 99th percentile.
+
+        Raises:
+            BagError: the session has no image.
+        """
+        rows = self.sent.get("/ultrasound/image", [])
+        if not rows:
+            raise BagError("the session holds no image on /ultrasound/image")
+        p50, p99 = np.percentile(
+            [(logged - stamp) / MILLISECOND for stamp, _, logged in rows], [50, 99]
+        )
+        return float(p50), float(p99)
+
+    def images_at(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
+        """The images with those stamps, (rows, columns) each, read in one pass.
+
+        Raises:
+            BagError: there is none with one of the stamps.
+        """
+        found: dict[int, NDArray[np.uint8]] = {}
+        for message in self.bag.messages(["/ultrasound/image"]):
+            decoded: Any = self.bag.deserialize(message)
+            if _stamp(decoded) in stamps:
+                found[_stamp(decoded)] = pixels_from(decoded)
+        for stamp in stamps:
+            if stamp not in found:
+                raise BagError(f"the session has no image with stamp {stamp}")
+        return found
+
+    def lumen_areas(
+        self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
+    ) -> LumenAreas | None:
+        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
+
+        ``progress`` is called with the fraction that is done.
+        """
+        volume = volume_of(scene)
+        numbers = {name: label for label, name in volume.label_names.items()}
+        vessels = [name for name in VESSELS if name in numbers]
+        if volume.labels is None or not vessels or self.rest is None or self.tetrahedra is None:
+            return None
+        scanner = scanner_of(scene, volume)
+        scanner.carry(self.rest, self.tetrahedra)
+        stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
+        if not stamps:
+            raise BagError(
+                "the session holds no image with its pose and nodes, so nothing can be measured: "
+                "look into nodes.log"
+            )
+        picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
+        chosen = [stamps[i] for i in picked]
+        pixel = float(np.prod(scanner.probe.pixel_spacing))
+        area: dict[str, list[float]] = {name: [] for name in vessels}
+        for done, stamp in enumerate(chosen, start=1):
+            labels = scanner.labels(self.poses[stamp], self.nodes[stamp])
+            for name in vessels:
+                area[name].append(label_area(labels, numbers[name], pixel))
+            if progress is not None:
+                progress(done / len(chosen))
+        first = min(self.poses)
+        return LumenAreas(
+            time=np.array([(stamp - first) * 1e-9 for stamp in chosen]),
+            depth=np.array([self.poses[stamp].position[2] for stamp in chosen]),
+            area={name: np.array(values) for name, values in area.items()},
+        )
+
+    def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
+        """Everything as one JSON-like mapping; times in ms, areas in mm²."""
+        stamps = self.images
+        poses = max(len(self.sent.get(topic, [])) for topic in PLAYED)
+        seconds = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 1 else 0.0
+        latency = {
+            topic: dict(zip(("p50", "p99"), self.latency(topic), strict=True))
+            for topic in STAMPED[1:]
+            if self.sent.get(topic)
+        }
+        summary: dict[str, Any] = {
+            "poses_in": poses,
+            "images_out": len(stamps),
+            "dropped": poses - len(stamps),
+            "images_per_second": (len(stamps) - 1) / seconds if seconds else 0.0,
+            "latency_ms": latency,
+            "nodes": self.reports,
+            "recorder": self._recorded(),
+        }
+        if stamps:
+            summary["latency_ms"]["end_to_end"] = dict(
+                zip(("p50", "p99"), self.end_to_end(), strict=True)
+            )
+        if areas is not None:
+            summary["areas"] = _areas(areas)
+        return summary
+
+    def _recorded(self) -> dict[str, dict[str, int]]:
+        """What each publisher last reported to have sent, beside what was recorded in the end."""
+        recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
+        said = {
+            key.removeprefix("published "): int(value)
+            for node, report in self.reports.items()
+            if node != "session_recorder"
+            for key, value in report.items()
+            if key.startswith("published ")
+        }
+        return {
+            topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
+            for topic, count in said.items()
+        }
+
+
+def _areas(areas: LumenAreas) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "time_s": areas.time.round(4).tolist(),
+        "depth_mm": (areas.depth * 1e3).round(4).tolist(),
+    }
+    for name, area in areas.area.items():
+        result[f"{name}_mm2"] = (area * 1e6).round(4).tolist()
+        result[f"{name}_change_at_full_press"] = areas.change(name, areas.pressed)
+        result[f"{name}_change_after_release"] = areas.change(name, len(areas.time) - 1)
+    return result
+
+
+def read_session(file: Path) -> Session:
+    """Read a session that `session_recorder` wrote.
+
+    Raises:
+        BagError: the file cannot be read.
+    """
+    bag = read_bag(file)
+    poses: dict[int, Pose] = {}
+    nodes: dict[int, NDArray[np.float64]] = {}
+    sent: dict[str, list[tuple[int, int, int]]] = {}
+    reports: dict[str, dict[str, str]] = {}
+    rest = tetrahedra = None
+    there = [topic.name for topic in bag.topics if topic.name in {*STAMPED, *OTHERS}]
+    for message in bag.messages(there):
+        decoded: Any = bag.deserialize(message)
+        if message.topic in STAMPED:
+            times = (_stamp(decoded), message.publish_time, message.log_time)
+            sent.setdefault(message.topic, []).append(times)
+        if message.topic == "/probe/pose":
+            poses[_stamp(decoded)] = pose_from(decoded)
+        elif message.topic == "/tissue/nodes":
+            nodes[_stamp(decoded)] = vectors_from(decoded)
+        elif message.topic == "/tissue/rest":
+            rest = vectors_from(decoded)
+        elif message.topic == "/tissue/tetrahedra":
+            tetrahedra = tetrahedra_from(decoded)
+        elif message.topic == "/diagnostics":
+            for status in decoded.status:
+                name = status.name.rsplit("/", 1)[-1]
+                reports[name] = {item.key: item.value for item in status.values}
+    return Session(bag, poses, nodes, rest, tetrahedra, sent, reports)
+
+
+def write_summary(summary: dict[str, Any], file: Path) -> None:
+    """The summary as indented JSON."""
+    file.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)

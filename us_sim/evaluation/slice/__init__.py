@@ -1,0 +1,1 @@
+"""Error of every slicing method against its run time."""

@@ -1,0 +1,226 @@
+"""What `us-sim evaluate slice` cuts: a block of speckle, its meshes, dents and planes.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.slice.cases import MAIN, dented
+>>> MAIN.name
+'512 px, 32x16x16 nodes, pressed_12mm, straight'
+>>> mesh = MAIN.mesh()
+>>> len(mesh.nodes), len(mesh.tetrahedra)
+(8192, 34875)
+>>> float(dented(np.zeros((1, 3)), 0.012)[0, 2])
+0.012
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from us_sim.evaluation.tissue.cases import LARGEST_MESH, MESHES
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
+
+__all__ = [
+    "DEPTHS",
+    "MAIN",
+    "PLANES",
+    "SIZES",
+    "Case",
+    "Frame",
+    "black_and_white",
+    "cases",
+    "dented",
+    "speckle",
+]
+
+#: Columns, and rows, of an image.
+SIZES = (256, 512, 1024)
+#: m, by which the block is pressed.
+DEPTHS = {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03}
+
+_EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
+_BEYOND = 5e-3  # m of volume around the block, which does not deform
+_VOXEL = 0.4e-3  # m
+_WIDTH = 0.022  # m, of the dent: its standard deviation
+_BULGE = 0.25  # of the dent's depth, by which tissue under it is pushed aside
+_APERTURE, _DEPTH = 0.06, 0.08  # m, of the image
+_LAYERS = (0.008, 0.02, 0.035, 0.05, 0.07, 0.09)  # m below the skin
+_TREMOR = 0.2e-3  # m, of the probe from one image to the next
+
+
+@dataclass(frozen=True)
+class _View:
+    """How the image lies to the probe's path: where it begins, and how it is turned."""
+
+    words: str
+    turned: float = 0.0  # degrees about the probe's axis
+    tilted: float = 0.0  # degrees about the image's columns' direction, first
+    beside: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, from where the probe stands
+    on_faces: bool = False  # moved onto a layer of the mesh's faces
+
+
+PLANES = {
+    "straight": _View("in the probe's plane"),
+    "oblique": _View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
+    "corner": _View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
+    "faces": _View("along a layer of faces", on_faces=True),
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a slicer is given for one image."""
+
+    nodes: NDArray[np.float64]  # (N, 3) m, deformed
+    plane: SlicePlane
+
+
+@dataclass(frozen=True)
+class Case:
+    """An image of the block: how large, on which mesh, how deformed, and on which plane."""
+
+    size: int
+    counts: tuple[int, int, int]
+    deformation: str
+    plane: str
+
+    @property
+    def name(self) -> str:
+        """As on the screen."""
+        counts = "x".join(map(str, self.counts))
+        return f"{self.size} px, {counts} nodes, {self.deformation}, {self.plane}"
+
+    def mesh(self) -> TetrahedralMesh:
+        """The block at rest."""
+        return _block(self.counts)
+
+    def frames(self, count: int) -> list[Frame]:
+        """Images of a trembling probe, so that none is a repetition of the one before."""
+        rest = self.mesh().nodes
+        depth, view = DEPTHS[self.deformation], PLANES[self.plane]
+        found = []
+        for number in range(count):
+            nodes = dented(rest, depth * (1.0 - 0.01 * number))
+            position = np.array(view.beside)
+            position[2] += depth
+            if view.on_faces:
+                layers = rest[:, 1]
+                position[1] = layers[np.abs(layers).argmin()]
+            else:
+                position += _TREMOR * number
+            pose = Pose(position, _turn(math.radians(view.turned), math.radians(view.tilted)))
+            probe = LinearProbe(_APERTURE, _DEPTH, self.size, self.size)
+            found.append(Frame(nodes, probe.plane(pose)))
+        return found
+
+
+#: The case by which methods are compared.
+MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")
+
+
+def cases(quick: bool) -> list[Case]:
+    """All that are cut.
+
+    Every deformation on every plane in the middle size on the finest of the paper's meshes; every
+    mesh with every deformation; every size on every mesh. The quick run leaves most of it out.
+    """
+    if quick:
+        return [
+            MAIN,
+            replace(MAIN, deformation="rest", plane="faces"),
+            replace(MAIN, deformation="pressed_30mm", plane="oblique"),
+            replace(MAIN, size=SIZES[0]),
+            replace(MAIN, size=SIZES[-1]),
+            replace(MAIN, counts=MESHES[0]),
+            replace(MAIN, counts=LARGEST_MESH),
+        ]
+    meshes = [*MESHES, LARGEST_MESH]
+    found = [MAIN]
+    found += [replace(MAIN, deformation=d, plane=p) for d in DEPTHS for p in PLANES]
+    found += [replace(MAIN, counts=c, deformation=d) for c in meshes for d in DEPTHS]
+    found += [replace(MAIN, counts=c, size=s) for c in meshes for s in SIZES]
+    found += [
+        replace(MAIN, size=SIZES[-1], deformation="pressed_30mm", plane=p)
+        for p in ("oblique", "corner")
+    ]
+    return list(dict.fromkeys(found))
+
+
+def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+    """Nodes (N, 3) m of the block pressed by ``depth`` m in the middle of its top.
+
+    A smooth field, so that nothing depends on a solver: down under a Gaussian dent that ends at
+    the bottom, and aside halfway down.
+    """
+    height = _EXTENT[2][1]
+    below = nodes[:, 2:] / height
+    dent = np.exp(-(nodes[:, :2] ** 2).sum(axis=1, keepdims=True) / (2.0 * _WIDTH**2))
+    aside = _BULGE * depth / _WIDTH * nodes[:, :2] * 4.0 * below * (1.0 - below) ** 2
+    return np.asarray(nodes + np.hstack([aside, depth * (1.0 - below) ** 2]) * dent)
+
+
+def speckle(seed: int = 1) -> Volume:
+    """The block's volume, and a little around it: speckle with balls and bright layers."""
+    axes = _voxel_axes()
+    generator = np.random.default_rng(seed)
+    echo = generator.standard_normal([len(axis) for axis in axes], dtype=np.float32)
+    for axis in range(3):
+        echo = ndimage.correlate1d(echo, np.array([0.25, 0.5, 0.25], np.float32), axis)
+    echo *= np.float32(60.0 / echo.std())
+    grey = np.abs(echo, out=echo)
+    for _ in range(40):
+        centre = [generator.uniform(axis[0], axis[-1]) for axis in axes]
+        radius = generator.uniform(3e-3, 9e-3)
+        part = tuple(
+            slice(*np.searchsorted(axis, [c - radius, c + radius]))
+            for axis, c in zip(axes, centre, strict=True)
+        )
+        inside = [(axis[p] - c) ** 2 for axis, p, c in zip(axes, part, centre, strict=True)]
+        x, y, z = np.ix_(*inside)
+        grey[part][x + y + z < radius**2] *= np.float32(generator.choice([0.2, 2.0]))
+    for depth in _LAYERS:
+        grey[:, :, np.abs(axes[2] - depth) < 0.6e-3] *= np.float32(2.5)
+    return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
+
+
+def black_and_white(seed: int = 1) -> Volume:
+    """Of the same shape and place: every voxel black or white, so that a shift is seen at once."""
+    shape = [len(places) for places in _voxel_axes()]
+    bits = np.random.default_rng(seed).integers(0, 2, shape, dtype=np.uint8)
+    return _placed(np.multiply(bits, 255, out=bits))
+
+
+def _voxel_axes() -> list[NDArray[np.float64]]:
+    """m, the centres of the voxels along x, y and z."""
+    counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in _EXTENT)
+    return [
+        np.asarray(low - _BEYOND + _VOXEL * (np.arange(count) + 0.5))
+        for (low, _), count in zip(_EXTENT, counts, strict=True)
+    ]
+
+
+def _placed(voxels: NDArray[np.uint8]) -> Volume:
+    placed = np.diag([_VOXEL, _VOXEL, _VOXEL, 1.0])
+    placed[:3, 3] = [axis[0] for axis in _voxel_axes()]
+    return Volume(voxels, placed)
+
+
+@cache
+def _block(counts: tuple[int, int, int]) -> TetrahedralMesh:
+    planes = (uniform_planes(*side, count) for side, count in zip(_EXTENT, counts, strict=True))
+    return box_mesh(*planes)
+
+
+def _turn(about_z: float, about_x: float) -> NDArray[np.float64]:
+    """The quaternion (x, y, z, w) of a tilt about x, then a turn about z, both in radians."""
+    sx, cx = math.sin(about_x / 2), math.cos(about_x / 2)
+    sz, cz = math.sin(about_z / 2), math.cos(about_z / 2)
+    return np.array([cz * sx, sz * sx, sz * cx, cz * cx])

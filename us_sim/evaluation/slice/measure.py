@@ -1,0 +1,183 @@
+"""`us-sim evaluate slice`: how wrong each method's images are, against how long they take.
+
+Every method cuts the same images of a block of speckle, in turns in one run; each is compared with
+what it must show by brute force in float64 (`us_sim.evaluation.slice.reference`). VTK takes part
+where it is installed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import UsSimError
+from us_sim.evaluation.report_folder import prepare_folder, write_rows
+from us_sim.evaluation.slice.cases import MAIN, Case, black_and_white, cases, speckle
+from us_sim.evaluation.slice.contenders import Contender, contender, methods
+from us_sim.evaluation.slice.costs import costs
+from us_sim.evaluation.slice.memory import peak_memory
+from us_sim.evaluation.slice.pictures import draw_differences
+from us_sim.evaluation.slice.points import COLUMNS, Point, compare, timed_together
+from us_sim.evaluation.slice.publishing import publishing_ms
+from us_sim.evaluation.slice.recorded_frames import RecordedComparison, compare_with_recorded
+from us_sim.evaluation.slice.reference import exact_slice, sampled
+from us_sim.evaluation.slice.report import Surroundings, table, write_report
+from us_sim.evaluation.slice.targets import LARGE_VOLUME
+from us_sim.evaluation.slice.vtk_images import HOW_TO_GET, is_installed
+from us_sim.progress import Progress
+
+__all__ = ["evaluate_slice"]
+
+# Threads that each method is given.
+_THREADS = {"scan_conversion": (1, 2), "row_subdivision": (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
+_FRAMES = 4  # that a case's images go through
+# s, of timing the main case and another.
+_SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)
+
+
+def evaluate_slice(
+    out: Path, quick: bool, volume_file: Path | None = None, sweep_file: Path | None = None
+) -> int:
+    """Measure, write slice.csv, the pictures and slice.md, and print the table.
+
+    Args:
+        out: folder to write to; made if it is not there.
+        quick: fewer cases, timed more shortly.
+        volume_file: a volume that was compounded from a tracked sweep, if its recorded frames are
+            to be compared with images of it.
+        sweep_file: that sweep.
+
+    Returns:
+        0, or 1 when a method failed; its row says how, and the others are there.
+
+    Raises:
+        UsSimError: the folder cannot be written or holds a report, one of the two files is given
+            without the other, or cannot be read.
+    """
+    begin = time.perf_counter()
+    prepare_folder(out, "slice.md")
+    recorded = _recorded(volume_file, sweep_file, out, quick)
+    bench = _Bench(quick)
+    planned = cases(quick)
+    points: list[Point] = []
+    with Progress("slices", len(planned), "cases") as progress:
+        for done, case in enumerate(planned):
+            progress.update(done, case.name)
+            points += bench.points(case)
+        progress.update(len(planned))
+    write_rows(out / "slice.csv", COLUMNS, [point.row for point in points])
+    with Progress("around the slices", 4, "parts") as progress:
+        progress.update(0, "picture of differences")
+        differences = out / "slice_differences.png"
+        draw_differences(bench.volume, _working(points), differences)
+        progress.update(1, "probes and image formation")
+        probes, settings = costs(bench.volume, quick)
+        progress.update(2, "publishing")
+        publishing = publishing_ms(MAIN.size)
+        progress.update(3, "memory")
+        memory = peak_memory(LARGE_VOLUME)
+        progress.update(4)
+    around = Surroundings(probes, settings, publishing, memory, recorded)
+    seconds = time.perf_counter() - begin
+    pictures = [*write_report(out, points, around, quick, seconds), differences]
+    print(table(points))
+    if not is_installed():
+        print(HOW_TO_GET)
+    print(f"Report: {out / 'slice.md'}; pictures: {', '.join(map(str, pictures))}")
+    failed = [point for point in points if point.failure]
+    for point in failed:
+        print(f"failed: {point.method} on {point.size} px, {point.nodes} nodes: {point.failure}")
+    return 1 if failed else 0
+
+
+def _recorded(
+    volume_file: Path | None, sweep_file: Path | None, out: Path, quick: bool
+) -> RecordedComparison | None:
+    """The comparison with recorded frames, if it is asked for.
+
+    Raises:
+        UsSimError: one of the two files is given without the other, or cannot be read.
+    """
+    if volume_file is None and sweep_file is None:
+        return None
+    if volume_file is None or sweep_file is None:
+        raise UsSimError(
+            "--volume and --sweep belong together: give the tracked sweep and the volume that was "
+            "compounded from it"
+        )
+    with Progress("recorded frames", 1, "sweep") as progress:
+        progress.update(0, sweep_file.name)
+        found = compare_with_recorded(volume_file, sweep_file, out, quick)
+        progress.update(1)
+    return found
+
+
+def _working(points: Sequence[Point]) -> list[str]:
+    """The methods that did not fail."""
+    failed = {point.method for point in points if point.failure}
+    return [method for method in methods() if method not in failed]
+
+
+class _Bench:
+    """Cuts cases with every method; keeps what they share."""
+
+    def __init__(self, quick: bool) -> None:
+        self.volume = speckle()
+        self._contrast = black_and_white()
+        self._seconds = _QUICK_SECONDS if quick else _SECONDS
+
+    def points(self, case: Case) -> list[Point]:
+        """A row for every method."""
+        mesh, frames = case.mesh(), case.frames(_FRAMES)
+        first = frames[0]
+        exact = exact_slice(self.volume, mesh.nodes, mesh.tetrahedra, first.nodes, first.plane)
+        shown = sampled(self._contrast, exact.rest)
+        seen: dict[str, NDArray[np.uint8]] = {}
+        contenders: list[Contender] = []
+        points: dict[tuple[str, int], Point] = {}
+        for method, threads in ((m, n) for m in methods() for n in _THREADS[m]):
+            point = Point(
+                method,
+                case.size,
+                len(mesh.nodes),
+                len(mesh.tetrahedra),
+                threads,
+                deformation=case.deformation,
+                plane=case.plane,
+            )
+            try:
+                ready = contender(self.volume, case, method, threads)
+                if method not in seen:
+                    other = contender(self._contrast, case, method, threads)
+                    seen[method] = other.image(first)
+                errors = compare(
+                    *(self.volume, first, exact, ready.image(first)),
+                    ready.rest_coordinates(first),
+                    (shown, seen[method]),
+                    tissue_only=method == "vtk",
+                )
+            # Whatever breaks in one method must not take the others' results along.
+            except Exception as error:
+                words = f"{type(error).__name__}: {error}".replace("\n", " ")
+                points[method, threads] = replace(point, failure=words)
+                continue
+            points[method, threads] = replace(point, **errors._asdict())
+            contenders.append(ready)
+        times = timed_together(contenders, frames, self._seconds[case != MAIN])
+        for ready, timing in zip(contenders, times, strict=True):
+            key = (ready.method, ready.threads)
+            points[key] = replace(
+                points[key],
+                ms_median=timing.median,
+                ms_p99=timing.p99,
+                cpu_ms_median=float(np.median(timing.processor)),
+                filter_ms=timing.parts[0],
+                sampling_ms=timing.parts[1],
+                images=len(timing.milliseconds),
+            )
+        return list(points.values())

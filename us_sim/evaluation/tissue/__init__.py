@@ -1,0 +1,1 @@
+"""Error of every tissue solver against its run time."""

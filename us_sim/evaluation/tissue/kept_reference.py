@@ -1,0 +1,128 @@
+"""Reference solutions on two meshes, kept in the user's cache folder by what decides them."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation.tissue import neo_hookean_hexahedra, reference, two_level
+from us_sim.evaluation.tissue.cases import Scene
+from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
+from us_sim.evaluation.tissue.reference import Solution, solve_contact
+from us_sim.geometry.pose import Pose
+from us_sim.volume.phantom_cache import cache_folder
+
+__all__ = ["Reference", "kept_reference"]
+
+# m. Poses on the way to the last are this far apart, at least.
+_STRIDE = 0.005
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The solution at the end of a scene's path, and how much a coarser mesh differs."""
+
+    solution: Solution
+    size: float  # m, of the elements under the probe
+    coarser: float  # m, likewise, of the mesh compared with
+    difference: float  # relative L2, between the two
+    force_difference: float  # relative
+
+    @property
+    def unknowns(self) -> int:
+        """Displacement components of the whole block's half that was solved."""
+        return self.solution.displacement.size
+
+
+def kept_reference(
+    scene: Scene, sizes: Sequence[float], progress: Callable[[float, str], None] | None = None
+) -> Reference:
+    """The reference of a scene, computed first if it is not kept.
+
+    Args:
+        scene: pressed as its path's end says.
+        sizes: m, of the elements under the probe, at least two: each mesh starts from the one
+            before, the last is the reference, and the one before it shows how far it has converged.
+        progress: called with the fraction that is done, and a word.
+
+    Raises:
+        SolverError: no equilibrium was found.
+    """
+    fine: Solution | None = None
+    for number, size in enumerate(sizes):
+
+        def tell(done: float, text: str, number: int = number) -> None:
+            if progress is not None:
+                progress((number + done) / len(sizes), text)
+
+        coarse, fine = fine, _kept(scene, size, fine, tell)
+    assert coarse is not None
+    assert fine is not None
+    points = fine.block.corners
+    here, there = fine.at(points), coarse.at(points)
+    return Reference(
+        fine,
+        sizes[-1],
+        sizes[-2],
+        float(np.linalg.norm(there - here) / np.linalg.norm(here)),
+        float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force)),
+    )
+
+
+def _kept(
+    scene: Scene, size: float, start: Solution | None, progress: Callable[[float, str], None]
+) -> Solution:
+    planes = scene.reference_planes(size)
+    file = cache_folder() / f"reference-{_hash(scene, planes)}.npz"
+    names = ("displacement", "pressure", "force", "volume", "penetration")
+    try:
+        with np.load(file) as kept:
+            block = NeoHookeanHexahedra(planes, scene.material)
+            displacement, pressure, force, volume, penetration = (kept[name] for name in names)
+            return Solution(block, displacement, pressure, force, float(volume), float(penetration))
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        _logger.warning("%s cannot be used (%s), so it is made again", file, error)
+    poses = [scene.path[-1]] if start is not None else _approach(scene)
+    solution = solve_contact(planes, scene.material, scene.collider, poses, start, progress)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as partial:
+            np.savez(partial, **{name: getattr(solution, name) for name in names})
+        os.replace(partial.name, file)
+    except OSError as error:
+        _logger.warning("%s cannot be written (%s), so it is not kept", file, error)
+    return solution
+
+
+def _approach(scene: Scene) -> list[Pose]:
+    """The path's poses without those that are near the one before; the last is there."""
+    poses = [scene.path[0]]
+    for pose in scene.path[1:-1]:
+        turn = 1.0 - abs(float(pose.orientation @ poses[-1].orientation))
+        if np.linalg.norm(pose.position - poses[-1].position) > 0.999 * _STRIDE or turn > 0.0009:
+            poses.append(pose)
+    return [*poses, scene.path[-1]]
+
+
+def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
+    """Of everything that decides the solution, the code included."""
+    digest = hashlib.sha256()
+    for module in (neo_hookean_hexahedra, reference, two_level):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(repr(scene.material).encode())
+    return digest.hexdigest()[:16]

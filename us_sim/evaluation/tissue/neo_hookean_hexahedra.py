@@ -1,0 +1,207 @@
+"""Large deformation of a block by 27-node hexahedra of scikit-fem: energy, forces, stiffness.
+
+A second opinion on `us_sim.tissue`: other elements (triquadratic, exactly integrated), another
+library's interpolation and quadrature, and no kernel in common. The energy density is the stable
+neo-Hookean one (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans.
+Graph. 37, 2018, without its logarithm):
+mu/2 (|F|^2 - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
+>>> from us_sim.tissue.elasticity.materials import Material
+>>> planes = [0.0, 0.05, 0.1]
+>>> block = NeoHookeanHexahedra((planes, planes, planes), Material(10e3, 0.45, 1000.0))
+>>> block.nodes.shape
+(125, 3)
+>>> turned = block.nodes @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T - block.nodes
+>>> bool(abs(block.forces(turned)).max() < 1e-12)
+True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import bsr_array, csr_array
+
+from us_sim.errors import UsSimError
+from us_sim.tissue.elasticity.materials import Material
+
+try:
+    from skfem import Basis, ElementHex1, ElementHex2, FacetBasis, MeshHex
+except ImportError as error:
+    raise UsSimError(
+        "the reference solution needs scikit-fem, which is not installed: run "
+        "pip install 'us_sim[evaluate]'"
+    ) from error
+
+__all__ = ["NeoHookeanHexahedra"]
+
+# Elements whose stiffness is computed at once; bounds the memory.
+_BATCH = 128
+
+# The sign of each permutation of three axes.
+_SIGN = np.zeros((3, 3, 3))
+_SIGN[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+_SIGN[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
+
+
+class NeoHookeanHexahedra:
+    """A box of triquadratic elements between planes of each axis.
+
+    Args:
+        planes: m, ascending, of x, y and z.
+        material: of the whole box.
+    """
+
+    def __init__(self, planes: Sequence[ArrayLike], material: Material) -> None:
+        self.planes = tuple(np.asarray(coordinates, dtype=np.float64) for coordinates in planes)
+        mesh = MeshHex.init_tensor(*self.planes)
+        basis = Basis(mesh, ElementHex2(), intorder=5)
+        self.nodes = basis.doflocs.T.copy()  # (N, 3) m
+        self.corners = Basis(mesh, ElementHex1()).doflocs.T.copy()  # (C, 3) m
+        self.elements = basis.element_dofs.T.copy()  # (M, 27)
+        self._weights = basis.dx  # (M, Q) m3
+        # (M, 27, Q, 3) 1/m
+        self._gradients = np.ascontiguousarray(
+            np.stack([field[0].grad for field in basis.basis]).transpose(2, 0, 3, 1)
+        )
+        modulus, ratio = material.young_modulus, material.poisson_ratio
+        self._shear = modulus / (2 * (1 + ratio))
+        self._bulk = self._shear / (1 - 2 * ratio)  # lambda + mu
+
+        top = mesh.facets_satisfying(lambda x: np.isclose(x[2], self.planes[2][0]))
+        surface = FacetBasis(mesh, ElementHex2(), facets=top, intorder=7)
+        self.surface_points = np.asarray(surface.global_coordinates()).reshape(3, -1).T  # (S, 3) m
+        self.surface_weights = surface.dx.ravel()  # (S,) m2
+        values = np.stack([np.asarray(field[0]) for field in surface.basis])  # (27, facets, points)
+        count = values[0].size
+        #: (S, N), values of the shape functions at the surface points.
+        self.surface_values = csr_array(
+            (
+                values.reshape(27, -1).T.ravel(),
+                np.repeat(surface.element_dofs.T, values.shape[2], axis=0).ravel(),
+                np.arange(0, 27 * count + 1, 27),
+            ),
+            shape=(count, len(self.nodes)),
+        )
+        self.surface_values.eliminate_zeros()
+        self._lay_out_blocks()
+
+        # Which element lies in cell (i, j, k) between the planes.
+        cells = self._cells(self.nodes[self.elements].mean(axis=1))
+        self._element_of_cell = np.empty(tuple(len(p) - 1 for p in self.planes), dtype=int)
+        self._element_of_cell[tuple(cells.T)] = np.arange(len(cells))
+        self._shape_functions, self._mapping = basis.elem, basis.mapping
+
+    def energy(self, displacement: NDArray[np.float64]) -> float:
+        """J, stored at a displacement (N, 3)."""
+        gradient = self._deformation_gradient(displacement)
+        ratio = np.linalg.det(gradient) - 1.0
+        density = 0.5 * self._shear * (np.einsum("mqij,mqij->mq", gradient, gradient) - 3.0)
+        density += (0.5 * self._bulk * ratio - self._shear) * ratio
+        return float((self._weights * density).sum())
+
+    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) N, derivative of the energy."""
+        gradient = self._deformation_gradient(displacement)
+        pressure = self._bulk * (np.linalg.det(gradient) - 1.0) - self._shear
+        stress = self._shear * gradient + pressure[..., None, None] * _cofactor(gradient)
+        stress *= self._weights[..., None, None]
+        count = len(self.elements)
+        local = self._gradients.reshape(count, 27, -1) @ stress.swapaxes(2, 3).reshape(count, -1, 3)
+        return np.stack(
+            [
+                np.bincount(self.elements.ravel(), local[..., i].ravel(), len(self.nodes))
+                for i in range(3)
+            ],
+            axis=1,
+        )
+
+    def stiffness(self, displacement: NDArray[np.float64]) -> bsr_array:
+        """(3N, 3N) N/m, second derivative of the energy, in 3x3 blocks."""
+        gradient = self._deformation_gradient(displacement)
+        blocks = np.zeros((9, len(self._columns)))
+        for first in range(0, len(self.elements), _BATCH):
+            batch = slice(first, first + _BATCH)
+            local = self._local_stiffness(gradient[batch], batch)
+            place = self._place[batch].ravel()
+            for entry in range(9):
+                blocks[entry] += np.bincount(
+                    place, local[..., entry].ravel(), minlength=len(self._columns)
+                )
+        size = 3 * len(self.nodes)
+        data = np.ascontiguousarray(blocks.T).reshape(-1, 3, 3)
+        return bsr_array((data, self._columns, self._start), shape=(size, size))
+
+    def volume(self, displacement: NDArray[np.float64]) -> float:
+        """m3, of the deformed box."""
+        return float(
+            (self._weights * np.linalg.det(self._deformation_gradient(displacement))).sum()
+        )
+
+    def smallest_volume_ratio(self, displacement: NDArray[np.float64]) -> float:
+        """The least determinant of the deformation gradient at a quadrature point."""
+        return float(np.linalg.det(self._deformation_gradient(displacement)).min())
+
+    def at(self, field: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P, D), a nodal field (N, D) interpolated at rest positions (P, 3) m in the box."""
+        elements = self._element_of_cell[tuple(self._cells(points).T)]
+        local = self._mapping.invF(points.T[:, :, None], elements)[:, :, 0]
+        values = np.stack([self._shape_functions.lbasis(local, i)[0] for i in range(27)], axis=1)
+        return np.einsum("pa,pad->pd", values, field[self.elements[elements]])
+
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
+        """(P, 3) cell between the planes in which each point lies."""
+        return np.stack(
+            [
+                np.clip(np.searchsorted(p, x, side="right") - 1, 0, len(p) - 2)
+                for p, x in zip(self.planes, points.T, strict=True)
+            ],
+            axis=1,
+        )
+
+    def _lay_out_blocks(self) -> None:
+        """Where the block of each pair of an element's nodes goes in the assembled matrix."""
+        count = len(self.nodes)
+        rows = np.repeat(self.elements, 27, axis=1).astype(np.int64)
+        pairs, place = np.unique(
+            rows * count + np.tile(self.elements, (1, 27)), return_inverse=True
+        )
+        self._place = place.reshape(len(self.elements), -1)  # (M, 729)
+        self._columns = (pairs % count).astype(np.int32)
+        self._start = np.searchsorted(pairs, np.arange(count + 1) * count).astype(np.int32)
+
+    def _deformation_gradient(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M, Q, 3, 3)."""
+        count = len(self.elements)
+        local = displacement[self.elements].swapaxes(1, 2)  # (M, 3, 27)
+        product = local @ self._gradients.reshape(count, 27, -1)
+        return product.reshape(count, 3, -1, 3).swapaxes(1, 2) + np.eye(3)
+
+    def _local_stiffness(self, gradient: NDArray[np.float64], batch: slice) -> NDArray[np.float64]:
+        """(B, 729, 9) N/m of each pair of nodes, of a batch of elements."""
+        count, points = gradient.shape[:2]
+        cofactor = _cofactor(gradient)
+        pressure = self._bulk * (np.linalg.det(gradient) - 1.0) - self._shear
+        # d P_iJ / d F_kL as (B, Q, J, i, k, L)
+        twist = np.einsum("ikm,jln,bqmn->bqjikl", _SIGN, _SIGN, gradient, optimize=True)
+        moduli = pressure[..., None, None, None, None] * twist
+        moduli += self._bulk * np.einsum("bqij,bqkl->bqjikl", cofactor, cofactor)
+        for i in range(3):
+            for j in range(3):
+                moduli[:, :, j, i, i, j] += self._shear
+        moduli *= self._weights[batch][..., None, None, None, None]
+        shapes = self._gradients[batch]  # (B, 27, Q, 3)
+        right = moduli.reshape(count, points, 27, 3) @ shapes.transpose(0, 2, 3, 1)
+        right = right.reshape(count, points * 3, 9 * 27)
+        local = shapes.reshape(count, 27, points * 3) @ right  # (B, 27, 9 * 27)
+        return local.reshape(count, 27, 9, 27).swapaxes(2, 3).reshape(count, -1, 9)
+
+
+def _cofactor(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The derivative of the determinant of (..., 3, 3) matrices."""
+    rows = [np.cross(matrix[..., (i + 1) % 3, :], matrix[..., (i + 2) % 3, :]) for i in range(3)]
+    return np.stack(rows, axis=-2)

@@ -1,0 +1,297 @@
+"""Where a block of tissue really is under the probe: large deformation on fine quadratic elements.
+
+Frictionless contact of the whole surface, not of nodes only, by augmented Lagrangian terms at the
+surface's quadrature points (P. Wriggers, Computational Contact Mechanics, 2nd ed., 2006, 9.3.3),
+and Newton's method with a line search. Elastic equilibrium without friction does not depend on the
+path, so a pose is approached in a few steps from rest.
+
+The block lies between its mirror plane y = 0 and its side; the probe must be as symmetric.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.evaluation.tissue.reference import solve_contact
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.elasticity.materials import Material
+>>> planes = [-0.05, -0.02, 0.02, 0.05], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]
+>>> soft = Material(10e3, 0.45, 1000.0)
+>>> solution = solve_contact(planes, soft, Sphere(0.03), [Pose(position=[0.0, 0.0, 0.002])])
+>>> bool(solution.force[2] < 0), bool(solution.penetration < 2e-5)
+(True, True)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import bsr_array, coo_array, csr_array, diags_array, eye_array, kron
+from scipy.spatial import cKDTree
+
+from us_sim.errors import SolverError
+from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
+from us_sim.evaluation.tissue.two_level import TwoLevel
+from us_sim.geometry.collider import Collider
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.elasticity.materials import Material
+
+__all__ = ["Solution", "graded_planes", "solve_contact"]
+
+# Pa/m over Young's modulus: a soft contact finds its extent in few steps, a hard one is exact. The
+# multipliers are updated each time that the penalty is raised.
+_SOFT = 200.0
+_HARDER = (200.0, 200.0, 1000.0, 5000.0, 20000.0)
+_AUGMENTATIONS = 4
+_PENETRATION = 1.5e-5  # m, above which the multipliers are updated once more
+_TOLERANCE = 1e-5  # unbalanced force over contact force at the end
+_APPROACHING = 1e-2  # the same, on the way
+_NEWTON_STEPS = 60
+_SHORTEST_STEP = 2.0**-12
+_GROWTH = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The equilibrium under the last pose."""
+
+    block: NeoHookeanHexahedra  # the half with y >= 0
+    displacement: NDArray[np.float64]  # (N, 3) m
+    pressure: NDArray[np.float64]  # (S,) Pa, of the probe on the block's surface points
+    force: NDArray[np.float64]  # (3,) N, of the whole tissue on the probe, frame probe
+    volume: float  # m3, of the whole deformed block
+    penetration: float  # m, the deepest point of the surface inside the probe
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P, 3) m, displacement of rest positions (P, 3) m anywhere in the block."""
+        side = np.where(points[:, 1:2] < 0, -1.0, 1.0) * [[0, 1, 0]] + [[1, 0, 1]]
+        return self.block.at(self.displacement, points * side) * side
+
+    def pressure_near(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,) Pa at the surface points that are nearest to rest positions (P, 3) m."""
+        return self.pressure[cKDTree(self.block.surface_points).query(points)[1]]
+
+
+def graded_planes(
+    low: float, high: float, fine_low: float, fine_high: float, size: float
+) -> NDArray[np.float64]:
+    """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside."""
+    count = max(1, round((fine_high - fine_low) / size))
+    fine = np.linspace(fine_low, fine_high, count + 1)
+    parts = [fine]
+    for length, end, direction in (
+        (fine_low - low, fine_low, -1),
+        (high - fine_high, fine_high, 1),
+    ):
+        if length <= 0:
+            continue
+        number = max(1, round(np.log1p(length / size * (1 - 1 / _GROWTH)) / np.log(_GROWTH)))
+        steps = _GROWTH ** np.arange(1, number + 1)
+        parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
+    planes = np.unique(np.concatenate(parts))
+    planes[[0, -1]] = low, high
+    return planes
+
+
+def solve_contact(
+    planes: Sequence[ArrayLike],
+    material: Material,
+    collider: Collider,
+    poses: Sequence[Pose],
+    start: Solution | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Solution:
+    """Approach the last pose through the others.
+
+    Args:
+        planes: m, of x, y >= 0 and z; the block is held at the last of z.
+        material: of the whole block.
+        collider: the probe's shape.
+        poses: with y = 0 and turned about y only.
+        start: another mesh's solution of the first pose, or of one near it.
+        progress: called with the fraction of poses that are done, and a word.
+
+    Raises:
+        SolverError: a pose is not symmetric, or no equilibrium was found.
+    """
+    for pose in poses:
+        if abs(pose.position[1]) > 1e-12 or abs(pose.rotation[1, 1] - 1) > 1e-12:
+            raise SolverError(
+                "the reference solution needs a probe that is symmetric about y = 0: move it along "
+                "x and z, and turn it about y only"
+            )
+    block = NeoHookeanHexahedra(planes, material)
+    search = _Search(block, collider, progress)
+    modulus = material.young_modulus
+    penalties = np.array(_HARDER) * modulus
+    search.penalty = _SOFT * modulus
+    if start is not None:
+        search.displacement = start.at(block.nodes) * search.free
+        search.push, penalties = start.pressure_near(block.surface_points), penalties[3:]
+    for number, pose in enumerate(poses[:-1]):
+        search.done = number / len(poses)
+        search.equilibrate(pose, _APPROACHING)
+    search.done = (len(poses) - 1) / len(poses)
+    for penalty in penalties:
+        search.penalty = penalty
+        search.equilibrate(poses[-1], _APPROACHING)
+        search.push = search.pressure(poses[-1])[0]
+    for _ in range(_AUGMENTATIONS):
+        search.equilibrate(poses[-1], _TOLERANCE)
+        penetration = search.penetration(poses[-1])
+        if penetration <= _PENETRATION:
+            break
+        search.push = search.pressure(poses[-1])[0]
+    pressure, normal, _ = search.pressure(poses[-1])
+    total = 2.0 * ((block.surface_weights * pressure)[:, None] * normal).sum(axis=0)
+    force = -(total * [1, 0, 1]) @ poses[-1].rotation
+    volume = 2.0 * block.volume(search.displacement)
+    return Solution(block, search.displacement, pressure, force, volume, penetration)
+
+
+class _Search:
+    """Newton's method on one block; keeps the displacement and the contact multipliers."""
+
+    def __init__(
+        self,
+        block: NeoHookeanHexahedra,
+        collider: Collider,
+        progress: Callable[[float, str], None] | None,
+    ) -> None:
+        self.block, self.collider, self._progress = block, collider, progress
+        self.done, self.penalty = 0.0, 0.0
+        self.displacement = np.zeros_like(block.nodes)
+        self.push = np.zeros(len(block.surface_points))  # Pa, multipliers
+        self.free = _movable(block, block.nodes)
+        grid = np.stack(np.meshgrid(*block.planes, indexing="ij"), axis=-1).reshape(-1, 3)
+        coarse = np.flatnonzero(_movable(block, grid).ravel())
+        spread = kron(_trilinear(block.planes, block.nodes), eye_array(3)).tocsr()
+        self._mask = diags_array(self.free.ravel().astype(float))
+        self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
+
+    def pressure(
+        self, pose: Pose
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """At the surface points: Pa (S,), the direction of the push (S, 3), curvature (S, 3, 3)."""
+        gap, normal, curvature = self._distance(pose)
+        return np.maximum(self.push - self.penalty * gap, 0.0), normal, curvature
+
+    def penetration(self, pose: Pose) -> float:
+        """m, how deep the deepest surface point is inside the probe."""
+        return max(0.0, -float(self._distance(pose)[0].min()))
+
+    def equilibrate(self, pose: Pose, tolerance: float) -> None:
+        """Move to where the unbalanced force is below ``tolerance`` times the contact force."""
+        energy = self._energy(pose)
+        for _ in range(_NEWTON_STEPS):
+            unbalanced, load = self._unbalanced(pose)
+            residual = float(np.linalg.norm(unbalanced))
+            if self._progress is not None:
+                self._progress(self.done, f"imbalance {residual / (load or 1.0):.1e}")
+            if residual <= tolerance * load or residual < 1e-12:
+                return
+            system = TwoLevel(self._tangent(pose), self._prolongation)
+            step = system(-unbalanced.ravel(), 1e-3).reshape(-1, 3)
+            slope = float((unbalanced * step).sum())
+            before, whole = self.displacement, energy
+            length = 1.0
+            while length > _SHORTEST_STEP:
+                self.displacement = before + length * step
+                energy = self._energy(pose)
+                # The rounding of the energy hides the last steps' gain.
+                if energy <= whole + 1e-4 * length * slope + 1e-13 * abs(whole):
+                    break
+                length *= 0.5
+            else:
+                break
+        raise SolverError(
+            f"the reference solution found no equilibrium at {pose.position.tolist()} m: approach "
+            f"the pose in smaller steps or on a finer mesh"
+        )
+
+    def _energy(self, pose: Pose) -> float:
+        if not self.block.smallest_volume_ratio(self.displacement) > 0.0:
+            return np.inf
+        pressure, _, _ = self.pressure(pose)
+        contact = (self.block.surface_weights * pressure**2).sum() / (2 * self.penalty)
+        return self.block.energy(self.displacement) + float(contact)
+
+    def _unbalanced(self, pose: Pose) -> tuple[NDArray[np.float64], float]:
+        """Forces (N, 3) N that nothing balances, and the norm of the contact forces."""
+        pressure, normal, _ = self.pressure(pose)
+        weighted = (self.block.surface_weights * pressure)[:, None] * normal
+        pushes = self.block.surface_values.T @ weighted
+        unbalanced = (self.block.forces(self.displacement) - pushes) * self.free
+        return unbalanced, float(np.linalg.norm(pushes))
+
+    def _tangent(self, pose: Pose) -> bsr_array:
+        block = self.block
+        pressure, normal, curvature = self.pressure(pose)
+        local = self.penalty * normal[:, :, None] * normal[:, None, :]
+        local -= pressure[:, None, None] * curvature
+        local *= (block.surface_weights * (pressure > 0))[:, None, None]
+        values, parts = block.surface_values, []
+        for i in range(3):
+            for j in range(3):
+                part = (values.T @ diags_array(local[:, i, j]) @ values).tocoo()
+                parts.append((part.data, 3 * part.row + i, 3 * part.col + j))
+        data, rows, columns = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+        matrix = block.stiffness(self.displacement)
+        matrix = matrix.tocsr() + coo_array((data, (rows, columns)), shape=matrix.shape).tocsr()
+        held = diags_array(1.0 - self.free.ravel())
+        return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
+
+    def _distance(
+        self, pose: Pose
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Gap (S,) m of the surface points to the probe, its gradient and its second derivative."""
+        points = self.block.surface_points + self.block.surface_values @ self.displacement
+        *half, rounding = self.collider.offset_box
+        rotation = pose.rotation
+        local = (points - pose.position) @ rotation + [0.0, 0.0, half[2] + rounding]
+        beyond = np.abs(local) - half
+        outside = np.maximum(beyond, 0.0)
+        distance = np.maximum(np.linalg.norm(outside, axis=1), 1e-9)
+        normal = np.sign(local) * outside / distance[:, None]
+        curved = (beyond > 0).astype(float)[:, :, None] * np.eye(3)
+        curvature = (curved - normal[:, :, None] * normal[:, None, :]) / distance[:, None, None]
+        return (
+            distance - rounding,
+            normal @ rotation.T,
+            rotation @ curvature @ rotation.T,
+        )
+
+
+def _movable(block: NeoHookeanHexahedra, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(P, 3): all but the bottom, and not out of the mirror plane."""
+    free = np.ones(points.shape, dtype=bool)
+    free[np.isclose(points[:, 1], block.planes[1][0]), 1] = False
+    free[np.isclose(points[:, 2], block.planes[2][-1])] = False
+    return free
+
+
+def _trilinear(planes: Sequence[NDArray[np.float64]], points: NDArray[np.float64]) -> csr_array:
+    """(P, K), interpolation from the grid's K nodes, the last axis fastest, to points (P, 3)."""
+    shape = tuple(len(coordinates) for coordinates in planes)
+    cells, shares = [], []
+    for axis, coordinates in enumerate(planes):
+        cell = np.searchsorted(coordinates, points[:, axis], side="right") - 1
+        cell = np.clip(cell, 0, len(coordinates) - 2)
+        cells.append(cell)
+        shares.append((points[:, axis] - coordinates[cell]) / np.diff(coordinates)[cell])
+    columns, weights = [], []
+    for corner in np.ndindex(2, 2, 2):
+        place = [cell + offset for cell, offset in zip(cells, corner, strict=True)]
+        columns.append(np.ravel_multi_index(place, shape))
+        near = [s if offset else 1.0 - s for s, offset in zip(shares, corner, strict=True)]
+        weights.append(np.prod(near, axis=0))
+    matrix = csr_array(
+        (
+            np.stack(weights, axis=1).ravel(),
+            np.stack(columns, axis=1).ravel(),
+            np.arange(0, 8 * len(points) + 1, 8),
+        ),
+        shape=(len(points), int(np.prod(shape))),
+    )
+    matrix.eliminate_zeros()
+    return matrix

@@ -1,0 +1,289 @@
+"""tissue.md: the machine, the tables, the pictures, and which method is worth its time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
+from us_sim.evaluation.tissue.cases import LOCKING, MESHES, SCENES
+from us_sim.evaluation.tissue.kept_reference import Reference
+from us_sim.evaluation.tissue.plots import exponent, plot_errors, plot_sizes
+from us_sim.evaluation.tissue.points import Point
+
+__all__ = ["pareto_front", "table", "write_report"]
+
+_PAPERS_FINEST = int(np.prod(MESHES[-1]))
+
+
+def table(points: Sequence[Point]) -> str:
+    """What the command prints: the defaults of every method against the nonlinear reference."""
+    return markdown_table(
+        ("scene", "method", "nodes", "ms", "p99", "L2 %", "max mm", "force %", "volume %"),
+        [
+            (
+                p.scene,
+                p.method,
+                f"{p.nodes}",
+                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
+                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
+            )
+            for p in points
+            if p.default and not p.own
+        ],
+    )
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Those points than which no other is both faster and more accurate, fastest first."""
+    front: list[Point] = []
+    finite = [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)]
+    for point in sorted(finite, key=lambda p: (p.ms_median, p.rel_l2_error)):
+        if not front or point.rel_l2_error < front[-1].rel_l2_error:
+            front.append(point)
+    return front
+
+
+def write_report(
+    out: Path,
+    points: Sequence[Point],
+    references: dict[str, Reference],
+    quick: bool,
+    seconds: float,
+) -> list[Path]:
+    """Write tissue.md and its pictures; returns the pictures' files."""
+    focus = _Focus.of(points)
+    finest = [p for p in points if p.nodes == focus.nodes]
+    main = [p for p in points if p.scene == focus.scene]
+    nonlinear = [p for p in points if not p.own]
+    shown = [name for name in references if name not in LOCKING[1:]]
+    pictures = {
+        "tissue_error.png": (
+            "Error against run time, to large deformation on fine quadratic elements "
+            f"({focus.nodes:,} nodes)",
+            {name: [p for p in finest if p.scene == name and not p.own] for name in shown},
+        ),
+        "tissue_own_error.png": (
+            "Error against run time, to each method's own converged equations "
+            f"({focus.nodes:,} nodes)",
+            {name: [p for p in finest if p.scene == name and p.own] for name in shown},
+        ),
+        "tissue_meshes.png": (
+            f"Error against run time, by mesh, {SCENES[focus.scene].words}",
+            {
+                f"{nodes:,} nodes": [p for p in main if p.nodes == nodes and not p.own]
+                for nodes in sorted({p.nodes for p in main})
+            },
+        ),
+    }
+    files = []
+    for name, (title, panels) in pictures.items():
+        plot_errors({words: some for words, some in panels.items() if some}, title, out / name)
+        files.append(out / name)
+    sizes = [p for p in nonlinear if p.default and p.scene == focus.scene]
+    plot_sizes(sizes, f"Cost against size, {SCENES[focus.scene].words}", out / "tissue_size.png")
+    files.append(out / "tissue_size.png")
+    text = _text(points, references, sizes, focus, quick, seconds)
+    (out / "tissue.md").write_text(text, encoding="utf-8")
+    return files
+
+
+@dataclass(frozen=True)
+class _Focus:
+    """What is shown where only one mesh, or one scene, can be."""
+
+    nodes: int
+    scene: str
+
+    @classmethod
+    def of(cls, points: Sequence[Point]) -> _Focus:
+        """The paper's finest mesh, or the finest there is; the scene on the most meshes."""
+        sizes = {p.nodes for p in points}
+        scenes = list(dict.fromkeys(p.scene for p in points))
+        meshes = [len({p.nodes for p in points if p.scene == scene}) for scene in scenes]
+        return cls(
+            _PAPERS_FINEST if _PAPERS_FINEST in sizes else max(sizes),
+            scenes[int(np.argmax(meshes))],
+        )
+
+
+def _text(
+    points: Sequence[Point],
+    references: dict[str, Reference],
+    sizes: Sequence[Point],
+    focus: _Focus,
+    quick: bool,
+    seconds: float,
+) -> str:
+    parts = [
+        "# Tissue: error against run time",
+        f"`us-sim evaluate tissue{' --quick' if quick else ''}`, {seconds:.0f} s, on "
+        f"{machine('numpy', 'scipy', 'numba', 'scikit-fem')}. "
+        "Every row is in [tissue.csv](tissue.csv).",
+        "A block of 0.2 × 0.1 × 0.1 m, held at its bottom, E = 10 kPa and ν = 0.45 unless a scene "
+        "says otherwise, is pressed by a sphere of 30 mm radius that moves 2.5 mm a frame (in "
+        "`tilt` by a capsule of 25 mm radius that turns 2.5° a frame). Times are of whole frames, "
+        "wall clock, on one thread unless the column `threads` says more. Errors are of the last "
+        "frame as it came out while the probe moved: L2 and maximum of all nodes' displacements, "
+        "the force along the probe, and the block's volume over its volume at rest.",
+        "## Against large deformation",
+        "The reference is a stable neo-Hookean block of 27-node hexahedra with contact over the "
+        "whole surface, by scikit-fem; what it still changes from one mesh to the next finer is:",
+        _reference_table(references),
+        "![Error against run time](tissue_error.png)",
+        "Full marks are defaults; lines join a method's settings that solve the same equations; "
+        "the dotted line is 30 frames a second.",
+        _table_of_defaults(points),
+        "### The Pareto front",
+        f"Methods than which no other was both faster and more accurate, on {focus.nodes:,} nodes:",
+        *(_front(points, name, focus.nodes) for name in references if name not in LOCKING[1:]),
+        "![Error against run time on several meshes](tissue_meshes.png)",
+        "## Against each method's own equations",
+        "The same mesh and method with as many iterations as it takes (`fem` against an "
+        "independent assembly by scikit-fem, solved by SciPy). This is what the hurry of a frame "
+        "costs; what is left in the picture above is the mesh and the model.",
+        "![Error to own equations](tissue_own_error.png)",
+        _own_table(points, focus),
+        *_locking(points),
+        "## Cost against size",
+        "Memory is that of the arrays that a solver holds when it is ready, those of its mesh "
+        "included. Set-up is the time to make the solver, which may read its precomputed part from "
+        "the cache.",
+        "![Cost against size](tissue_size.png)",
+        _size_table(sizes),
+    ]
+    failures = [p for p in points if p.failure]
+    if failures:
+        parts += [
+            "## Failed",
+            "\n".join(
+                f"- {p.method} ({p.setting}), {p.scene}, {p.nodes:,} nodes: {p.failure}"
+                for p in failures
+            ),
+        ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _locking(points: Sequence[Point]) -> list[str]:
+    """How the reaction grows as tissue becomes incompressible; nothing without those scenes."""
+    found = {(p.scene, p.method): p for p in points if p.default and not p.own and not p.failure}
+    finest = {key: p for key, p in found.items() if p.nodes == _PAPERS_FINEST}
+    ratios = [name for name in LOCKING if any(scene == name for scene, _ in finest)]
+    if len(ratios) < 2:
+        return []
+    head = ["method", *(f"ν = {SCENES[name].poisson_ratio}" for name in ratios)]
+    rows = [
+        [
+            method,
+            *(
+                f"{100 * finest[name, method].force_error:.2g} %"
+                if (name, method) in finest
+                else ""
+                for name in ratios
+            ),
+        ]
+        for method in dict.fromkeys(method for _, method in finest)
+    ]
+    return [
+        "## Locking",
+        f"Error of the reaction to a press of 12 mm on {_PAPERS_FINEST:,} nodes, while the probe "
+        "moves, as the tissue becomes incompressible:",
+        markdown_table(head, rows),
+    ]
+
+
+def _reference_table(references: dict[str, Reference]) -> str:
+    return markdown_table(
+        ("scene", "elements", "unknowns", "force N", "L2 change", "force change", "penetration mm"),
+        [
+            (
+                name,
+                f"{r.coarser * 1e3:g} → {r.size * 1e3:g} mm",
+                f"{r.unknowns:,}",
+                f"{-r.solution.force[2]:.3f}",
+                f"{100 * r.difference:.2f} %",
+                f"{100 * r.force_difference:.2f} %",
+                f"{r.solution.penetration * 1e3:.3f}",
+            )
+            for name, r in references.items()
+        ],
+    )
+
+
+def _table_of_defaults(points: Sequence[Point]) -> str:
+    return markdown_table(
+        (
+            "scene",
+            "method",
+            "nodes",
+            "ms",
+            "p99 ms",
+            "L2 %",
+            "max mm",
+            "force %",
+            "volume %",
+            "smallest volume ratio",
+        ),
+        [
+            (
+                p.scene,
+                p.method,
+                f"{p.nodes:,}",
+                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
+                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
+                _number(p.smallest_volume_ratio),
+            )
+            for p in points
+            if p.default and not p.own
+        ],
+    )
+
+
+def _own_table(points: Sequence[Point], focus: _Focus) -> str:
+    return markdown_table(
+        ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference"),
+        [
+            (
+                p.method,
+                p.setting,
+                f"{p.threads}",
+                *(_number(v) for v in (p.ms_median, 100 * p.rel_l2_error, p.max_error_mm)),
+                _number(100 * p.force_error),
+                p.reference,
+            )
+            for p in points
+            if p.own and p.scene == focus.scene and p.nodes == focus.nodes
+        ],
+    )
+
+
+def _size_table(sizes: Sequence[Point]) -> str:
+    counts = sorted({p.nodes for p in sizes})
+    rows = []
+    for method in dict.fromkeys(p.method for p in sizes):
+        mine = {p.nodes: p for p in sizes if p.method == method}
+        for what, value in (
+            ("ms a frame", lambda p: p.ms_median),
+            ("MB held", lambda p: p.memory / 1e6),
+            ("s to set up", lambda p: p.setup),
+        ):
+            numbers = [_number(value(mine[n])) if n in mine else "" for n in counts]
+            rows.append((method, what, *numbers, _number(exponent(list(mine.values()), value))))
+    return markdown_table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
+
+
+def _front(points: Sequence[Point], scene: str, nodes: int) -> str:
+    front = pareto_front([p for p in points if p.scene == scene and p.nodes == nodes and not p.own])
+    steps = [
+        f"`{p.method}` ({p.setting}) leaves {100 * p.rel_l2_error:.2g} % in {p.ms_median:.3g} ms"
+        for p in front
+    ]
+    return f"- **{scene}** ({SCENES[scene].words}): {'; '.join(steps) or 'nothing was measured'}."
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "failed"

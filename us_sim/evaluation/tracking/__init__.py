@@ -1,0 +1,1 @@
+"""Error of tracked poses against their run time."""

@@ -1,0 +1,190 @@
+"""Bodies of markers, cameras and conditions that trackers are measured in, and views of them.
+
+>>> from us_sim.evaluation.tracking.cases import Case
+>>> case = Case("aruco_40mm", "640x480", 0.4, 30.0)
+>>> sequence = case.sequence(0)
+>>> len(sequence), round(float(np.linalg.norm(sequence[2].position)), 6)
+(5, 0.4)
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import exp, rotation_exp
+from us_sim.share import shared_path
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.rendered_views import Conditions
+from us_sim.tracking.camera.rigid_body import RigidBody
+from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+
+__all__ = [
+    "CAMERAS",
+    "CONDITIONS",
+    "FRAMES",
+    "MARKERS",
+    "RIGID_BODY",
+    "SINGLE",
+    "Case",
+    "Marker",
+    "cases",
+    "marker",
+]
+
+RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"
+FRAMES = 5
+"""Views in a row, as a hand moves the body; before the first, the tracker forgets everything."""
+
+_RATE = 30.0  # frames per second
+_SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s of the hand
+_EXPOSURE = 0.015  # s, in the condition with motion blur
+_HASTE = 3.0  # times the hand's speed in that condition
+_LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
+
+
+def _pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+#: Webcams of the same field of view from top to bottom, 44°.
+CAMERAS = {
+    "640x480": CameraModel(640, 480, _pinhole(600.0, 601.0, 322.3, 238.1), _LENS),
+    "1920x1080": CameraModel(1920, 1080, _pinhole(1350.0, 1352.0, 965.2, 536.7), 0.3 * _LENS),
+}
+
+CONDITIONS = {
+    "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),
+    "noise": (Conditions(read_noise=4.0, shot_noise=0.05), "5 grey levels of noise, as at dusk"),
+    "blur": (
+        Conditions(defocus=1.6),
+        f"out of focus by 1.6 pixels, and moving by {_HASTE * _SPEED * _EXPOSURE * 1e3:.1f} mm "
+        f"during the exposure",
+    ),
+    "occlusion": (Conditions(occlusion=0.35), "a hand over a third of the body"),
+    "gradient": (Conditions(gradient=0.7), "light that falls by 70 % across the image"),
+}
+"""What makes views worse, and that in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A body of markers and the side of it that the camera is before at an angle of 0."""
+
+    body: RigidBody
+    front: NDArray[np.float64]  # (3,) unit, towards the camera
+    words: str
+
+
+MARKERS = (SINGLE, "apriltag_40mm", "charuco_board", "grid_board", RIGID_BODY)
+
+
+@lru_cache
+def marker(name: str) -> Marker:
+    """One of the bodies of `MARKERS`."""
+    if name == SINGLE:
+        body, words = RigidBody.single("4X4_50", 7, 0.04), "one ArUco marker of 40 mm"
+    elif name == "apriltag_40mm":
+        body, words = RigidBody.single("APRILTAG_36h11", 7, 0.04), "one AprilTag of 40 mm"
+    elif name == "charuco_board":
+        body = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018)
+        words = "ChArUco, 5 × 4 squares of 24 mm with markers of 18 mm"
+    elif name == "grid_board":
+        body = RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006)
+        words = "4 × 3 ArUco markers of 24 mm, 6 mm apart"
+    else:
+        # Between its middle facet and the one to the right: these two are seen, at 30° each.
+        body = read_rigid_body(shared_path("config/markers/probe_grip.yaml"))
+        front = np.array([0.5, 0.0, np.sqrt(0.75)])
+        return Marker(body, front, "6 markers of 30 mm on three facets, 4 of them visible at 0°")
+    return Marker(body, body.normals[0], words)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A body seen from a distance at an angle, again and again."""
+
+    marker: str
+    image_size: str
+    distance: float  # m, from the camera to the body's middle
+    angle: float  # degrees, from the line of sight to the body's front
+    condition: str = "plain"
+
+    def sequence(self, number: int) -> list[Pose]:
+        """Poses of the body in ``camera_optical``, `FRAMES` of them; the middle one as asked."""
+        random = np.random.default_rng([zlib.crc32(repr(self).encode()), number])
+        camera, seen = CAMERAS[self.image_size], marker(self.marker)
+        size = np.array([camera.width, camera.height])
+        pixel = size * (0.5 + random.uniform(-0.12, 0.12, 2))
+        place = np.append(camera.rays(pixel[None])[0], 1.0)
+        place *= self.distance / np.linalg.norm(place)
+        about = random.uniform(0, 2 * np.pi)
+        tilt = np.radians(self.angle) * np.array([np.cos(about), np.sin(about), 0.0])
+        spin = np.array([0.0, 0.0, random.uniform(0, 2 * np.pi)])
+        turn = (
+            _turn(_between(np.array([0.0, 0.0, 1.0]), place))
+            @ _turn(tilt)
+            @ _turn(spin)
+            @ _turn(_between(seen.front, np.array([0.0, 0.0, -1.0])))
+        )
+        middle = seen.body.centres.mean(axis=0)
+        asked = Pose(place - turn.rotation @ middle, turn.orientation)
+        velocity = self.velocity(number)
+        poses = []
+        for frame in range(FRAMES):
+            moved = exp((frame - FRAMES // 2) / _RATE * velocity)
+            # About the body's middle, which is what the case says the distance of.
+            turned = Pose(np.zeros(3), (moved @ asked).orientation)
+            poses.append(
+                Pose(place + moved.position - turned.rotation @ middle, turned.orientation)
+            )
+        return poses
+
+    def velocity(self, number: int) -> NDArray[np.float64]:
+        """(6,) m/s and rad/s, of a sequence's middle, along the camera's axes."""
+        random = np.random.default_rng([zlib.crc32(repr(self).encode()), number, 1])
+        ways = random.normal(size=(2, 3))
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        haste = _HASTE if self.condition == "blur" else 1.0
+        return haste * np.concatenate([_SPEED * ways[0], _TURNING * ways[1]])
+
+    def motion(self, number: int) -> NDArray[np.float64] | None:
+        """(6,) from the beginning to the end of the exposure; None where it is too short."""
+        return _EXPOSURE * self.velocity(number) if self.condition == "blur" else None
+
+
+def cases(quick: bool) -> list[Case]:
+    """All that is measured, in order."""
+    distances = (0.4, 0.9) if quick else (0.2, 0.3, 0.4, 0.6, 0.9, 1.3)
+    angles = (0.0, 30.0, 60.0) if quick else (0.0, 15.0, 30.0, 45.0, 60.0, 70.0)
+    tilted = (30.0,) if quick else (0.0, 30.0, 60.0)
+    found = []
+    for name in MARKERS:
+        small, large = CAMERAS
+        found += [Case(name, small, d, a) for d in distances for a in angles]
+        found += [Case(name, small, 0.4, a, c) for c in CONDITIONS if c != "plain" for a in tilted]
+        found += [
+            Case(name, large, d, a) for d in ((0.4,) if quick else (0.4, 0.9)) for a in tilted
+        ]
+        if not quick:
+            found += [Case(name, large, 0.4, 30.0, c) for c in CONDITIONS if c != "plain"]
+    return found
+
+
+def _turn(vector: NDArray[np.float64]) -> Pose:
+    return Pose(np.zeros(3), rotation_exp(vector))
+
+
+def _between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) rad, of the shortest rotation from one direction to another."""
+    one, other = one / np.linalg.norm(one), other / np.linalg.norm(other)
+    axis = np.cross(one, other)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.array([np.pi, 0.0, 0.0]) if one @ other < 0 else np.zeros(3)
+    return axis / sine * float(np.arctan2(sine, one @ other))

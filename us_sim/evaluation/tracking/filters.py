@@ -1,0 +1,196 @@
+"""What filters bring and cost: how far they are behind a moving hand, and how much still trembles.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.tracking.filters import delay
+>>> times = np.arange(0, 4, 0.01)
+>>> late = np.sin(7 * (times - 0.025))[:, None]
+>>> round(delay(times, late, lambda t: np.sin(7 * t)[:, None]), 4)
+0.025
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import rotation_exp, rotation_log
+from us_sim.tracking.filter.pose_filter import make_filter
+from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.tracking.measurement import Measurement
+
+__all__ = ["COLUMNS", "FilterPoint", "delay", "filter_points"]
+
+COLUMNS = (
+    *("filter", "setting", "rate_hz", "noise_mm", "noise_deg", "lag_ms", "rotation_lag_ms"),
+    *("jitter_mm", "jitter_deg", "moving_jitter_mm", "error_mm", "stated_lag_ms", "us_per_pose"),
+)
+
+_RATE = 60.0  # Hz
+_NOISE, _TURN_NOISE = 3e-4, 3.5e-3  # m and rad, standard deviation of a coordinate
+_MOVING, _REST = 8.0, 8.0  # s
+_BEGINNING, _SETTLING = 1.0, 4.0  # s of motion, and of rest, that are not judged
+_LONGEST = 0.8  # s
+# Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor.
+_SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
+
+_Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class FilterPoint:
+    """A row of filters.csv."""
+
+    method: str
+    setting: str
+    default: bool
+    lag: float  # s
+    rotation_lag: float  # s
+    jitter: float  # m, at rest, root mean square over all three coordinates
+    rotation_jitter: float  # rad
+    moving_jitter: float  # m, of what is left when the lag is taken out
+    error: float  # m, root mean square to where the probe is at that moment
+    stated: float  # s, what the filter itself says of its lag, in motion
+    seconds: float  # a pose
+
+    @property
+    def row(self) -> tuple[object, ...]:
+        """The values of `COLUMNS`."""
+        return (
+            *(
+                self.method,
+                self.setting,
+                _RATE,
+                1e3 * _NOISE,
+                round(float(np.degrees(_TURN_NOISE)), 3),
+            ),
+            *(round(1e3 * self.lag, 2), round(1e3 * self.rotation_lag, 2)),
+            *(round(1e3 * self.jitter, 4), round(float(np.degrees(self.rotation_jitter)), 4)),
+            *(round(1e3 * self.moving_jitter, 4), round(1e3 * self.error, 4)),
+            *(round(1e3 * self.stated, 2), round(1e6 * self.seconds, 1)),
+        )
+
+
+def filter_points(quick: bool) -> list[FilterPoint]:
+    """Every filter over its settings, on the same noisy path."""
+    cutoffs = (0.5, 1.5, 6.0) if quick else (0.25, 0.5, 1.0, 1.5, 3.0, 6.0, 12.0)
+    slopes = (180.0,) if quick else (0.0, 60.0, 180.0, 600.0)
+    accelerations = (0.01, 0.05, 0.25) if quick else (0.003, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0)
+    tried = [(FilterSettings("none"), "")]
+    for slope in slopes:
+        for cutoff in cutoffs:
+            turning = slope * FilterSettings().rotation_speed_coefficient / 180.0
+            settings = FilterSettings(
+                "one_euro",
+                minimum_cutoff=cutoff,
+                speed_coefficient=slope,
+                rotation_minimum_cutoff=cutoff,
+                rotation_speed_coefficient=turning,
+            )
+            tried.append((settings, f"{cutoff:g} Hz + {slope:g} Hz per m/s"))
+    for acceleration in accelerations:
+        settings = FilterSettings(
+            "kalman", acceleration=acceleration, angular_acceleration=10 * acceleration
+        )
+        tried.append((settings, f"{acceleration:g} m/s per root second"))
+    return [_point(settings, words) for settings, words in tried]
+
+
+def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) -> float:
+    """s by which values (K, d) at times (K,) are behind a path, by least squares.
+
+    The path is known at any time, so this is the peak of the correlation between grid points too.
+    """
+
+    def misfit(lag: float) -> float:
+        return float(((values - path(times - lag)) ** 2).sum())
+
+    grid = np.linspace(-0.05, _LONGEST, 171)
+    step = float(grid[1] - grid[0])
+    best = float(grid[np.argmin([misfit(lag) for lag in grid])])
+    for _ in range(4):
+        before, here, after = (misfit(best + side * step) for side in (-1, 0, 1))
+        bend = before - 2 * here + after
+        best += 0.5 * step * (before - after) / bend if bend > 0 else 0.0
+        step *= 0.2
+    return best
+
+
+def _point(settings: FilterSettings, words: str) -> FilterPoint:
+    times = np.arange(round((_MOVING + _REST) * _RATE)) / _RATE
+    random = np.random.default_rng(7)
+    noise = random.normal(0.0, _NOISE, (len(times), 3))
+    turn_noise = random.normal(0.0, _TURN_NOISE, (len(times), 3))
+    covariance = np.diag([_NOISE**2] * 3 + [_TURN_NOISE**2] * 3)
+    positions, turns = _position(times), _rotation(times)
+    measured = [
+        Measurement(
+            round(1e9 * moment) + 1,
+            Pose(
+                position + off,
+                (
+                    Pose(np.zeros(3), rotation_exp(turned_off))
+                    @ Pose(np.zeros(3), rotation_exp(turn))
+                ).orientation,
+            ),
+            covariance,
+        )
+        for moment, position, turn, off, turned_off in zip(
+            times, positions, turns, noise, turn_noise, strict=True
+        )
+    ]
+    filter = make_filter(settings)
+    filtered, stated = [], []
+    began = time.thread_time()
+    for measurement in measured:
+        filtered.append(filter.update(measurement).pose)
+        stated.append(filter.lag)
+    seconds = (time.thread_time() - began) / len(measured)
+    found = np.array([pose.position for pose in filtered])
+    found_turns = np.array([rotation_log(pose.orientation) for pose in filtered])
+    moving = (times >= _BEGINNING) & (times < _MOVING)
+    rest = times >= _MOVING + _SETTLING
+    lag = delay(times[moving], found[moving], _position)
+    left = found[moving] - _position(times[moving] - lag)
+    return FilterPoint(
+        settings.method,
+        words,
+        settings in (FilterSettings(settings.method), FilterSettings("none")),
+        lag,
+        delay(times[moving], found_turns[moving], _rotation),
+        _root_mean_square(found[rest] - positions[rest]),
+        _root_mean_square(found_turns[rest] - turns[rest]),
+        _root_mean_square(left),
+        _root_mean_square(found[moving] - positions[moving]),
+        float(np.median(np.array(stated)[moving])),
+        seconds,
+    )
+
+
+def _position(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _swayed(times, 1)
+
+
+def _rotation(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _swayed(times, 2)
+
+
+def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
+    """(K, 3) m or rad: the hand sways, comes to rest, and stays there."""
+    ease = np.clip((_MOVING - times) / 0.5, 0.0, 1.0)
+    ease = ease**3 * (10 - 15 * ease + 6 * ease**2)
+    total = np.zeros((len(times), 3))
+    for axis in range(3):
+        for number, sway in enumerate(_SWAY):
+            phase = 1.7 * axis + 0.9 * number
+            share = (1.0, 0.6, 0.3)[axis]
+            total[:, axis] += share * sway[what] * np.sin(2 * np.pi * sway[0] * times + phase)
+    return total * ease[:, None]
+
+
+def _root_mean_square(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt((values**2).sum(axis=1).mean()))

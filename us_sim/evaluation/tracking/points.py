@@ -1,0 +1,263 @@
+"""What one case shows: how far poses are off, how often they fail, and how long they take.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.tracking.points import mirrored
+>>> tilted = Pose([0.0, 0.0, 0.4], [np.sin(0.1), 0.0, 0.0, np.cos(0.1)])
+>>> mirrored(tilted, np.zeros(3), np.array([0.0, 0.0, 1.0])).orientation.round(4) + 0.0
+array([-0.0998,  0.    ,  0.    ,  0.995 ])
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation.tracking.cases import CAMERAS, CONDITIONS, MARKERS, Case, Marker, marker
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import rotation_between
+from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
+from us_sim.tracking.camera.fiducial_detector import FiducialDetector
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.rendered_views import RenderedView
+from us_sim.tracking.camera.settings import CameraSettings
+from us_sim.tracking.camera.source import CameraSource
+from us_sim.tracking.measurement import Measurement
+
+__all__ = ["COLUMNS", "Bench", "Point", "View", "mirrored", "visible"]
+
+COLUMNS = (
+    *("marker", "image_size", "distance_m", "angle_deg", "condition", "views", "detected"),
+    *("flipped", "median_mm", "p95_mm", "median_deg", "p95_deg", "ms_median", "ms_first"),
+    *("cpu_ms_median", "detector_cpu_ms", "pose_cpu_ms", "markers_used", "expected_mm"),
+    *("within_95", "failure"),
+)
+
+_FLIP = 5.0  # degrees; a body that is turned by less is not the wrong way round
+_CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
+
+
+@dataclass(frozen=True)
+class View:
+    """What the tracker made of one image."""
+
+    first: bool  # of a sequence: nothing was known before
+    ms: float  # wall clock
+    cpu_ms: float
+    detected: bool = False
+    flipped: bool = False
+    mm: float = np.nan  # of the body's middle
+    degrees: float = np.nan
+    used: int = 0  # markers
+    visible: int = 0  # markers that the camera sees at less than the usual limit of the angle
+    expected_mm: float = np.nan  # by the covariance, of the body's origin
+    square: float = np.nan  # of the error in its own standard deviations (Mahalanobis)
+
+    @property
+    def inside(self) -> bool:
+        """Whether the error is in the ellipsoid that should hold 95 % of them."""
+        return self.square < _CHI_SQUARE_95
+
+
+@dataclass(frozen=True)
+class Point:
+    """A row of tracking.csv."""
+
+    case: Case
+    views: tuple[View, ...] = ()
+    detector_cpu_ms: float = np.nan  # one whole image
+    pose_cpu_ms: float = np.nan
+    failure: str = ""
+
+    @property
+    def row(self) -> tuple[object, ...]:
+        """The values of `COLUMNS`."""
+        case = self.case
+        return (
+            *(case.marker, case.image_size, case.distance, case.angle, case.condition),
+            *(len(self.views), len(self.found), self.flipped),
+            *(_rounded(self.error(share)) for share in (50, 95)),
+            *(_rounded(self.turned(share)) for share in (50, 95)),
+            *(_rounded(self.ms), _rounded(self.ms_first), _rounded(self.cpu_ms)),
+            *(_rounded(self.detector_cpu_ms), _rounded(self.pose_cpu_ms)),
+            _rounded(_mean([view.used for view in self.found])),
+            _rounded(_percentile([view.expected_mm for view in self.found], 50)),
+            _rounded(self.within),
+            self.failure,
+        )
+
+    @property
+    def found(self) -> list[View]:
+        """Views in which the body was."""
+        return [view for view in self.views if view.detected]
+
+    @property
+    def flipped(self) -> int:
+        """Views in which a mirror image of the pose was taken for it."""
+        return sum(view.flipped for view in self.views)
+
+    @property
+    def ms(self) -> float:
+        """Wall clock of an image, median."""
+        return _percentile([view.ms for view in self.views], 50)
+
+    @property
+    def ms_first(self) -> float:
+        """That of images of which nothing was known before."""
+        return _percentile([view.ms for view in self.views if view.first], 50)
+
+    @property
+    def cpu_ms(self) -> float:
+        """Processor time of an image, median."""
+        return _percentile([view.cpu_ms for view in self.views], 50)
+
+    @property
+    def within(self) -> float:
+        """Share of the errors inside the ellipsoid that should hold 95 % of them."""
+        return _mean([view.inside for view in self.found])
+
+    def error(self, share: float) -> float:
+        """mm, percentile of the position's error."""
+        return _percentile([view.mm for view in self.found], share)
+
+    def turned(self, share: float) -> float:
+        """Degrees, percentile of the rotation's error."""
+        return _percentile([view.degrees for view in self.found], share)
+
+
+class Bench:
+    """Renders cases and has them tracked; keeps the rooms that several share."""
+
+    def __init__(self) -> None:
+        self._rooms: dict[tuple[str, str], RenderedView] = {}
+
+    def warm_up(self) -> None:
+        """Let everything be compiled that is timed later."""
+        for name in MARKERS:
+            self.point(Case(name, "640x480", 0.4, 30.0), 1)
+
+    def point(self, case: Case, sequences: int) -> Point:
+        """What so many sequences of images show."""
+        seen, camera = marker(case.marker), CAMERAS[case.image_size]
+        key = (case.marker, case.image_size)
+        if key not in self._rooms:
+            self._rooms = {key: RenderedView(camera, seen.body)}
+        room = self._rooms[key]
+        views: list[View] = []
+        parts: list[tuple[float, float]] = []
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        try:
+            for number in range(sequences):
+                images = _images(room, case, number)
+                source = CameraSource(camera, seen.body)
+                for frame, (pose, image) in enumerate(images):
+                    views.append(_view(source, seen, frame, pose, image))
+                    if frame == 0:
+                        parts.append(_parts(camera, seen, image))
+        finally:
+            cv2.setNumThreads(threads)
+        detector = _percentile([part[0] for part in parts], 50)
+        solver = _percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
+        return Point(case, tuple(views), detector, solver)
+
+
+def _images(
+    room: RenderedView, case: Case, number: int
+) -> Iterator[tuple[Pose, NDArray[np.uint8]]]:
+    """Poses of a sequence and how they look."""
+    conditions, _ = CONDITIONS[case.condition]
+    seed = zlib.crc32(f"{case} {number}".encode())
+    for frame, pose in enumerate(case.sequence(number)):
+        # The hand and the light stay as they are through a sequence, the noise does not.
+        yield pose, room.render(pose, conditions, seed, case.motion(number), frame)
+
+
+def _view(
+    source: CameraSource, seen: Marker, frame: int, true: Pose, image: NDArray[np.uint8]
+) -> View:
+    begin, processor = time.perf_counter(), time.thread_time()
+    measured = source.measure(image, round(frame * 1e9 / 30))
+    processor, wall = time.thread_time() - processor, time.perf_counter() - begin
+    view = View(frame == 0, 1e3 * wall, 1e3 * processor, visible=visible(seen, true))
+    if measured is None:
+        return view
+    return replace(_compared(view, measured, seen, true), used=source.seen)
+
+
+def visible(seen: Marker, pose: Pose) -> int:
+    """How many markers of a body face the camera, by less than its usual limit of the angle."""
+    centres = pose.apply(seen.body.centres)
+    cosines = -((seen.body.normals @ pose.rotation.T) * centres).sum(axis=1)
+    cosines /= np.linalg.norm(centres, axis=1)
+    return int((cosines > np.cos(CameraSettings().view_angle_limit)).sum())
+
+
+def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> View:
+    found = measured.pose
+    middle = seen.body.centres.mean(axis=0)
+    off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
+    angle = rotation_angle(found, true)
+    other = rotation_angle(found, mirrored(true, middle, seen.front))
+    error = np.concatenate(
+        [true.position - found.position, rotation_between(found.orientation, true.orientation)]
+    )
+    square = np.nan
+    if measured.covariance is not None:
+        square = float(error @ np.linalg.pinv(measured.covariance, hermitian=True) @ error)
+    return replace(
+        view,
+        detected=True,
+        flipped=bool(other < angle and angle > np.radians(_FLIP)),
+        mm=1e3 * float(np.linalg.norm(off)),
+        degrees=float(np.degrees(angle)),
+        expected_mm=1e3 * (measured.position_deviation or np.nan),
+        square=square,
+    )
+
+
+def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
+    """The pose that a plane seen from afar may be taken for: tilted the other way.
+
+    Args:
+        pose: of the body in ``camera_optical``.
+        middle: (3,) m, of the body, in its own frame.
+        front: (3,) unit, normal of its plane, in its own frame.
+    """
+    sight = pose.apply(middle[None])[0]
+    sight = sight / np.linalg.norm(sight)
+    matrix = np.eye(4)
+    before, behind = np.eye(3) - 2 * np.outer(sight, sight), np.eye(3) - 2 * np.outer(front, front)
+    matrix[:3, :3] = before @ pose.rotation @ behind
+    matrix[:3, 3] = pose.position
+    return Pose.from_matrix(matrix)
+
+
+def _parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple[float, float]:
+    """ms of processor time: finding markers in the whole image, and a pose from them."""
+    detector = FiducialDetector(seen.body)
+    begin = time.thread_time()
+    detection = detector.detect(image)
+    points, pixels, owners = detection.correspondences(seen.body)
+    between = time.thread_time()
+    if not len(points):
+        return 1e3 * (between - begin), np.nan
+    body_poses(camera, points, pixels, owners)
+    return 1e3 * (between - begin), 1e3 * (time.thread_time() - between)
+
+
+def _percentile(values: Sequence[float], share: float) -> float:
+    return float(np.percentile(values, share)) if len(values) else float("nan")
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _rounded(value: float) -> float:
+    return round(value, 4)

@@ -1,0 +1,243 @@
+"""tracking.md: what was asked and seen, the tables, the pictures, and how it was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
+from us_sim.evaluation.tracking.cases import CONDITIONS, FRAMES, MARKERS, marker
+from us_sim.evaluation.tracking.filters import FilterPoint
+from us_sim.evaluation.tracking.plots import (
+    plot_conditions,
+    plot_filters,
+    plot_run_time,
+    plot_views,
+)
+from us_sim.evaluation.tracking.points import Point
+from us_sim.evaluation.tracking.targets import targets
+
+__all__ = ["table", "write_report"]
+
+
+def table(points: Sequence[Point]) -> str:
+    """What the command prints: every measure that is asked for, and what was seen."""
+    return markdown_table(
+        ("", "asked", "seen", "met"), [target.cells for target in targets(points)]
+    )
+
+
+def write_report(
+    out: Path,
+    points: Sequence[Point],
+    filters: Sequence[FilterPoint],
+    quick: bool,
+    seconds: float,
+) -> list[Path]:
+    """Write tracking.md and its plots; returns the plots' files.
+
+    Args:
+        out: folder.
+        points: all rows of views.
+        filters: all rows of filters.
+        quick: whether it was the short run.
+        seconds: that the run took.
+    """
+    drawn = {
+        "tracking_error.png": lambda file: plot_views(points, file),
+        "tracking_run_time.png": lambda file: plot_run_time(points, file),
+        "tracking_conditions.png": lambda file: plot_conditions(points, file),
+        "tracking_filters.png": lambda file: plot_filters(filters, file),
+    }
+    files = [out / name for name in drawn]
+    for file, draw in zip(files, drawn.values(), strict=True):
+        draw(file)
+    text = _text(points, filters, quick, seconds)
+    (out / "tracking.md").write_text(text, encoding="utf-8")
+    return files
+
+
+def _text(
+    points: Sequence[Point], filters: Sequence[FilterPoint], quick: bool, seconds: float
+) -> str:
+    count = sum(len(point.views) for point in points)
+    parts = [
+        "# Tracking: error against run time",
+        f"`us-sim evaluate tracking{' --quick' if quick else ''}`, {seconds:.0f} s, on "
+        f"{machine('numpy', 'numba', 'opencv-python-headless', 'opencv-python')}. Every row is in "
+        "[tracking.csv](tracking.csv) and [filters.csv](filters.csv).",
+        f"{count:,} images of bodies of markers are rendered as cameras see them: every pixel that "
+        "an edge crosses is the mean of 64 rays through a distorting lens; then come the lens's "
+        "blur, a lamp beside the camera, and the sensor's noise and grey levels, before a room "
+        "with things in it that have edges. What is compared is the known pose with what "
+        "`probe_tracker`'s camera source measures.",
+        "## What is asked",
+        table(points),
+        "Times are processor time of one thread, OpenCV's included. Other programs on the machine "
+        "lengthen the wall clock (`ms_median` in the CSV), and processor time a little.",
+        "## Bodies and conditions",
+        "![Bodies and conditions](tracking_views.png)",
+        "\n".join(f"- `{name}`: {marker(name).words}" for name in MARKERS),
+        "\n".join(f"- {name}: {words}" for name, (_, words) in CONDITIONS.items()),
+        "## Error against distance and angle",
+        "![Error against distance and angle](tracking_error.png)",
+        _bodies(points),
+        "The position's error is of the body's middle. Flipped is a pose that is nearer to the "
+        "true one's mirror image, tilted the other way about the line of sight, and off by more "
+        "than 5°.",
+        "## Error against run time",
+        "![Error against run time](tracking_run_time.png)",
+        _times(points),
+        "The detector looks at one whole image, of which nothing is known, and the solver finds "
+        "the pose from its corners; a source that knows where the body was looks only there.",
+        "## Conditions",
+        "![Conditions](tracking_conditions.png)",
+        _conditions(points),
+        "A single marker that a hand touches is not found, and says so; a body of several is.",
+        "## What the covariance says",
+        _covariance(points),
+        "Within is the share of errors inside the ellipsoid that the reported covariance says "
+        "holds 95 % of them. More is caution: the covariance assumes at least "
+        "`camera.corner_deviation` (0.1 pixels) for a corner, for real lenses, prints and "
+        "calibrations are not as good as rendered ones.",
+        "## Filters: lag against jitter",
+        "![Filters](tracking_filters.png)",
+        _filters(filters),
+        "A hand sways by 35 mm and 14°, with a tremor, then rests; 60 poses a second have a noise "
+        "of 0.3 mm and 0.2° in each coordinate. Lag is the shift in time by which the filtered "
+        "path fits the true one best, jitter at rest and in motion what is left without it, error "
+        "what is off at the very moment. The lag stated is the filter's own word, the median in "
+        "motion.",
+        "## How it was measured",
+        f"A case's views come in sequences of {FRAMES} at 30 a second, in which a hand moves the "
+        "body by 50 mm/s and 0.2 rad/s; each starts with a tracker that knows nothing. Bodies are "
+        "in the middle quarter of the image, turned by any angle about the line of sight and "
+        "tilted towards any side. Views of the same case have different noise, hands and light.",
+    ]
+    failures = [point for point in points if point.failure]
+    if failures:
+        parts += ["## Failed", "\n".join(f"- {p.case}: {p.failure}" for p in failures)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _bodies(points: Sequence[Point]) -> str:
+    head = ("body", "image", "m", "views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
+    rows = []
+    plain = [p for p in points if p.case.condition == "plain" and p.views]
+    for name in MARKERS:
+        for size in dict.fromkeys(p.case.image_size for p in plain):
+            for distance in sorted({p.case.distance for p in plain}):
+                mine = [
+                    view
+                    for p in plain
+                    if (p.case.marker, p.case.image_size, p.case.distance) == (name, size, distance)
+                    for view in p.views
+                ]
+                if not mine:
+                    continue
+                found = [view for view in mine if view.detected]
+                rows.append(
+                    (
+                        *(name, size, f"{distance:g}", f"{len(mine)}"),
+                        _percent(len(found), len(mine)),
+                        f"{sum(view.flipped for view in mine)}",
+                        *_percentiles([view.mm for view in found]),
+                        *_percentiles([view.degrees for view in found]),
+                    )
+                )
+    return markdown_table(head, rows)
+
+
+def _times(points: Sequence[Point]) -> str:
+    head = ("body", "image", "CPU ms an image", "detector, CPU ms", "solver, CPU ms")
+    rows = []
+    plain = [p for p in points if (p.case.condition, p.case.distance) == ("plain", 0.4)]
+    for name in MARKERS:
+        for size in dict.fromkeys(p.case.image_size for p in plain):
+            mine = [p for p in plain if (p.case.marker, p.case.image_size) == (name, size)]
+            mine = [p for p in mine if p.views]
+            if mine:
+                cells = [
+                    [view.cpu_ms for p in mine for view in p.views],
+                    [p.detector_cpu_ms for p in mine],
+                    [p.pose_cpu_ms for p in mine],
+                ]
+                rows.append((name, size, *(f"{np.nanmedian(values):.2f}" for values in cells)))
+    return markdown_table(head, rows)
+
+
+def _conditions(points: Sequence[Point]) -> str:
+    head = ("body", "condition", "views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
+    rows = []
+    for name in MARKERS:
+        for condition in CONDITIONS:
+            mine = [
+                view
+                for p in points
+                if (p.case.marker, p.case.condition) == (name, condition)
+                and (p.case.image_size, p.case.distance) == ("640x480", 0.4)
+                for view in p.views
+            ]
+            found = [view for view in mine if view.detected]
+            rows.append(
+                (
+                    *(name, condition, f"{len(mine)}", _percent(len(found), len(mine))),
+                    f"{sum(view.flipped for view in mine)}",
+                    *_percentiles([view.mm for view in found]),
+                    *_percentiles([view.degrees for view in found]),
+                )
+            )
+    return markdown_table(head, rows)
+
+
+def _covariance(points: Sequence[Point]) -> str:
+    head = ("body", "within the 95 % ellipsoid", "median error, mm", "said, mm")
+    rows = []
+    for name in MARKERS:
+        mine = [
+            view
+            for p in points
+            if (p.case.marker, p.case.condition) == (name, "plain")
+            for view in p.found
+        ]
+        rows.append(
+            (
+                name,
+                _percent(sum(view.inside for view in mine), len(mine)),
+                _percentiles([view.mm for view in mine])[0],
+                _percentiles([view.expected_mm for view in mine])[0],
+            )
+        )
+    return markdown_table(head, rows)
+
+
+def _filters(points: Sequence[FilterPoint]) -> str:
+    head = ("filter", "setting", "lag, ms", "stated, ms", "jitter at rest, mm", "in motion, mm")
+    rows = [
+        (
+            f"**{p.method}**" if p.default else p.method,
+            p.setting,
+            f"{1e3 * p.lag:.1f}",
+            f"{1e3 * p.stated:.1f}",
+            f"{1e3 * p.jitter:.3f}",
+            f"{1e3 * p.moving_jitter:.3f}",
+            f"{1e3 * p.error:.3f}",
+            f"{1e6 * p.seconds:.0f}",
+        )
+        for p in points
+    ]
+    return markdown_table((*head, "error, mm", "µs a pose"), rows)
+
+
+def _percentiles(values: Sequence[float]) -> tuple[str, str]:
+    if not len(values):
+        return "", ""
+    median, most = np.nanpercentile(values, [50, 95])
+    return f"{median:.3g}", f"{most:.3g}"
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else ""

@@ -1,0 +1,51 @@
+"""Faces of tetrahedra, and which of them are the outer surface: for tissue and slices alike.
+
+>>> import numpy as np
+>>> from us_sim.geometry.mesh_faces import boundary_triangles
+>>> len(boundary_triangles(np.array([[0, 1, 2, 3], [1, 2, 3, 4]])))  # of 8, two are one inside
+6
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FACES", "MOST_NODES", "boundary_faces", "boundary_triangles", "face_order"]
+
+#: The four outward faces of a positively oriented tetrahedron.
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+
+#: So many nodes at most, so that the three of a face fit into one 64-bit number.
+MOST_NODES = 2**21
+
+
+def face_order(
+    tetrahedra: NDArray[np.integer],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Faces brought together with the faces of the same three nodes.
+
+    Face f of tetrahedron t, ``FACES[f]``, has the number 4 t + f.
+
+    Returns:
+        (4M,) face numbers, those of the same nodes in a row and ascending; and for each set of
+        same faces where its row starts, and how many they are.
+    """
+    faces = np.sort(tetrahedra[:, FACES].reshape(-1, 3).astype(np.int64), axis=1)
+    keys = faces[:, 0] << 42 | faces[:, 1] << 21 | faces[:, 2]
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    return order, starts, np.diff(np.append(starts, len(keys)))
+
+
+def boundary_triangles(tetrahedra: NDArray[np.integer]) -> NDArray[np.int32]:
+    """(F, 3) triangles that belong to one tetrahedron only, normals pointing outward."""
+    faces = tetrahedra[:, FACES].reshape(-1, 3)[boundary_faces(tetrahedra)]
+    return np.ascontiguousarray(faces, dtype=np.int32)
+
+
+def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
+    """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
+    order, starts, counts = face_order(tetrahedra)
+    return np.sort(order[starts[counts == 1]])

@@ -1,0 +1,136 @@
+"""Rigid transforms: where the probe is, in metres and unit quaternions (x, y, z, w).
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> pressed = Pose(position=[0.0, 0.0, 0.012], orientation=[0.0, 0.0, 0.0, 1.0])
+>>> pressed.apply(np.array([[0.0, 0.0, 0.03]]))
+array([[0.   , 0.   , 0.042]])
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.errors import PoseError
+
+__all__ = ["Pose"]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A rotation followed by a translation, from a child frame (``probe``) to its parent.
+
+    Args:
+        position: (3,) m, the child's origin in the parent frame.
+        orientation: (4,) quaternion x, y, z, w; normalised here.
+
+    Raises:
+        PoseError: a number is not finite, or the quaternion's norm is below 1e-6.
+    """
+
+    position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    orientation: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0, 0, 1]))
+
+    def __post_init__(self) -> None:
+        position = np.array(self.position, dtype=np.float64)
+        orientation = np.array(self.orientation, dtype=np.float64)
+        if position.shape != (3,) or orientation.shape != (4,):
+            raise PoseError(
+                f"a pose needs 3 coordinates and 4 quaternion components, "
+                f"not {position.shape} and {orientation.shape}"
+            )
+        if not (np.isfinite(position).all() and np.isfinite(orientation).all()):
+            raise PoseError(
+                f"the pose is not finite: position {position.tolist()}, "
+                f"orientation {orientation.tolist()}"
+            )
+        norm = float(np.linalg.norm(orientation))
+        if norm < 1e-6:
+            raise PoseError("the pose's quaternion is zero, so it has no orientation")
+        position.flags.writeable = False
+        orientation /= norm
+        orientation.flags.writeable = False
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "orientation", orientation)
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Pose:
+        """The pose of a 4×4 homogeneous rigid matrix.
+
+        Raises:
+            PoseError: the upper left block is not a rotation to 1e-3 (scaled, sheared, mirrored).
+        """
+        matrix = np.asarray(matrix, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise PoseError("a rigid transform is a finite 4×4 matrix")
+        rotation = matrix[:3, :3]
+        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or (
+            np.linalg.det(rotation) < 0
+        ):
+            raise PoseError("the matrix is not rigid: its upper left 3×3 block is not a rotation")
+        return cls(matrix[:3, 3], _quaternion(rotation))
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) rotation matrix, child to parent."""
+        x, y, z, w = self.orientation
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(4, 4) homogeneous matrix, child to parent."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.position
+        return matrix
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) m of the child frame, in the parent frame."""
+        return points @ self.rotation.T + self.position
+
+    def inverse(self) -> Pose:
+        """The transform from parent to child."""
+        return Pose(-self.rotation.T @ self.position, self.orientation * [-1.0, -1.0, -1.0, 1.0])
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """First ``other``, then this transform."""
+        x1, y1, z1, w1 = self.orientation
+        x2, y2, z2, w2 = other.orientation
+        product = [
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        ]
+        return Pose(self.rotation @ other.position + self.position, np.array(product))
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978)."""
+    trace = np.trace(rotation)
+    squares = np.array([*(2 * np.diag(rotation) - trace), trace]) + 1.0
+    k = int(np.argmax(squares))
+    quaternion = np.empty(4)
+    if k == 3:
+        quaternion[3] = squares[3]
+        quaternion[:3] = [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    else:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        quaternion[k] = squares[k]
+        quaternion[i] = rotation[i, k] + rotation[k, i]
+        quaternion[j] = rotation[j, k] + rotation[k, j]
+        quaternion[3] = rotation[j, i] - rotation[i, j]
+    return quaternion / np.linalg.norm(quaternion)

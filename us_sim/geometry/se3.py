@@ -1,0 +1,146 @@
+"""Rigid motions as vectors: exponential, logarithm, adjoint and interpolation on SE(3).
+
+A twist is (6,): translation (m), then rotation (rad), the order of a measurement's covariance.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking import se3
+>>> quarter_turn = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2]))
+>>> half_way = se3.interpolate(Pose(), quarter_turn, 0.5)
+>>> np.degrees(se3.log(half_way)[5]).round(6).item(), half_way.position.round(6).tolist()
+(45.0, [0.0, 0.0, 0.05])
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, sin, sqrt, tan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+
+__all__ = [
+    "adjoint",
+    "cross_matrix",
+    "exp",
+    "interpolate",
+    "left_jacobian",
+    "log",
+    "product",
+    "rotation_between",
+    "rotation_exp",
+    "rotation_log",
+]
+
+_SMALL = 1e-3  # rad: below it series to the fourth order are exact to rounding
+
+
+def exp(twist: NDArray[np.float64]) -> Pose:
+    """The motion of a twist (6,) m, rad, done for one unit of time (Barfoot 2017, 7.86)."""
+    rotation = twist[3:]
+    return Pose(left_jacobian(rotation) @ twist[:3], rotation_exp(rotation))
+
+
+def log(pose: Pose) -> NDArray[np.float64]:
+    """The twist (6,) m, rad, of at most half a turn whose exponential is the pose."""
+    rotation = rotation_log(pose.orientation)
+    return np.concatenate([_inverse_left_jacobian(rotation) @ pose.position, rotation])
+
+
+def adjoint(pose: Pose) -> NDArray[np.float64]:
+    """(6, 6): takes twists of the child's frame to the parent's (Barfoot 2017, 7.43)."""
+    rotation = pose.rotation
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = rotation
+    matrix[:3, 3:] = cross_matrix(pose.position) @ rotation
+    return matrix
+
+
+def interpolate(first: Pose, second: Pose, part: float) -> Pose:
+    """The pose at a part (0 to 1) of the way: straight, and turning evenly the shorter way."""
+    turn = part * rotation_between(first.orientation, second.orientation)
+    return Pose(
+        first.position + part * (second.position - first.position),
+        product(rotation_exp(turn), first.orientation),
+    )
+
+
+def rotation_exp(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion (4,) x, y, z, w of a rotation vector (3,) rad."""
+    x, y, z = vector.tolist()
+    square = x * x + y * y + z * z
+    angle = sqrt(square)
+    factor = 0.5 - square / 48.0 if angle < _SMALL else sin(0.5 * angle) / angle
+    return np.array([factor * x, factor * y, factor * z, cos(0.5 * angle)])
+
+
+def rotation_log(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vector (3,) rad, of at most pi, of a unit quaternion (4,) x, y, z, w."""
+    x, y, z, w = quaternion.tolist()
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    half_sine = sqrt(x * x + y * y + z * z)
+    factor = 2.0 / w if half_sine < 1e-12 else 2.0 * atan2(half_sine, w) / half_sine
+    return np.array([factor * x, factor * y, factor * z])
+
+
+def rotation_between(
+    first: NDArray[np.float64], second: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotation vector (3,) rad about the parent's axes that turns the first into the second."""
+    x, y, z, w = first.tolist()
+    return rotation_log(product(second, np.array([-x, -y, -z, w])))
+
+
+def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
+    x1, y1, z1, w1 = first.tolist()
+    x2, y2, z2, w2 = second.tolist()
+    return np.array(
+        [
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        ]
+    )
+
+
+def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) J: exp(v + d) is exp(J d) exp(v) to the first order in d (Barfoot 2017, 7.37)."""
+    x, y, z = vector.tolist()
+    square = x * x + y * y + z * z
+    angle = sqrt(square)
+    if angle < _SMALL:
+        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        first, second = (1.0 - cos(angle)) / square, (angle - sin(angle)) / (square * angle)
+    xy, yz, zx = second * x * y, second * y * z, second * z * x
+    x1, y1, z1 = first * x, first * y, first * z
+    return np.array(
+        [
+            [1.0 - second * (y * y + z * z), xy - z1, zx + y1],
+            [xy + z1, 1.0 - second * (z * z + x * x), yz - x1],
+            [zx - y1, yz + x1, 1.0 - second * (x * x + y * y)],
+        ]
+    )
+
+
+def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) matrix that takes any u to vector × u."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _inverse_left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) inverse of the left Jacobian, by half angles so that half a turn is no exception."""
+    square = float(vector @ vector)
+    angle = sqrt(square)
+    if angle < _SMALL:
+        second = 1.0 / 12.0 + square / 720.0
+    else:
+        second = (1.0 - 0.5 * angle / tan(0.5 * angle)) / square
+    cross = cross_matrix(vector)
+    matrix: NDArray[np.float64] = np.eye(3) - 0.5 * cross + second * (cross @ cross)
+    return matrix

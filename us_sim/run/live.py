@@ -1,0 +1,243 @@
+"""Live runs: the nodes of a scene as separate processes, followed until they are done."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from us_sim.errors import UsSimError, VolumeError
+from us_sim.progress import Progress
+from us_sim.run.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
+from us_sim.run.supervision import Monitored, follow, plan_of
+from us_sim.scene.building import volume_of
+from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from us_sim.demo.camera_video import PathVideo
+
+__all__ = ["demo", "dry_run", "play", "prepare_volume", "run"]
+
+
+def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: Path | None) -> str:
+    """What :func:`run` would start and what it would leave out, and why, one line each."""
+    plan_of(scene, parameters, record=record, path=path)
+    rows = [
+        ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
+    ]
+    rows.append(
+        ("runs", "path_player", f"plays {path}")
+        if path
+        else ("left out", "path_player", f"no --path: poses come from `{scene.tracker.source}`")
+    )
+    rows.append(
+        ("runs", "session_recorder", f"records to {record}")
+        if record
+        else ("left out", "session_recorder", "no --record")
+    )
+    lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume_name}"]
+    lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
+    lines.append(
+        "on demand wrench, tf, markers, annotated image: nothing is computed for a topic nobody "
+        "subscribes"
+    )
+    return "\n".join(lines)
+
+
+def run(
+    scene: Scene,
+    parameters: Parameters,
+    *,
+    record: Path | None,
+    path: Path | None,
+    duration: float | None,
+    network: bool,
+) -> int:
+    """Run a scene until its path ends, the duration is over, or Ctrl-C."""
+    keep_on_this_host(network=network)
+    plan = plan_of(scene, parameters, record=record, path=path, duration=duration)
+    prepare_volume(scene)
+    follow(plan, log=None)
+    if record is not None:
+        print(f"recorded to {record}")
+    return 0
+
+
+def demo(
+    name: str,
+    volume: Path | None,
+    out: Path,
+    parameters: Parameters,
+    *,
+    network: bool,
+    source: str | None = None,
+) -> int:
+    """Replay the scene's path through its nodes; recording, contact sheet and summary in ``out``.
+
+    Args:
+        name: of the scene, or its file.
+        volume: in place of the scene's.
+        out: folder to write to.
+        parameters: given by a person, by node.
+        network: talk beyond this host.
+        source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
+            None is the one that the scene's tracker asks for.
+
+    Raises:
+        UsSimError: bad input, ``out`` already holds a session, or a node failed.
+    """
+    keep_on_this_host(network=network)
+    scene = load_scene(name, volume=volume)
+    if scene.path is None:
+        raise UsSimError(f"{scene.origin}: path: is missing, and the demo needs one to play")
+    recording = out / "session.mcap"
+    if recording.exists():
+        raise UsSimError(f"{recording} exists already; choose another folder with --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    source = source or ("camera" if scene.tracker.source == "camera" else "path")
+    video = _prepared_video(scene, Path(scene.path)) if source == "camera" else None
+    path = Path(scene.path) if video is None else None
+    plan = plan_of(scene, parameters, record=recording, path=path, video=video)
+    prepare_volume(scene)
+    started = time.monotonic()
+    startup = follow(plan, log=out / "nodes.log")
+    return _report(scene, out, recording, startup, time.monotonic() - started, video)
+
+
+def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:
+    """Play a bag into whatever runs on this ROS domain."""
+    from us_sim.recording.path import read_path
+    from us_sim.recording.reader import read_bag
+
+    keep_on_this_host(network=network)
+    settings: dict[str, object] = {
+        "path": str(bag.expanduser().resolve()),
+        "rate": rate,
+        "loop": loop,
+    }
+    if everything:
+        count = read_bag(bag).message_count
+        process = NodeProcess("session_player", settings)
+    else:
+        count = len(read_path(bag, topic or None))
+        process = NodeProcess("path_player", settings | {"topic": topic})
+    group = ProcessGroup()
+    try:
+        with (
+            contextlib.closing(Monitored([process.node])) as monitor,
+            Progress("playing", count, "messages") as bar,
+        ):
+            group.start([process])
+            while group.is_running(process.node):
+                monitor.spin()
+                report = monitor.node.reports.get(process.node, {})
+                done = sum(int(v) for k, v in report.items() if k.startswith("published "))
+                state = report.get("state", "starting")
+                domain = os.environ.get("ROS_DOMAIN_ID", "0")
+                where = f" on ROS domain {domain}" if state.startswith("waiting") else ""
+                bar.update(min(done, count), state + where)
+            group.check()
+            bar.update(count)
+    finally:
+        group.stop()
+    return 0
+
+
+def prepare_volume(scene: Scene) -> None:
+    """Make a phantom that is not in the cache yet, in view of the person who waits."""
+    bar: list[Progress] = []
+
+    def show(fraction: float, text: str) -> None:
+        if not bar:
+            _require_a_cache()
+            bar.append(Progress(f"making {scene.volume_name}", 100, "%"))
+        bar[0].update(100 * fraction, text)
+
+    try:
+        volume_of(scene, show)
+    finally:
+        for shown in bar:
+            shown.__exit__(None, None, None)
+
+
+def _prepared_video(scene: Scene, file: Path) -> PathVideo:
+    """What the scene's camera sees of a path, rendered in view of the person who waits."""
+    from us_sim.demo.camera_video import path_video
+    from us_sim.recording.path import read_path
+
+    with contextlib.ExitStack() as stack:
+        bar: list[Progress] = []
+
+        def show(done: int, total: int) -> None:
+            if not bar:
+                bar.append(stack.enter_context(Progress("rendering the video", total, "images")))
+            bar[0].update(done)
+
+        return path_video(scene, read_path(file), show)
+
+
+def _require_a_cache() -> None:
+    """Raise VolumeError when what is made would be lost, and made again by every node."""
+    from us_sim.volume.phantom_cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise VolumeError(
+            f"the cache folder {folder} cannot be written ({error.strerror}): set US_SIM_CACHE to "
+            f"a folder that can"
+        ) from error
+
+
+def _report(
+    scene: Scene,
+    out: Path,
+    recording: Path,
+    startup: float,
+    wall: float,
+    video: PathVideo | None,
+) -> int:
+    """Summary and contact sheet of what was recorded, and one paragraph for the person."""
+    from us_sim.demo.contact_sheet import contact_sheet
+    from us_sim.demo.session import read_session, write_summary
+
+    with Progress("measuring the recording", 100, "%") as bar:
+        session = read_session(recording)
+        areas = session.lumen_areas(scene, 120, lambda done: bar.update(100 * done))
+    summary = session.summary(areas)
+    summary |= {"scene": scene.name, "startup_s": round(startup, 2), "wall_s": round(wall, 2)}
+    tracked = None
+    if video is not None:
+        from us_sim.demo.tracked_path import tracked_path
+
+        tracked = tracked_path(session, video)
+        summary["tracked_path"] = tracked.summary
+    contact_sheet(session, scene, areas, out / "contact_sheet.png")
+    write_summary(summary, out / "summary.json")
+    latency = summary["latency_ms"]["end_to_end"]
+    print(
+        f"{summary['poses_in']} {'poses' if video is None else 'camera images'} in, "
+        f"{summary['images_out']} images out, "
+        f"{summary['dropped']} dropped, {summary['images_per_second']:.1f} images/s, "
+        f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    )
+    if tracked is not None:
+        print(tracked)
+    for vessel in areas.area if areas is not None else ():
+        print(
+            f"{vessel}: {summary['areas'][f'{vessel}_change_at_full_press']:+.0%} at full press, "
+            f"{summary['areas'][f'{vessel}_change_after_release']:+.1%} after release"
+        )
+    for file in ("session.mcap", "contact_sheet.png", "summary.json", "nodes.log"):
+        print(out / file)
+    return 0

@@ -1,0 +1,174 @@
+"""Lockstep: all nodes of a scene in one process, one image out for every pose in, repeatably."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from us_sim.errors import UsSimError
+from us_sim.progress import Progress
+from us_sim.run.graph import (
+    NodeProcess,
+    Parameters,
+    keep_on_this_host,
+    player_settings,
+    simulation_nodes,
+)
+from us_sim.run.live import prepare_volume
+from us_sim.run.supervision import refuse_unknown
+from us_sim.scene.building import path_of
+from us_sim.scene.scene import Scene
+
+__all__ = ["render", "render_scene"]
+
+QUIET_S = 0.25
+"""Silence after which everything that was sent has been taken."""
+
+
+def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Parameters) -> int:
+    """`us-sim render`: with checks of its arguments, and progress.
+
+    Raises:
+        UsSimError: no path, an output folder that is not empty, or what :func:`render` raises.
+    """
+    keep_on_this_host(network=False)
+    path = path or (Path(scene.path) if scene.path else None)
+    if path is None:
+        raise UsSimError(f"{scene.origin}: path: is missing; give a bag with --path")
+    if out.exists() and any(out.iterdir()):
+        raise UsSimError(f"--out {out}: is not empty; choose another folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    prepare_volume(scene)
+    with Progress("rendering", len(path_of(scene, path)), "images") as bar:
+        count = render(scene, path, out, lambda done, _: bar.update(done), parameters)
+    print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
+    return 0
+
+
+def render(
+    scene: Scene,
+    path: Path,
+    out: Path,
+    progress: Callable[[int, int], None],
+    parameters: Parameters | None = None,
+) -> int:
+    """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
+
+    Args:
+        progress: called with the images done and the poses there are.
+        parameters: more parameters by node, as YAML texts.
+
+    Returns:
+        The number of images, equal to the number of poses.
+
+    Raises:
+        UsSimError: bad input, or an output that cannot be written.
+    """
+    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    context = Context()
+    domain = None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100
+    try:
+        rclpy.init(
+            args=[],
+            context=context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # what rcl raises differs between its versions
+        raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+    executor = SingleThreadedExecutor(context=context)
+    nodes: list[Any] = []
+    try:
+        for module, name, settings in _nodes(scene, path, out, parameters or {}):
+            nodes.append(_created(module, name, settings, context))
+            executor.add_node(nodes[-1])
+        for process in simulation_nodes(scene, parameters, played=True):
+            (node,) = (node for node in nodes if node.get_name() == process.node)
+            refuse_unknown(process, node.list_parameters([], 0).names)
+        return _spin(executor, nodes, progress)
+    finally:
+        for node in reversed(nodes):
+            executor.remove_node(node)
+            node.destroy_node()
+        executor.shutdown()
+        context.try_shutdown()
+
+
+def _nodes(
+    scene: Scene, path: Path, out: Path, parameters: Parameters
+) -> list[tuple[str, str, dict[str, object]]]:
+    """Module, class and parameters of each node: listeners first, the player last."""
+    common: dict[str, object] = {"lockstep": True}
+    recorder: dict[str, object] = {
+        "file": str(out / "session.mcap"),
+        "compression": "zstd",
+        "exclude": ["/diagnostics"],
+    }
+    player = player_settings(scene, path, recorded=True) | {"lockstep": True}
+    return [
+        ("session_recorder", "SessionRecorder", recorder),
+        ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
+        *(
+            (process.node, _class_name(process.node), {**common, **_values(process)})
+            for process in simulation_nodes(scene, parameters, played=True)
+        ),
+        ("path_player", "PathPlayer", player),
+    ]
+
+
+def _class_name(node: str) -> str:
+    return "".join(word.capitalize() for word in node.split("_"))
+
+
+def _values(process: NodeProcess) -> dict[str, object]:
+    """All its parameters, those given as YAML texts parsed."""
+    given = {name: yaml.safe_load(text) for name, text in process.raw_parameters.items()}
+    return process.parameters | given
+
+
+def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:
+    from rclpy.exceptions import ParameterException
+    from rclpy.parameter import Parameter
+
+    kind = getattr(importlib.import_module(f"us_sim.nodes.{module}"), name)
+    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
+    try:
+        return kind(context=context, parameter_overrides=overrides)
+    except ParameterException as error:
+        raise UsSimError(" ".join(str(error).split())) from error
+
+
+def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None]) -> int:
+    """Until the path is at its end and nothing more arrives."""
+    recorder, writer, player = nodes[0], nodes[1], nodes[-1]
+    clock = player.get_clock()
+    total = player.pose_count
+    changed, last = clock.now().nanoseconds, (-1, -1)
+    while True:
+        executor.spin_once(timeout_sec=0.05)
+        state = (writer.count, recorder.health.received)
+        now = clock.now().nanoseconds
+        if state != last:
+            if state[0] != last[0]:
+                progress(state[0], total)
+            changed, last = now, state
+        silence = (now - changed) * 1e-9
+        if player.finished.done() and silence > QUIET_S:
+            return int(writer.count)
+        if silence > 60.0:
+            raise UsSimError(
+                f"no image came for pose {writer.count} in a minute; the path is rendered up to it"
+            )

@@ -1,0 +1,66 @@
+"""Whether the files that a scene names can be read, found out without running it.
+
+>>> from us_sim.scene.reading import parse_scene
+>>> from us_sim.scene.readable_files import check_files
+>>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
+...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
+>>> check_files(scene)
+[]
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from us_sim.scene.building import path_of
+from us_sim.scene.scene import Scene
+from us_sim.scene.tracker_building import camera_body_of, tracking_of
+
+__all__ = ["check_files"]
+
+
+def check_files(scene: Scene) -> list[str]:
+    """Read what files the scene names, of its volume only the header; the keys that name them.
+
+    Raises:
+        UsSimError: one cannot be used, and why.
+    """
+    checked = []
+    if scene.volume.file:
+        from us_sim.volume.readers import read_placement
+
+        read_placement(Path(scene.volume.file))
+        checked.append("volume.file (its header)")
+    if scene.tissue is not None and scene.tissue.mesh.file:
+        from us_sim.tissue.mesh.file import read_mesh
+
+        read_mesh(Path(scene.tissue.mesh.file), scene.tissue.mesh.unit)
+        checked.append("tissue.mesh.file")
+    surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
+    if scene.skin is not None:
+        surfaces["skin.file"] = scene.skin.file
+    for key, file in surfaces.items():
+        if file:
+            from us_sim.skin.surface import read_surface
+
+            read_surface(file)
+            checked.append(key)
+    tracker = scene.tracker
+    tracking_of(scene)
+    checked += [
+        f"tracker.{key}"
+        for key in ("registration", "calibration")
+        if isinstance(getattr(tracker, key), str)
+    ]
+    if tracker.camera is not None and tracker.camera.body:
+        camera_body_of(scene)
+        checked.append("tracker.camera.body")
+    if tracker.source == "path" and tracker.file:
+        path_of(scene, Path(tracker.file))
+        checked.append("tracker.file")
+    if scene.path:
+        from us_sim.recording.path import read_path
+
+        read_path(Path(scene.path))
+        checked.append("path")
+    return checked

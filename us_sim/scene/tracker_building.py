@@ -1,0 +1,99 @@
+"""What a scene says of its tracker, made into objects, each only when it is asked for.
+
+>>> from us_sim.scene.reading import load_scene
+>>> from us_sim.scene.tracker_building import tracking_of
+>>> tracking_of(load_scene("upper_arm")).filter.lag
+0.0
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from us_sim.geometry.pose import Pose
+from us_sim.scene.building import pose_of
+from us_sim.scene.scene import PoseSection, Scene
+
+if TYPE_CHECKING:
+    from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.haptic.rendering import HapticRendering
+    from us_sim.tracking.probe_tracking import ProbeTracking
+
+__all__ = ["camera_body_of", "haptic_rendering_of", "tracker_poses_of", "tracking_of"]
+
+
+def tracking_of(scene: Scene) -> ProbeTracking:
+    """What turns the measurements of the scene's tracker into the probe's poses.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+        TrackingError: the times make no sense.
+    """
+    from us_sim.tracking.filter.pose_filter import make_filter
+    from us_sim.tracking.probe_tracking import ProbeTracking
+
+    tracker = scene.tracker
+    gate = None
+    if tracker.gate is not None:
+        from us_sim.tracking.filter.outlier_gate import OutlierGate
+
+        gate = OutlierGate(tracker.gate)
+    return ProbeTracking(
+        *tracker_poses_of(scene),
+        make_filter(tracker.filter),
+        gate,
+        time_offset=tracker.time_offset,
+        coast_for=tracker.coast_for,
+        lost_after=tracker.lost_after,
+    )
+
+
+def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
+    """Registration (the device in ``patient``) and calibration (the probe in the body).
+
+    Raises:
+        CalibrationError: a file of one of them cannot be used.
+    """
+    tracker = scene.tracker
+    return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
+
+
+def haptic_rendering_of(scene: Scene) -> HapticRendering:
+    """What tells the wrench on the handle of the scene's haptic arm.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+    """
+    from us_sim.tracking.haptic.device import HapticDevice
+    from us_sim.tracking.haptic.rendering import HapticRendering
+    from us_sim.tracking.haptic.settings import HapticSettings
+
+    tracker = scene.tracker
+    settings = tracker.haptic or HapticSettings()
+    device = HapticDevice(settings, *tracker_poses_of(scene))
+    return HapticRendering(settings, device, time_offset=tracker.time_offset)
+
+
+def _pose_or_file(given: PoseSection | str | None) -> Pose:
+    if isinstance(given, str):
+        from us_sim.tracking.calibration.transform_file import read_transform
+
+        return read_transform(given)
+    return pose_of(given) if given is not None else Pose()
+
+
+def camera_body_of(scene: Scene) -> RigidBody:
+    """The markers on the probe that the scene's camera looks for.
+
+    Raises:
+        TrackingError: their file cannot be used.
+    """
+    from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.camera.settings import CameraSettings
+
+    settings = scene.tracker.camera or CameraSettings()
+    if settings.body:
+        from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+
+        return read_rigid_body(settings.body, settings.dictionary)
+    return RigidBody.single(settings.dictionary, settings.marker, settings.size)

@@ -1,0 +1,158 @@
+"""Numbers with units, as a person writes them in a scene: ``0.04``, ``40 mm``, ``12 kPa``.
+
+>>> from us_sim.settings.quantity import Quantity
+>>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
+0.04
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = ["Quantity", "given", "require_given"]
+
+_UNITS: dict[str, dict[str, float]] = {
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
+    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
+    "density": {"kg/m3": 1.0, "kg/m^3": 1.0, "g/cm3": 1e3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "angle": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
+    "stiffness": {"N/m": 1.0, "N/mm": 1e3},
+    "mass per area": {"kg/m2": 1.0, "kg/m^2": 1.0},
+    "level": {"dB": 1.0},
+    "frequency": {"Hz": 1.0, "kHz": 1e3},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3},
+    "angular speed": {"rad/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180},
+    "number": {},
+}
+_NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A dimension and the range in which a value of it makes sense; SI unless a unit is written."""
+
+    dimension: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    @property
+    def unit(self) -> str:
+        """The SI unit's symbol, or nothing for a plain number."""
+        return next(iter(_UNITS[self.dimension]), "")
+
+    def parse(self, value: object) -> float:
+        """The value in SI units.
+
+        Raises:
+            ValueError: not a number, a unit of another dimension, not finite, or out of range.
+        """
+        number = self._number(value)
+        if not math.isfinite(number):
+            raise ValueError(f"{value!r} is not finite")
+        if not self.minimum <= number <= self.maximum:
+            unit = f" {self.unit}" if self.unit else ""
+            hint = self._hint(number)
+            raise ValueError(
+                f"{number:g}{unit} is outside {self.minimum:g} to {self.maximum:g}{unit}{hint}"
+            )
+        return number
+
+    def _number(self, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise ValueError(f"{value!r} is not a {self.dimension}")
+        if not isinstance(value, str):
+            # A whole number may be larger than any that a float holds.
+            return float(value) if abs(value) < 1e308 else math.inf
+        match = _NUMBER.match(value)
+        units = _UNITS[self.dimension]
+        if match is None:
+            raise ValueError(f"{value!r} is not a {self.dimension}")
+        number, unit = float(match[1]), match[2]
+        if not unit:
+            return number
+        if unit not in units:
+            known = ", ".join(units) or "none"
+            raise ValueError(f"{value!r} is not a {self.dimension}: its units are {known}")
+        return number * units[unit]
+
+    def _hint(self, number: float) -> str:
+        """A likely unit slip: millimetres or kilopascals written where SI is meant."""
+        for unit, factor in _UNITS[self.dimension].items():
+            if factor != 1.0 and self.minimum <= number * factor <= self.maximum:
+                return f"; did you mean '{number:g} {unit}'?"
+        return ""
+
+
+def given(
+    quantity: Quantity | None = None,
+    *,
+    choices: Sequence[str] = (),
+    description: str = "",
+    file: bool = False,
+    **kwargs: Any,
+) -> Any:
+    """A dataclass field that a scene may set: the check its value must pass, and what it is.
+
+    A text that is a ``file`` is looked up beside the scene, and must be there.
+    """
+    metadata = {
+        "quantity": quantity,
+        "choices": tuple(choices),
+        "description": description,
+        "file": file,
+    }
+    return field(metadata=metadata, **kwargs)
+
+
+def require_given(settings: Any, section: str, error: type[Exception]) -> None:
+    """Make every `given` field of a frozen dataclass what its type says, or refuse it.
+
+    A field with a quantity becomes a float, an int or, by its type, a tuple of floats; one without
+    a quantity or choices is a text or a boolean.
+
+    Args:
+        settings: the dataclass instance, in its ``__post_init__``.
+        section: the scene's section, for the sentence.
+        error: what to raise.
+
+    Raises:
+        error: with the section, the field, the value and what would do.
+    """
+    for item in dataclasses.fields(settings):
+        try:
+            value = _checked(item, getattr(settings, item.name))
+        except ValueError as problem:
+            raise error(f"{section}.{item.name}: {problem}") from problem
+        object.__setattr__(settings, item.name, value)
+
+
+def _checked(item: dataclasses.Field[Any], value: Any) -> Any:
+    quantity, choices = item.metadata["quantity"], item.metadata["choices"]
+    type_name = str(item.type)
+    if value is None and "None" in type_name:
+        return None
+    if choices:
+        if value not in choices:
+            raise ValueError(f"{value!r} is not one of {', '.join(choices)}")
+        return value
+    if quantity is None:
+        wanted, name = (str, "a text") if type_name.startswith("str") else (bool, "true or false")
+        if not isinstance(value, wanted):
+            raise ValueError(f"{value!r} is not {name}")
+        return value
+    if type_name.startswith("tuple"):
+        if isinstance(value, str) or not hasattr(value, "__iter__"):
+            raise ValueError(f"{value!r} is not a list of numbers")
+        return tuple(quantity.parse(each) for each in value)
+    number = quantity.parse(value)
+    if type_name.startswith("int"):
+        if number != int(number):
+            raise ValueError(f"{value!r} is not a whole number")
+        return int(number)
+    return number

@@ -1,0 +1,1 @@
+"""Cutting images from a deformed volume: one interface, one file a method."""

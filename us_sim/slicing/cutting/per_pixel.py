@@ -1,0 +1,182 @@
+"""Images of deformed tissue by locating every pixel on its own: the naive method, and the oracle.
+
+Every pixel is tried in every tetrahedron whose cut has it in its bounding box, in float64 and
+without any knowledge of its neighbours; the first that holds it says where it lay at rest. Slow,
+but there is little in it that could be wrong, so that the other methods are held against it.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.cutting.per_pixel import PerPixel
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.volume.volume import Volume
+>>> ramp = np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1))
+>>> to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+>>> to_patient[:2, 3] = -0.02
+>>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
+>>> slicer = PerPixel(Volume(ramp, to_patient, None, {}), mesh.nodes, mesh.tetrahedra)
+>>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
+>>> slicer.image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
+array([ 4, 12, 20, 28, 36], dtype=uint8)
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.slicing.cutting.resampling import label_voxels
+from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
+from us_sim.slicing.cutting.slicer import Slicer
+from us_sim.slicing.cutting.trilinear import SLACK
+from us_sim.slicing.probe.plane import SlicePlane
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
+
+__all__ = ["PerPixel"]
+
+# As for a section: pixels off the plane that count as on it, and a flat share of the rest volume.
+_ON_PLANE = 1e-9
+_FLAT = 1e-6
+
+
+class PerPixel(Slicer):
+    """Locates every pixel by brute force."""
+
+    def __init__(
+        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+    ) -> None:
+        if threads < 1:
+            raise ValueError(f"give at least one thread, not {threads}")
+        self._volume = volume
+        self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+        self._threads = threads
+
+    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        inside, index = self._voxels(nodes, plane)
+        lower = np.minimum(index.astype(np.int64), np.maximum(np.array(self._volume.shape) - 2, 0))
+        upper = np.minimum(lower + 1, np.array(self._volume.shape) - 1)
+        way = index - lower
+        grey = np.zeros(len(index))
+        for side in np.ndindex(2, 2, 2):
+            corner = np.where(side, upper, lower)
+            weight = np.where(side, way, 1.0 - way).prod(axis=1)
+            grey += weight * self._volume.intensities[tuple(corner.T)]
+        image = np.zeros(inside.shape, dtype=np.uint8)
+        image[inside] = np.floor(grey + 0.5)
+        return image
+
+    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        labels = label_voxels(self._volume)[0].reshape(self._volume.shape)
+        inside, index = self._voxels(nodes, plane)
+        image = np.zeros(inside.shape, dtype=np.uint8)
+        image[inside] = labels[tuple((index + 0.5).astype(np.int64).T)]
+        return image
+
+    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+        moved = finite_nodes(nodes, len(self._mesh.nodes))
+        covered, _ = self._place(self._mesh.nodes, plane)
+        rest, self.skipped = self._place(moved, plane)
+        outside = np.isnan(rest[..., 0])
+        rest[outside] = plane.pixels()[outside]
+        rest[outside & ~np.isnan(covered[..., 0])] = np.nan
+        rest[~plane.is_shown()] = np.nan
+        return rest
+
+    def _voxels(
+        self, nodes: ArrayLike, plane: SlicePlane
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """(rows, columns) which pixels lie in the volume, and the voxel indices (P, 3) of those.
+
+        The outer half voxel takes the index of the outermost centre.
+        """
+        to_index, shape = self._volume.patient_to_index, np.array(self._volume.shape)
+        index = self.rest_coordinates(nodes, plane) @ to_index[:3, :3].T + to_index[:3, 3]
+        inside = ((index >= -0.5 - SLACK) & (index <= shape - 0.5 + SLACK)).all(axis=-1)
+        return np.asarray(inside), np.clip(index[inside], 0, shape - 1)
+
+    def _place(
+        self, nodes: NDArray[np.float64], plane: SlicePlane
+    ) -> tuple[NDArray[np.float64], int]:
+        """Rest positions (rows, columns, 3) m, NaN outside the mesh, and the number skipped."""
+        now, places = nodes[self._mesh.tetrahedra], self._mesh.nodes[self._mesh.tetrahedra]
+        corners = now @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
+        first, last = _boxes(corners)
+        met = ((last >= 0) & (first <= [plane.columns - 1, plane.rows - 1])).all(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a solver that has blown up
+            size, rest_size = (np.linalg.det(x[:, 1:] - x[:, :1]) for x in (now, places))
+        valid = size * np.sign(rest_size) > _FLAT * np.abs(rest_size)
+        kept = met & valid
+        first, last = (np.clip(x[kept], -1, 1e6).astype(np.int64) for x in (first, last))
+        rest = np.full((plane.rows, plane.columns, 3), np.nan)
+        locate = partial(_locate, corners[kept], places[kept], first, last, rest)
+        share_rows(self._threads, plane.rows, locate)
+        return rest, int((met & ~valid).sum())
+
+
+def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(M, 2) least and greatest column and row of each tetrahedron's cut; inf, -inf without one.
+
+    Args:
+        corners: (M, 4, 3) column, row and height above the plane.
+    """
+    one, other = corners[:, :, None], corners[:, None, :]
+    above, below = one[..., 2], other[..., 2]
+    on_edge = (above > 0.0) & (below < 0.0)
+    on_node = np.eye(4, dtype=np.bool_) & (np.abs(above) <= _ON_PLANE)
+    way = np.where(on_edge, above / np.where(on_edge, above - below, 1.0), 0.0)[..., None]
+    points = one[..., :2] + way * (other - one)[..., :2]
+    margin = 1e-6 * (1.0 + np.abs(points))
+    on_plane = (on_edge | on_node)[..., None]
+    first = np.where(on_plane, points - margin, np.inf).min(axis=(1, 2))
+    last = np.where(on_plane, points + margin, -np.inf).max(axis=(1, 2))
+    return np.ceil(first), np.floor(last)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _locate(corners, places, first, last, rest, first_row, end_row):
+    """Rest positions of the pixels of some rows; a pixel in several tetrahedra takes the first.
+
+    Args:
+        corners: (E, 4, 3) column, row and height of the tetrahedra's nodes.
+        places: (E, 4, 3) m, the nodes at rest. first, last: (E, 2) columns and rows.
+        rest: (rows, columns, 3) m, NaN, filled here where a tetrahedron is.
+    """
+    weights = np.empty(4)
+    pixel = np.zeros(3)
+    for e in range(len(corners)):
+        corner = corners[e].copy()
+        size = _six_volumes(corner)
+        for row in range(max(first_row, first[e, 1]), min(end_row, last[e, 1] + 1)):
+            for column in range(max(0, first[e, 0]), min(rest.shape[1], last[e, 0] + 1)):
+                if not np.isnan(rest[row, column, 0]):
+                    continue
+                pixel[0] = column
+                pixel[1] = row
+                # A barycentric coordinate is the share of the volume with the pixel as a corner.
+                for k in range(4):
+                    corner[k] = pixel
+                    weights[k] = _six_volumes(corner) / size
+                    corner[k] = corners[e, k]
+                if weights.min() >= INSIDE:
+                    for a in range(3):
+                        rest[row, column, a] = (weights * places[e, :, a]).sum()
+
+
+@njit(inline="always", error_model="numpy")
+def _six_volumes(c):
+    """The triple product of the edges from the first of four corners (4, 3)."""
+    u = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
+    v = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
+    w = c[3, 0] - c[0, 0], c[3, 1] - c[0, 1], c[3, 2] - c[0, 2]
+    return (
+        u[0] * (v[1] * w[2] - v[2] * w[1])
+        + u[1] * (v[2] * w[0] - v[0] * w[2])
+        + u[2] * (v[0] * w[1] - v[1] * w[0])
+    )

@@ -1,0 +1,174 @@
+"""Grey values and labels of a volume along an affine map from pixels to voxels.
+
+Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
+their value, so that the volume ends at the faces of its voxels and not half a voxel inside; beyond
+those faces everything is 0. Grey values are trilinear and rounded half up, see `span_sampling`;
+labels are those of the nearest voxel.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.cutting.resampling import sample_plane
+>>> from us_sim.volume.volume import Volume
+>>> ramp = np.tile(np.arange(50, dtype=np.uint8), (40, 3, 1))
+>>> millimetres = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+>>> volume = Volume(ramp, millimetres, None, {})
+>>> plane = LinearProbe(aperture=0.02, depth=0.01, columns=4, rows=5).plane(Pose([0.01, 0, 0]))
+>>> sample_plane(volume, plane)[:, 0]
+array([1, 3, 5, 7, 9], dtype=uint8)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.slicing.cutting.location import BLACK
+from us_sim.slicing.cutting.rest_outline import NO_OUTLINE
+from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
+from us_sim.slicing.cutting.spans import END_SHIFT
+from us_sim.slicing.cutting.trilinear import inside_volume
+from us_sim.slicing.probe.plane import SlicePlane
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
+
+__all__ = [
+    "full_runs",
+    "grey_voxels",
+    "label_voxels",
+    "pixel_to_index",
+    "sample_labels",
+    "sample_nearest",
+    "sample_plane",
+    "voxels_of",
+]
+
+
+def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
+    """The image (rows, columns) on a plane through the volume as it is, without tissue.
+
+    It does not depend on the number of threads that share its rows.
+
+    Raises:
+        VolumeError: the volume has too many voxels.
+    """
+    voxels, shape = grey_voxels(volume)
+    runs = full_runs(plane) if plane.spans is None else plane.spans
+    # One map holds on whole rows, so that no pixel is left for what lies outside a mesh.
+    spans = np.full((plane.rows, 1), plane.columns << END_SHIFT, dtype=np.int64)
+    used = np.ones(plane.rows, dtype=np.int32)
+    maps, inside = pixel_to_index(volume, plane)[None], np.zeros(1, dtype=np.bool_)
+    image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
+
+    def draw(first_row: int, end_row: int) -> None:
+        sample_spans(
+            voxels, shape, maps, inside, 0, spans, used, runs, True, *NO_OUTLINE,
+            first_row, end_row, image,
+        )  # fmt: skip
+
+    share_rows(threads, plane.rows, draw)
+    return image
+
+
+def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
+    """The label image (rows, columns) on a plane through the volume as it is.
+
+    Raises:
+        VolumeError: the volume has no labels.
+    """
+    voxels, shape = label_voxels(volume)
+    maps = pixel_to_index(volume, plane)[None]
+    elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
+    if plane.spans is not None:
+        elements[~plane.is_shown()] = BLACK
+    image = np.empty(elements.shape, dtype=np.uint8)
+    share_rows(
+        threads,
+        plane.rows,
+        lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+    )
+    return image
+
+
+def full_runs(plane: SlicePlane) -> NDArray[np.int32]:
+    """(rows, 2, 2) as `SlicePlane.spans`, for an image that fills its grid."""
+    runs = np.zeros((plane.rows, 2, 2), dtype=np.int32)
+    runs[:, 0, 1] = plane.columns
+    return runs
+
+
+def pixel_to_index(volume: Volume, plane: SlicePlane) -> NDArray[np.float64]:
+    """(3, 3) map from (1, column, row) to voxel indices, for a plane through the rigid volume."""
+    to_index = volume.patient_to_index
+    steps = np.column_stack([plane.origin, plane.column_step, plane.row_step])
+    steps = to_index[:3, :3] @ steps
+    steps[:, 0] += to_index[:3, 3]
+    return steps
+
+
+def voxels_of(array: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """A volume's voxels as the kernels take them: flat and read-only, and their shape (3,)."""
+    # Read-only always, since numba would compile the kernels again for memory-mapped volumes.
+    flat = np.asarray(array).reshape(-1)
+    flat.flags.writeable = False
+    return flat, np.array(array.shape, dtype=np.int64)
+
+
+def grey_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The grey values' voxels as `sample_spans` takes them.
+
+    Raises:
+        VolumeError: there are too many.
+    """
+    intensities = volume.intensities
+    if max(intensities.shape) > MOST_VOXELS_A_SIDE or intensities.size > MOST_VOXELS:
+        raise VolumeError(
+            f"the volume has {intensities.shape} voxels: cut or coarsen it to at most "
+            f"{MOST_VOXELS_A_SIDE} a side and {MOST_VOXELS} in all"
+        )
+    voxels, shape = voxels_of(intensities)
+    if intensities.shape[2] == 1:
+        # Nothing follows the last voxel of a row; a volume so thin is small.
+        voxels, _ = voxels_of(np.repeat(intensities, 2, axis=2))
+    return voxels, shape
+
+
+def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The labels' voxels as the kernels take them.
+
+    Raises:
+        VolumeError: the volume has no labels.
+    """
+    if volume.labels is None:
+        raise VolumeError("the volume has no labels: give one with a segmentation")
+    return voxels_of(volume.labels)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sample_nearest(voxels, shape, maps, elements, first_row, last_row, image):
+    """Labels of the nearest voxels; arguments as for `trilinear.sample_linear`."""
+    for row in range(first_row, last_row):
+        for i in range(elements.shape[1]):
+            element = elements[row, i]
+            image[row, i] = 0
+            if element < 0:
+                continue
+            m = maps[element]
+            x = (m[0, 0] + m[0, 2] * row) + m[0, 1] * i
+            y = (m[1, 0] + m[1, 2] * row) + m[1, 1] * i
+            z = (m[2, 0] + m[2, 2] * row) + m[2, 1] * i
+            if (
+                inside_volume(x, shape[0])
+                and inside_volume(y, shape[1])
+                and inside_volume(z, shape[2])
+            ):
+                ix = np.int64(min(max(x, 0.0), shape[0] - 1.0) + 0.5)
+                iy = np.int64(min(max(y, 0.0), shape[1] - 1.0) + 0.5)
+                iz = np.int64(min(max(z, 0.0), shape[2] - 1.0) + 0.5)
+                image[row, i] = voxels[np.uint64((ix * shape[1] + iy) * shape[2] + iz)]

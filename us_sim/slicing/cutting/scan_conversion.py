@@ -1,0 +1,215 @@
+"""Exact images of deformed tissue: every tetrahedron that an image cuts is scan-converted.
+
+The tetrahedra that the image may meet are found by `clusters` and cut by `cut_polygons`: each
+gets its polygon and the affine map from pixels to where its tissue lay at rest. `spans` says which
+pixels are in which polygon, every one exactly once, and `span_sampling` looks them up in the
+volume. `rest_outline` tells tissue that was pushed away from what lies beside it.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.cutting.scan_conversion import ScanConversion
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.volume.volume import Volume
+>>> ramp = np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1))
+>>> to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+>>> to_patient[:2, 3] = -0.02
+>>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
+>>> slicer = ScanConversion(Volume(ramp, to_patient, None, {}), mesh.nodes, mesh.tetrahedra)
+>>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
+>>> slicer.image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
+array([ 4, 12, 20, 28, 36], dtype=uint8)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.geometry.mesh_faces import face_order
+from us_sim.slicing.cutting.clusters import Clusters
+from us_sim.slicing.cutting.cut_polygons import cut_tetrahedra, room_for_cuts
+from us_sim.slicing.cutting.location import BLACK
+from us_sim.slicing.cutting.resampling import (
+    full_runs,
+    grey_voxels,
+    label_voxels,
+    pixel_to_index,
+    sample_nearest,
+)
+from us_sim.slicing.cutting.rest_outline import NO_OUTLINE, Outline, RestSurface
+from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.section import RestMesh, finite_nodes
+from us_sim.slicing.cutting.slicer import Slicer
+from us_sim.slicing.cutting.span_sampling import (
+    INNER_MARGIN,
+    fill_elements,
+    sample_spans,
+)
+from us_sim.slicing.cutting.spans import convert_cuts
+from us_sim.slicing.probe.plane import SlicePlane
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
+
+__all__ = ["ScanConversion"]
+
+
+class ScanConversion(Slicer):
+    """Cuts exact images, and fast."""
+
+    def __init__(
+        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+    ) -> None:
+        if threads < 1:
+            raise ValueError(f"give at least one thread, not {threads}")
+        self._threads = threads
+        self._volume = volume
+        mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+        self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
+        self._determinants = mesh.determinants[self._clusters.order]
+        self._rest_index = mesh.rest_index
+        self._within = _among_centres(mesh.rest_index, self._clusters.tetrahedra, volume.shape)
+        self._neighbours = _neighbours(self._clusters.tetrahedra, self._determinants)
+        self._surface = RestSurface(
+            mesh.nodes, self._clusters.tetrahedra, self._determinants, self._neighbours
+        )
+        self._voxels, self._shape = grey_voxels(volume)
+        self._moved = np.empty(mesh.nodes.shape)
+        self._cuts = room_for_cuts(256)
+        self._spans = np.empty((0, 0), dtype=np.int64)
+        self._used = np.empty(0, dtype=np.int32)
+        self._full = np.empty((0, 2, 2), dtype=np.int32)
+
+    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        count, pieces, outline, is_covered = self._cut(nodes, plane)
+        runs = self._shown(plane)
+        image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
+
+        def draw(first_row: int, end_row: int) -> None:
+            spans = self._convert(count, pieces, runs, first_row, end_row)
+            sample_spans(
+                self._voxels, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
+                self._used, runs, is_covered, *outline, first_row, end_row, image,
+            )  # fmt: skip
+
+        share_rows(self._threads, plane.rows, draw)
+        return image
+
+    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        voxels, shape = label_voxels(self._volume)
+        elements, maps = self._locate(nodes, plane)
+        image = np.empty(elements.shape, dtype=np.uint8)
+        share_rows(
+            self._threads,
+            plane.rows,
+            lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+        )
+        return image
+
+    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+        elements, maps = self._locate(nodes, plane)
+        column, row = np.meshgrid(np.arange(plane.columns), np.arange(plane.rows))
+        pixel = np.stack([np.ones(column.shape), column, row], axis=-1)
+        index = np.einsum("rcij,rcj->rci", maps[elements], pixel)
+        index[elements == BLACK] = np.nan
+        to_patient = self._volume.index_to_patient
+        return index @ to_patient[:3, :3].T + to_patient[:3, 3]
+
+    def _locate(
+        self, nodes: ArrayLike, plane: SlicePlane
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
+        count, pieces, outline, _ = self._cut(nodes, plane)
+        runs = self._shown(plane)
+        spans = self._convert(count, pieces, runs, 0, plane.rows)
+        elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
+        fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
+        return elements, self._cuts.maps[: count + 1]
+
+    def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline, bool]:
+        """Fills the cuts, followed by the rigid map.
+
+        Returns:
+            how many there are, and how many outlines; the mesh at rest; and whether the cuts are
+            known to cover the image, so that the mesh at rest does not matter.
+        """
+        moved = self._as_kernels_take(nodes)
+        near = self._clusters.near(moved, plane)
+        if 4 * len(near) >= len(self._cuts.sides):
+            self._cuts = room_for_cuts(2 * len(near))
+        count, pieces, self.skipped, is_covered = cut_tetrahedra(
+            near, moved, plane.to_pixel, float(np.linalg.det(plane.basis)), plane.columns,
+            plane.rows, self._clusters.tetrahedra, self._neighbours, self._determinants,
+            self._rest_index, self._within, self._cuts,
+        )  # fmt: skip
+        self._cuts.maps[count] = pixel_to_index(self._volume, plane)
+        outline = NO_OUTLINE if is_covered else self._surface.cut(plane)
+        return count, pieces, outline, is_covered
+
+    def _as_kernels_take(self, nodes: ArrayLike) -> NDArray[np.float64]:
+        """Nodes (N, 3) m, contiguous float64, without a copy where they are so."""
+        array = np.asarray(nodes)
+        if array.shape != self._moved.shape:
+            finite_nodes(array, len(self._moved))
+        if array.dtype == np.float64 and array.flags.c_contiguous:
+            return array
+        self._moved[:] = array
+        return self._moved
+
+    def _shown(self, plane: SlicePlane) -> NDArray[np.int32]:
+        """(rows, 2, 2) the runs of columns that an image shows, once there is room for its spans.
+
+        A row has no more spans than pixels, unless deformed tissue overlaps itself.
+        """
+        if len(self._used) < plane.rows or self._spans.shape[1] < plane.columns:
+            self._used = np.empty(plane.rows, dtype=np.int32)
+            self._spans = np.empty((plane.rows, plane.columns), dtype=np.int64)
+        if plane.spans is not None:
+            return plane.spans
+        if len(self._full) != plane.rows or self._full[0, 0, 1] != plane.columns:
+            self._full = full_runs(plane)
+        return self._full
+
+    def _convert(
+        self, count: int, pieces: int, runs: NDArray[np.int32], first_row: int, end_row: int
+    ) -> NDArray[np.int64]:
+        """The spans of a run of rows."""
+        cuts, spans = self._cuts, self._spans
+        while True:
+            most = convert_cuts(
+                cuts.corners, cuts.sides, count, cuts.outlines, cuts.points, cuts.owner, pieces,
+                runs, first_row, end_row, spans, self._used,
+            )  # fmt: skip
+            if most <= spans.shape[1]:
+                return spans
+            spans = np.empty((end_row, most), dtype=np.int64)
+
+
+def _among_centres(
+    rest_index: NDArray[np.float64], tetrahedra: NDArray[np.int32], shape: tuple[int, int, int]
+) -> NDArray[np.bool_]:
+    """(M,) which tetrahedra lie well among the centres of the volume's voxels."""
+    last = np.array(shape) - 1 - INNER_MARGIN
+    among = (rest_index >= INNER_MARGIN) & (rest_index <= last)
+    return np.asarray(among[tetrahedra].all(axis=(1, 2)))
+
+
+def _neighbours(
+    tetrahedra: NDArray[np.int32], determinants: NDArray[np.float64]
+) -> NDArray[np.int32]:
+    """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none.
+
+    What is flat at rest is nobody's neighbour.
+    """
+    solid = np.flatnonzero(determinants).astype(np.int32)
+    order, starts, counts = face_order(tetrahedra[solid])
+    first = starts[counts == 2]
+    one, other = order[first], order[first + 1]
+    of_solid = np.full(4 * len(solid), -1, dtype=np.int32)
+    of_solid[one], of_solid[other] = solid[other // 4], solid[one // 4]
+    neighbours = np.full(tetrahedra.shape, -1, dtype=np.int32)
+    neighbours[solid] = of_solid.reshape(-1, 4)
+    return neighbours

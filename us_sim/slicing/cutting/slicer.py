@@ -1,0 +1,121 @@
+"""Cutting images from a volume that deformed tissue carries: one interface, methods by name."""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.probe.plane import SlicePlane
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
+
+__all__ = ["METHODS", "Slicer", "create_slicer", "warm_up"]
+
+METHODS = {
+    "scan_conversion": "us_sim.slicing.cutting.scan_conversion:ScanConversion",
+    "row_subdivision": "us_sim.slicing.cutting.row_subdivision:RowSubdivision",
+    "per_pixel": "us_sim.slicing.cutting.per_pixel:PerPixel",
+}
+"""Where each method is; its module is imported only when it is used."""
+
+
+class Slicer(ABC):
+    """Cuts images from a volume that is carried by a deformed tetrahedral mesh.
+
+    A pixel in the deformed mesh (its surface included) shows what lies at its place at rest. One
+    outside shows the volume as it is, unless the mesh covers it at rest: tissue that was pushed
+    away leaves black behind, not its ghost. Beyond the volume, and outside a plane's spans, all
+    is black.
+
+    Raises:
+        MeshError: the mesh is not finite, or its tetrahedra name nodes that are not there.
+        ValueError: fewer than one thread.
+    """
+
+    skipped: int = 0
+    """Inverted or flat tetrahedra on the latest image, which were left out."""
+
+    @abstractmethod
+    def __init__(
+        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+    ) -> None:
+        """``rest_nodes`` (N, 3) m lie in the undeformed volume; ``tetrahedra`` (M, 4) index them.
+
+        The image does not depend on the number of threads.
+        """
+
+    @abstractmethod
+    def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        """The B-mode image (rows, columns) with the mesh at ``nodes`` (N, 3) m.
+
+        Grey values are trilinear in the undeformed volume.
+
+        Raises:
+            MeshError: another number of nodes than at rest, or nodes that are not finite.
+        """
+
+    @abstractmethod
+    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
+        """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
+
+        Raises:
+            VolumeError: the volume has no labels.
+            MeshError: as for `image`.
+        """
+
+    @abstractmethod
+    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
+        """Where each pixel's tissue lies at rest: (rows, columns, 3) m, frame ``patient``.
+
+        Outside the mesh that is the pixel itself; NaN where tissue moved away, and outside spans.
+
+        Raises:
+            MeshError: as for `image`.
+        """
+
+
+def create_slicer(
+    name: str,
+    volume: Volume,
+    rest_nodes: ArrayLike,
+    tetrahedra: ArrayLike,
+    *,
+    threads: int = 1,
+    **settings: int,
+) -> Slicer:
+    """The slicer of that name.
+
+    Raises:
+        KeyError: there is no method of that name.
+        MeshError: the mesh cannot be used.
+    """
+    module, _, cls = METHODS[name].partition(":")
+    method: type[Slicer] = getattr(importlib.import_module(module), cls)
+    return method(volume, rest_nodes, tetrahedra, threads=threads, **settings)
+
+
+def warm_up(name: str, threads: int = 1) -> None:
+    """Compile every kernel of a method, or load it from numba's cache, by cutting a tiny image.
+
+    Those for a volume without tissue too.
+    """
+    from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+    from us_sim.slicing.probe.probe import LinearProbe
+    from us_sim.volume.volume import Volume
+
+    voxels = np.zeros((2, 2, 2), dtype=np.uint8)
+    volume = Volume(voxels, np.eye(4), voxels, {0: "nothing"})
+    nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
+    slicer = create_slicer(name, volume, nodes, np.array([[0, 1, 2, 3]]), threads=threads)
+    plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
+    slicer.image(1.1 * nodes, plane)
+    slicer.labels(nodes, plane)
+    slicer.rest_coordinates(nodes, plane)
+    sample_plane(volume, plane, threads=threads)
+    sample_labels(volume, plane, threads=threads)

@@ -1,0 +1,1 @@
+"""Scales, outlines and letters on an image for the eye."""

@@ -1,0 +1,64 @@
+"""The outlines of a label in an image of labels.
+
+>>> import numpy as np
+>>> from us_sim.slicing.drawing.label_outlines import label_outlines
+>>> labels = np.zeros((40, 40), np.uint8)
+>>> labels[10:20, 12:30] = 3  # its sides are half a pixel around the centres of its pixels
+>>> outline, = label_outlines(labels, 3)
+>>> np.abs(outline - [20.5, 14.5]).max(axis=0).round()
+array([9., 5.])
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["label_outlines"]
+
+_MOST = 64
+"""Outlines of one label: of more, the longest are taken."""
+
+
+def label_outlines(
+    labels: NDArray[np.uint8], label: int, *, least: float = 6.0, smoothing: float = 1.0
+) -> list[NDArray[np.float64]]:
+    """Closed outlines of where ``labels`` is ``label``, holes too, the longest first.
+
+    Args:
+        labels: (rows, columns).
+        least: pixels that an outline must enclose.
+        smoothing: about how many pixels the steps are long that are to be seen no more.
+
+    Returns:
+        Of each outline (P, 2) column and row, in pixels: between the pixels that have the label
+        and those that have not, at most about half of ``smoothing`` apart.
+    """
+    mask = cv2.inRange(labels, (float(label),), (float(label),))
+    left, top, width, height = cv2.boundingRect(mask)
+    if width == 0:
+        return []
+    around = mask[top : top + height, left : left + width]
+    found, _ = cv2.findContours(around, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=(left, top))
+    enclosing = [chain[:, 0] for chain in found if cv2.contourArea(chain) + len(chain) / 2 >= least]
+    enclosing.sort(key=len, reverse=True)
+    return [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
+
+
+def _smooth(chain: NDArray[Any], smoothing: float) -> NDArray[np.float64]:
+    """A chain of neighbouring pixels on the inside (P, 2), smoothed and moved half a pixel out.
+
+    A Gaussian in the outline's Fourier series, applied as g (2 - g) so that circles hardly shrink.
+    """
+    series = np.fft.fft(chain[:, 0] + 1j * chain[:, 1])
+    frequency = 2 * np.pi * np.fft.fftfreq(len(chain))  # per pixel of the chain
+    damping = np.exp(-0.5 * (smoothing * frequency) ** 2)
+    series *= damping * (2 - damping)
+    outline = np.fft.ifft(series)
+    along = np.fft.ifft(1j * frequency * series)
+    outline += 0.5j * along / np.maximum(np.abs(along), 1e-9)
+    apart = max(1, int(smoothing / 2))
+    return np.column_stack([outline.real[::apart], outline.imag[::apart]])

@@ -1,0 +1,1 @@
+"""From echoes to grey values: gain, resolution, thickness of the beam, contact."""

@@ -1,0 +1,96 @@
+"""How echoes become grey values: what a sonographer sets at the console.
+
+>>> from us_sim.slicing.formation.imaging import Imaging
+>>> Imaging(gain=6.0).gain
+6.0
+>>> Imaging(grey_map="purple")
+Traceback (most recent call last):
+...
+us_sim.errors.ProbeError: imaging.grey_map: 'purple' is not one of linear, soft, contrast
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from us_sim.errors import ProbeError
+from us_sim.settings.quantity import Quantity, given, require_given
+
+__all__ = ["ECHO_RANGE", "GREY_MAPS", "Imaging"]
+
+ECHO_RANGE = 60.0
+"""dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
+
+GREY_MAPS = ("linear", "soft", "contrast")
+
+_GAIN = Quantity("level", -60.0, 60.0)
+_RESOLUTION = Quantity("length", 0.0, 0.01)
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """The settings of image formation; with the defaults the volume's grey values are shown.
+
+    Each is a key of a scene's ``imaging:`` and a parameter of the node that makes the images.
+
+    Raises:
+        ProbeError: a value is out of range, with its name and the range.
+    """
+
+    gain: float = given(_GAIN, default=0.0, description="dB added to every echo")
+    time_gain: tuple[float, ...] = given(
+        _GAIN,
+        default=(),
+        description="dB added at evenly spaced depths from the face to the end of the beams, "
+        "linear in between",
+    )
+    dynamic_range: float = given(
+        Quantity("level", 10.0, 120.0),
+        default=ECHO_RANGE,
+        description="dB from black to white",
+    )
+    grey_map: str = given(
+        default="linear",
+        choices=GREY_MAPS,
+        description="curve from dB to grey: soft lifts faint echoes, contrast parts middle ones",
+    )
+    elevation_planes: int = given(
+        Quantity("number", 1, 15),
+        default=1,
+        description="slices averaged across the thickness of the beam; 1 is ideally thin",
+    )
+    elevation_width: float = given(
+        Quantity("length", 1e-4, 0.02),
+        default=2e-3,
+        description="m, thickness of the beam at its focus, full width at half maximum",
+    )
+    lateral_resolution: float = given(
+        _RESOLUTION,
+        default=0.0,
+        description="m, width of a point along the array at the focus, 6 dB below its peak; "
+        "0 is ideal",
+    )
+    axial_resolution: float = given(
+        _RESOLUTION,
+        default=0.0,
+        description="m, length of a point along the beam at the face, 6 dB below its peak; "
+        "0 is ideal",
+    )
+    contact: bool = given(
+        default=False,
+        description="whether beams whose part of the face touches no skin see only air",
+    )
+    reverberation: float = given(
+        Quantity("level", -ECHO_RANGE, 0.0),
+        default=-10.0,
+        description="dB, the face's first echo in air, where the strongest echo is 0",
+    )
+
+    def __post_init__(self) -> None:
+        require_given(self, "imaging", ProbeError)
+
+    @property
+    def changes_grey_levels(self) -> bool:
+        """Whether an echo is shown otherwise than by its own grey value in the volume."""
+        plain = (0.0, ECHO_RANGE, "linear")
+        return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)

@@ -1,0 +1,1 @@
+"""Transducers: where their beams and pixels are."""

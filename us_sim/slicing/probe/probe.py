@@ -1,0 +1,279 @@
+"""Transducers: what part of the patient they image, as pixels and as beams.
+
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> probe = LinearProbe(aperture=0.04, depth=0.05, columns=400, rows=500, lines=4)
+>>> probe.plane(Pose()).origin * 1e3
+array([-19.95,   0.  ,   0.05])
+>>> probe.beam_starts * 1e3
+array([[-15.,   0.],
+       [ -5.,   0.],
+       [  5.,   0.],
+       [ 15.,   0.]])
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import ProbeError
+from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity, given
+from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
+
+__all__ = ["BEAM_LINES", "BEAM_SAMPLES", "FOCUS", "IMAGE_DEPTH", "LinearProbe", "Probe"]
+
+IMAGE_DEPTH = Quantity("length", 5e-3, 0.4)
+FOCUS = Quantity("length", 1e-3, 0.4)
+BEAM_LINES = Quantity("number", 1, 4096)
+BEAM_SAMPLES = Quantity("number", 1, 16384)
+
+# A pixel centre that lies on the outline, up to rounding, is in it: part of a beam or of the lines.
+_ROUNDING = 1e-9
+
+_BAND = 64  # rows
+
+
+class Probe(ABC):
+    """A transducer with straight beams in the plane y = 0 of frame ``probe``.
+
+    The middle of its face is the origin and +z the middle beam's direction. Each beam starts on
+    the face and is ``depth`` long. Beam ``k`` of ``lines`` is the middle of the k-th of as many
+    equal parts of the face (of the opening angle, where beams spread), and its sample ``s`` of
+    ``samples`` the middle of the s-th part of its length. So line coordinates in the image run
+    from -0.5 to lines - 0.5.
+
+    The image is the bounding rectangle of all that the beams reach; pixels that no beam reaches
+    are black.
+    """
+
+    depth: float  # m, along the beams from the face
+    columns: int  # pixels along the array
+    rows: int  # pixels along the depth
+    lines: int  # beams
+    samples: int  # of each beam
+    focus: float | None  # m, along the beams from the face
+
+    @classmethod
+    def with_square_pixels(cls, rows: int, **geometry: Any) -> Self:
+        """The probe with as many columns as make pixels square, to half a column.
+
+        Raises:
+            ProbeError: see the geometry.
+        """
+        make: Any = cls
+        draft: Self = make(columns=1, rows=rows, **geometry)
+        columns = max(1, round(rows * draft.width / draft.height))
+        return dataclasses.replace(draft, columns=columns)  # type: ignore[type-var]
+
+    @property
+    @abstractmethod
+    def _outline(self) -> tuple[float, float, float]:
+        """Half the width, the top and the bottom (m, along x, z, z) of all that beams reach."""
+
+    @abstractmethod
+    def _beam(
+        self, x: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Through points (m): which part of all lines, 0 to 1, and the way from the face (m).
+
+        Outside what beams reach either is beyond its range.
+        """
+
+    @abstractmethod
+    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Start (n, 2) m and unit direction (n, 2), as x and z, of the beams at parts (n,)."""
+
+    @cached_property
+    def width(self) -> float:
+        """m, of the image along x."""
+        return 2 * self._outline[0]
+
+    @cached_property
+    def height(self) -> float:
+        """m, of the image along z."""
+        _, top, bottom = self._outline
+        return bottom - top
+
+    @cached_property
+    def pixel_spacing(self) -> NDArray[np.float64]:
+        """(2,) m: from one column to the next, and from one row to the next."""
+        return _kept(np.array([self.width / self.columns, self.height / self.rows]))
+
+    @cached_property
+    def image_to_probe(self) -> NDArray[np.float64]:
+        """(4, 4) m: from (column, row, 0, 1) of a pixel's centre to frame ``probe``."""
+        lateral, axial = self.pixel_spacing
+        half_width, top, _ = self._outline
+        matrix = np.zeros((4, 4))
+        matrix[0, 0] = lateral
+        matrix[2, 1] = axial
+        matrix[1, 2] = -1.0  # so that it is a rotation but for the scale: x, z and -y
+        matrix[:, 3] = (0.5 * lateral - half_width, 0.0, 0.5 * axial + top, 1.0)
+        return _kept(matrix)
+
+    @cached_property
+    def beam_starts(self) -> NDArray[np.float64]:
+        """(lines, 2) m: x and z of each beam on the face."""
+        return _kept(self._rays(self._line_parts)[0])
+
+    @cached_property
+    def beam_directions(self) -> NDArray[np.float64]:
+        """(lines, 2): x and z of each beam's unit direction."""
+        return _kept(self._rays(self._line_parts)[1])
+
+    @cached_property
+    def pixel_beams(self) -> NDArray[np.float32]:
+        """(2, rows, columns): each pixel's line coordinate, and its way (m) along that beam.
+
+        The line coordinate is fractional between lines. NaN where no beam reaches.
+        """
+        beams = np.full((2, self.rows, self.columns), np.nan, dtype=np.float32)
+        for band, part, way, reached in self._bands():
+            line = part * self.lines - 0.5
+            np.copyto(beams[0, band], line, where=reached, casting="same_kind")
+            np.copyto(beams[1, band], way, where=reached, casting="same_kind")
+        return _kept(beams)
+
+    @cached_property
+    def beam_pixels(self) -> NDArray[np.float32]:
+        """(2, samples, lines): the column and row, fractional, of each sample of each beam."""
+        lateral, axial = self.pixel_spacing
+        half_width, top, _ = self._outline
+        way = (np.arange(self.samples)[:, None] + 0.5) * (self.depth / self.samples)
+        x = self.beam_starts[:, 0] + way * self.beam_directions[:, 0]
+        z = self.beam_starts[:, 1] + way * self.beam_directions[:, 1]
+        pixels = np.stack([(x + half_width) / lateral, (z - top) / axial]) - 0.5
+        return _kept(pixels.astype(np.float32))
+
+    def plane(self, pose: Pose) -> SlicePlane:
+        """The pixels of the image taken with the probe at ``pose``, in the parent frame."""
+        rotation = pose.rotation
+        lateral, axial = self.pixel_spacing
+        return SlicePlane(
+            origin=rotation @ self.image_to_probe[:3, 3] + pose.position,
+            column_step=rotation[:, 0] * lateral,
+            row_step=rotation[:, 2] * axial,
+            columns=self.columns,
+            rows=self.rows,
+            spans=self._spans,
+        )
+
+    @property
+    def _spans(self) -> NDArray[np.int32] | None:
+        """(rows, 2, 2): runs of columns of each row that beams reach, None when they reach all."""
+        return self._reached_runs
+
+    @cached_property
+    def _reached_runs(self) -> NDArray[np.int32]:
+        return _kept(np.concatenate([_runs(reached) for *_, reached in self._bands()]))
+
+    def _bands(
+        self,
+    ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
+        """Rows, what `_beam` says of their pixels, and which of these are reached; a few at a time
+        lest large images need many times their own memory.
+        """
+        lateral, axial = self.pixel_spacing
+        half_width, top, _ = self._outline
+        x = (np.arange(self.columns) + 0.5) * lateral - half_width
+        for first in range(0, self.rows, _BAND):
+            band = slice(first, min(first + _BAND, self.rows))
+            z = (np.arange(band.start, band.stop) + 0.5) * axial + top
+            part, way = self._beam(x[None, :], z[:, None])
+            reached = (part >= -_ROUNDING) & (part <= 1 + _ROUNDING)
+            reached &= (way >= -_ROUNDING * self.depth) & (way <= (1 + _ROUNDING) * self.depth)
+            yield band, part, way, reached
+
+    @property
+    def _line_parts(self) -> NDArray[np.float64]:
+        return (np.arange(self.lines) + 0.5) / self.lines
+
+    def _require_possible(self) -> None:
+        """Refuse a value out of its range.
+
+        Raises:
+            ProbeError: with the key, the value and the range.
+        """
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if field.name in ("columns", "rows") or (field.name == "focus" and value is None):
+                continue
+            try:
+                number = field.metadata["quantity"].parse(value)
+                if field.type == "int" and number != int(number):
+                    raise ValueError(f"{value!r} is not a whole number")
+            except ValueError as error:
+                raise ProbeError(f"probe.{field.name}: {error}") from error
+            object.__setattr__(self, field.name, int(number) if field.type == "int" else number)
+        try:
+            require_pixel_counts(self.columns, self.rows)
+        except ProbeError as error:
+            raise ProbeError(f"probe.image: {error}") from error
+
+
+@dataclass(frozen=True)
+class LinearProbe(Probe):
+    """A linear array: parallel beams along +z of frame ``probe``, from the face downwards.
+
+    The image lies in y = 0. The centre of column ``i`` is at
+    ``x = (i + 0.5) aperture / columns - aperture / 2`` and that of row ``j`` at
+    ``z = (j + 0.5) depth / rows``, so the upper edge of row 0 is the transducer's face.
+
+    Raises:
+        ProbeError: a value is out of its range.
+    """
+
+    aperture: float = given(Quantity("length", 5e-3, 0.2))  # m, of the face along the array
+    depth: float = given(IMAGE_DEPTH)
+    columns: int = 512
+    rows: int = 512
+    lines: int = given(BEAM_LINES, default=192, kw_only=True)
+    samples: int = given(BEAM_SAMPLES, default=512, kw_only=True)
+    focus: float | None = given(FOCUS, default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._require_possible()
+
+    @property
+    def _outline(self) -> tuple[float, float, float]:
+        return 0.5 * self.aperture, 0.0, self.depth
+
+    @property
+    def _spans(self) -> None:
+        """Beams reach every pixel."""
+
+    def _beam(
+        self, x: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return tuple(np.broadcast_arrays(x / self.aperture + 0.5, z))  # type: ignore[return-value]
+
+    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        starts = np.zeros((len(part), 2))
+        starts[:, 0] = (part - 0.5) * self.aperture
+        return starts, np.tile([0.0, 1.0], (len(part), 1))
+
+
+def _kept(array: Any) -> Any:
+    """The array, made read-only, since all share it."""
+    array.flags.writeable = False
+    return array
+
+
+def _runs(shown: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(rows, 2, 2): first and end column of up to two runs of each row of (rows, columns)."""
+    edges = np.diff(np.pad(shown, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    runs = np.zeros((len(shown), 2, 2), dtype=np.int32)
+    for which, sign in enumerate((1, -1)):
+        row, column = np.nonzero(edges == sign)
+        number = np.arange(len(row)) - np.searchsorted(row, row)
+        runs[row, number, which] = column
+    return runs

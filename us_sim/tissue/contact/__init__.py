@@ -1,0 +1,1 @@
+"""Contact of the probe with the surface of the tissue."""

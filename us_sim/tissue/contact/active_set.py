@@ -1,0 +1,143 @@
+"""Which nodes the probe pushes, for solvers that prescribe their displacement.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.contact.active_set import ActiveSet
+>>> contact = ActiveSet(Sphere(0.03), np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), 0.01)
+>>> displacement = np.zeros((2, 3))
+>>> contact.revise(Pose(position=[0.0, 0.0, 0.01]), displacement)
+True
+>>> contact.touched, displacement[0]
+(array([ True, False]), array([0.  , 0.  , 0.01]))
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.collider import Collider
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out
+
+__all__ = ["ActiveSet"]
+
+# m. When the probe has moved this far off a touched node and off its rest position, it is let go at
+# once, without waiting for its force to change sign: after a jump it would be pulled far up first.
+_CLEARANCE = 1e-3
+
+# m. On taking over, a node this near the probe is taken to be pushed.
+_NEAR = 1e-4
+
+# Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
+# under it again without end. So a touched node stays so until it is this part of the spacing away.
+_SKIRT = 0.25
+
+# As a touched node slides along a curved surface, its prescribed displacement and its normal become
+# outdated. Renewing them starts the search anew, so while it goes on small errors wait.
+_DRIFT, _LITTLE_DRIFT = 1e-4, 1e-9  # m
+_TURN, _LITTLE_TURN = 0.05, 1e-7  # rad
+
+
+class ActiveSet:
+    """Frictionless unilateral contact: nodes join when entered and leave when they would be pulled.
+
+    Args:
+        collider: the probe's shape.
+        rest: (C, 3) m, rest positions of the nodes that it can touch, frame ``patient``.
+        spacing: m, between neighbours among them.
+    """
+
+    def __init__(self, collider: Collider, rest: NDArray[np.float64], spacing: float) -> None:
+        self._collider = collider
+        self._rest = rest
+        self._spacing = spacing
+        self.touched = np.zeros(len(rest), dtype=bool)  # (C,)
+        self.normal = np.zeros((len(rest), 3))  # (C, 3), of the probe at touched nodes
+        self.push = np.zeros(len(rest))  # (C,), N, of the probe along the normal
+
+    def clear(self) -> None:
+        """Touch nothing."""
+        self.touched[:] = False
+        self.normal[:] = 0.0
+        self.push[:] = 0.0
+
+    def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
+        """Take as touched what lies on the probe's surface; who is pulled leaves at a revision."""
+        gap, self.normal = self._gap(pose, self._rest + displacement)
+        self.touched = gap < _NEAR
+        self.push[:] = 0.0
+
+    def revise(
+        self,
+        pose: Pose | None,
+        displacement: NDArray[np.float64],
+        *,
+        exactly: bool = True,
+        moved: bool = True,
+    ) -> bool:
+        """Let go who is pulled, add who is entered, and move all touched nodes onto the probe.
+
+        Args:
+            pose: of the probe, or None when none is near.
+            displacement: (C, 3) m, corrected in place.
+            exactly: whether nodes that slid a little are corrected too.
+            moved: whether the probe has moved since the last revision.
+
+        Returns:
+            Whether the equations changed: the set, a normal, or a displacement.
+        """
+        if pose is None:
+            changed = bool(self.touched.any())
+            self.clear()
+            return changed
+        gap, normal = self._gap(pose, self._rest + displacement)
+        touched = self.touched & (self.push >= 0) & np.isfinite(gap)
+        departed = touched & (gap > _CLEARANCE)
+        if moved and departed.any():
+            rest_gap, _ = push_out(self._collider, pose, self._rest[departed], self._spacing)
+            touched[np.flatnonzero(departed)[rest_gap > _CLEARANCE]] = False
+        touched |= gap < -GAP_TOLERANCE
+        off = touched & (np.abs(gap) > (_LITTLE_DRIFT if exactly else _DRIFT))
+        turn = np.abs(normal - self.normal).max(axis=1)
+        turned = touched & (turn > (_LITTLE_TURN if exactly else _TURN))
+        if not (off.any() or turned.any() or (touched != self.touched).any()):
+            return False
+        displacement[touched] -= gap[touched, None] * normal[touched]
+        self.push[~touched] = 0.0
+        self.touched = touched
+        self.normal = np.where(touched[:, None], normal, 0.0)
+        return True
+
+    def consistent(self, pose: Pose | None, displacement: NDArray[np.float64]) -> bool:
+        """Whether a revision would change nothing."""
+        if pose is None:
+            return not self.touched.any()
+        gap, _ = self._gap(pose, self._rest + displacement)
+        return not (
+            (gap < -GAP_TOLERANCE).any()
+            or (np.abs(gap[self.touched]) > GAP_TOLERANCE).any()
+            or (self.push[self.touched] < 0).any()
+        )
+
+    def normal_at(
+        self, pose: Pose | None, displacement: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(C, 3) directions in which the probe pushes touched nodes where they are; else zero."""
+        if pose is None:
+            return np.zeros_like(self.normal)
+        _, normal = self._gap(pose, self._rest + displacement)
+        return np.where(self.touched[:, None], normal, 0.0)
+
+    def weigh(self, force: NDArray[np.float64]) -> None:
+        """Take the forces (C, 3) N that hold the nodes; what is along the normal is the push."""
+        self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
+
+    def _margin(self) -> NDArray[np.float64]:
+        return np.where(self.touched, _SKIRT * self._spacing, 0.0)
+
+    def _gap(
+        self, pose: Pose, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return push_out(self._collider, pose, points, self._spacing, self._margin())

@@ -1,0 +1,175 @@
+"""Frictionless contact on a compliance: find pushes p >= 0 with gaps W p + g >= 0 and no work.
+
+The linear complementarity problem 0 <= p, W p + g >= 0, p . (W p + g) = 0 is solved exactly by
+principal pivoting: nodes are released by the sign of their force and added by their true gap, all
+at once as long as that brings fewer of them (J. J. Judice and F. M. Pires, A block principal
+pivoting algorithm for large-scale strictly monotone linear complementarity problems, Computers &
+Operations Research 21, 1994), and one at a time, the least index first, when it does not, which
+cannot cycle (K. G. Murty, Note on a Bard-type scheme for solving the complementarity problem,
+Opsearch 11, 1974).
+
+>>> import numpy as np
+>>> from us_sim.tissue.contact.complementarity import unilateral
+>>> delassus = np.array([[2.0, 1.0], [1.0, 2.0]])
+>>> unilateral(delassus, np.array([-2.0, 1.0]), np.zeros(2, dtype=bool))
+(array([1., 0.]), array([ True, False]))
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["pivot", "solve_active", "unilateral"]
+
+# Block pivots that may fail to improve before pivots are made one at a time.
+_PATIENCE = 5
+
+# Part of the largest distance among the gaps below which a gap counts as closed.
+_ROUNDING = 1e-12
+
+# Part of its own compliance that each node yields more: rows that are combinations of others then
+# have a solution, and what the gaps open by is as far below them.
+_GIVE = 1e-12
+
+_SINGLE_PIVOTS = 20  # for each unknown, before relaxation takes over
+_SWEEPS = 2000
+
+
+def unilateral(
+    delassus: NDArray[np.float64], gap: NDArray[np.float64], start: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Solve 0 <= push, delassus push + gap >= 0, one of the two zero at each node.
+
+    Redundant rows are allowed: where pushes are not unique, one solution is returned. Should
+    rounding keep a solution from being recognised, projected Gauss-Seidel takes over from there.
+
+    Args:
+        delassus: (k, k) m/N, symmetric positive semidefinite, how pushes open gaps.
+        gap: (k,) m, finite, without any push.
+        start: (k,) guess of who is pushed, such as the last frame's.
+
+    Returns:
+        (k,) N, push, at least zero, and (k,) who is pushed.
+    """
+    push = np.zeros(len(gap))
+    active = np.array(start, dtype=np.bool_)
+    if len(gap):
+        pivot(np.ascontiguousarray(delassus), np.ascontiguousarray(gap), push, active)
+    return push, active
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def solve_active(delassus, rhs, index, count, factor, out):
+    """Solve delassus[index, index] x = rhs[index] by Cholesky; rows without compliance get x = 0.
+
+    ``factor`` (k, k) and ``out`` (k,) are filled in their first ``count`` rows.
+    """
+    for i in range(count):
+        row = factor[i]
+        full = delassus[index[i]]
+        for j in range(i):
+            other = factor[j]
+            value = full[index[j]]
+            for m in range(j):
+                value -= row[m] * other[m]
+            row[j] = value / other[j] if other[j] > 0.0 else 0.0
+        pivot = (1.0 + _GIVE) * full[index[i]]
+        for m in range(i):
+            pivot -= row[m] * row[m]
+        row[i] = np.sqrt(pivot) if pivot > 0.0 else 0.0
+        value = rhs[index[i]]
+        for m in range(i):
+            value -= row[m] * out[m]
+        out[i] = value / row[i] if row[i] > 0.0 else 0.0
+    for i in range(count - 1, -1, -1):
+        value = out[i] / factor[i, i] if factor[i, i] > 0.0 else 0.0
+        out[i] = value
+        for m in range(i):
+            out[m] -= factor[i, m] * value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pivot(delassus, gap, push, active):
+    """What `unilateral` does: fills push (k,) and active (k,), which comes in as the guess."""
+    k = len(gap)
+    factor = np.empty((k, k))
+    solution = np.empty(k)
+    index = np.empty(k, dtype=np.int64)
+    opened = np.empty(k)
+    tolerance = _ROUNDING * np.abs(gap).max()
+    fewest, patience, single = k + 1, _PATIENCE, 0
+    while single <= _SINGLE_PIVOTS * k:
+        count = 0
+        for i in range(k):
+            if active[i]:
+                index[count] = i
+                count += 1
+        solve_active(delassus, -gap, index, count, factor, solution)
+        push[:] = 0.0
+        heaviest = 0.0
+        for m in range(count):
+            push[index[m]] = solution[m]
+            heaviest = max(heaviest, abs(solution[m]))
+        _open(delassus, gap, index, count, push, opened)
+        wrong, first = 0, -1
+        for i in range(k):
+            bad = push[i] < -_ROUNDING * heaviest if active[i] else opened[i] < -tolerance
+            if bad:
+                wrong += 1
+                if first < 0:
+                    first = i
+        if wrong == 0:
+            for i in range(k):
+                push[i] = max(push[i], 0.0)
+                active[i] = push[i] > 0.0
+            return
+        if wrong < fewest:
+            fewest, patience = wrong, _PATIENCE
+        else:
+            patience -= 1
+        if patience > 0:
+            for i in range(k):
+                if push[i] < -_ROUNDING * heaviest if active[i] else opened[i] < -tolerance:
+                    active[i] = not active[i]
+        else:
+            single += 1
+            active[first] = not active[first]
+    _relax(delassus, gap, push, tolerance)
+    for i in range(k):
+        active[i] = push[i] > 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _open(delassus, gap, index, count, push, opened):
+    """Fills opened (k,) with delassus push + gap, pushes being at ``index`` only."""
+    opened[:] = gap
+    for m in range(count):
+        value = push[index[m]]
+        row = delassus[index[m]]
+        for i in range(len(opened)):
+            opened[i] += row[i] * value
+        opened[index[m]] += _GIVE * row[index[m]] * value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _relax(delassus, gap, push, tolerance):
+    """Projected Gauss-Seidel on push (k,), which comes in as a guess."""
+    k = len(gap)
+    for i in range(k):
+        push[i] = max(push[i], 0.0)
+    for _ in range(_SWEEPS):
+        change = 0.0
+        for i in range(k):
+            if delassus[i, i] <= 0.0:
+                push[i] = 0.0
+                continue
+            value = gap[i]
+            for j in range(k):
+                value += delassus[i, j] * push[j]
+            updated = max(push[i] - value / delassus[i, i], 0.0)
+            change = max(change, abs(updated - push[i]) * delassus[i, i])
+            push[i] = updated
+        if change <= tolerance:
+            return

@@ -1,0 +1,344 @@
+"""A probe without friction on an elastic surface of known compliance, solved to rounding.
+
+Newton's method: at every round the probe is replaced by its tangent planes where the nodes now are,
+the linear complementarity problem between pushes and gaps is solved exactly, and the nodes are
+moved. On a curved probe the planes turn with them, which Anderson's mixing of the last rounds
+takes into account (D. G. Anderson, Iterative procedures for nonlinear integral equations, J. ACM
+12, 1965), so that a few rounds bring the gaps below a nanometre.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.contact.compliant_contact import CompliantContact
+>>> rest = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+>>> springs = np.eye(6) / 50.0  # m/N, each node on springs of its own
+>>> contact = CompliantContact(Sphere(0.03), rest, 0.02, springs)
+>>> contact.press(Pose(position=[0.0, 0.0, 0.01]))
+True
+>>> bool(abs(contact.forces[0, 2] - 0.5) < 1e-9)  # N, 10 mm on 50 N/m
+True
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.geometry.collider import Collider
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.complementarity import pivot, solve_active
+from us_sim.tissue.contact.penetration import only_forward, pushing_gap
+
+__all__ = ["CLOSED", "SKIRT", "CompliantContact", "gaps", "gather", "yielded"]
+
+#: m. A gap this small is closed, and so is a node that is in the probe by this much.
+CLOSED = 1e-9
+
+# After so many rounds that mixed earlier ones, plain and shorter steps are surer.
+_MIXED = 30
+_ROUNDS = 250
+_SHORT = 0.7
+
+# Part of the spacing: nodes with wider gaps are not looked at unless they turn out to be entered.
+_NEAR = 0.4
+
+# Part of the spacing: open gaps wider than this wait for the next round.
+_AHEAD = 0.25
+
+# How many earlier rounds are mixed.
+_MEMORY = 4
+
+# Force along the surface, over the contact force, that is left when the normals have come to rest.
+_SLIDING = 1e-7
+
+#: Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
+#: under it again without end. So a pushed node counts as under the probe until it is this part of
+#: the spacing beside it, and farther each time that it comes back.
+SKIRT = 0.25
+
+
+class CompliantContact:
+    """Which surface nodes a frictionless probe pushes, and how hard.
+
+    Args:
+        collider: the probe's shape.
+        rest: (S, 3) m, rest positions of the nodes that it can touch, frame ``patient``.
+        spacing: m, between neighbours among them.
+        compliance: (3S, 3S) m/N, displacement 3 s + axis of force 3 t + axis.
+    """
+
+    def __init__(
+        self,
+        collider: Collider,
+        rest: NDArray[np.float64],
+        spacing: float,
+        compliance: NDArray[np.float64],
+    ) -> None:
+        self._box = collider.offset_box
+        self._forward = only_forward(collider, spacing)
+        self._rest = np.ascontiguousarray(rest)
+        self._spacing = spacing
+        self._compliance = compliance
+        self.forces = np.zeros((len(rest), 3))  # (S, 3), N, of the probe on the tissue
+        self.displacement = np.zeros((len(rest), 3))  # (S, 3), m; exact at `near` nodes
+        self.near = np.zeros(len(rest), dtype=bool)  # (S,), which the last press looked at
+        self.sliding_force = 0.0  # N, norm of what is left along the surface at pushed nodes
+
+    def clear(self) -> None:
+        """Touch nothing."""
+        self.forces[:] = 0.0
+        self.displacement[:] = 0.0
+        self.near[:] = False
+        self.sliding_force = 0.0
+
+    def press(self, pose: Pose) -> bool:
+        """Find the forces of the probe at a pose, starting from the last ones.
+
+        Only nodes near the probe are looked at; `overlooked` tells whether that was enough.
+
+        Returns:
+            Whether all gaps are closed or open as they should be, to a nanometre.
+        """
+        gap = self._gaps(pose)
+        self.near = (gap < _NEAR * self._spacing) | self.forces.any(axis=1)
+        return self._solve(pose)
+
+    def overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
+        """Whether nodes that the last press did not look at are in the probe.
+
+        Args:
+            pose: of the probe.
+            displacement: (S, 3) m, of all nodes under the forces found.
+        """
+        self.displacement[~self.near] = displacement[~self.near]
+        entered = (self._gaps(pose) < -CLOSED) & ~self.near
+        self.near |= entered
+        return bool(entered.any())
+
+    def press_again(self, pose: Pose) -> bool:
+        """As `press`, with what `overlooked` found."""
+        return self._solve(pose)
+
+    def _gaps(self, pose: Pose) -> NDArray[np.float64]:
+        gap = np.empty(len(self._rest))
+        normal = np.empty_like(self._rest)
+        skirt = np.where(self.forces.any(axis=1), SKIRT * self._spacing, 0.0)
+        everyone = np.arange(len(self._rest))
+        gaps(
+            self._box,
+            self._forward,
+            pose.rotation,
+            np.array(pose.position),
+            self._rest,
+            everyone,
+            self.displacement,
+            skirt,
+            gap,
+            normal,
+        )
+        return gap
+
+    def _solve(self, pose: Pose) -> bool:
+        near = np.flatnonzero(self.near)
+        displacement = self.displacement[near]
+        forces = self.forces[near]
+        converged, self.sliding_force = _newton(
+            self._box,
+            self._forward,
+            pose.rotation,
+            np.array(pose.position),
+            self._rest,
+            self._spacing,
+            self._compliance,
+            near,
+            displacement,
+            forces,
+        )
+        self.forces[:] = 0.0
+        self.forces[near] = forces
+        self.displacement[near] = displacement
+        return bool(converged)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gather(compliance, near):
+    """(3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
+    k = len(near)
+    block = np.empty((3 * k, 3 * k))
+    for m in range(k):
+        for axis in range(3):
+            row = compliance[3 * near[m] + axis]
+            for n in range(k):
+                for other in range(3):
+                    block[3 * m + axis, 3 * n + other] = row[3 * near[n] + other]
+    return block
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
+    """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
+    r = rotation
+    for m in range(len(index)):
+        i = index[m]
+        a = rest[i, 0] + displacement[m, 0] - origin[0]
+        b = rest[i, 1] + displacement[m, 1] - origin[1]
+        c = rest[i, 2] + displacement[m, 2] - origin[2]
+        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
+        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
+        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
+        g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
+        gap[m] = g
+        normal[m, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
+        normal[m, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz
+        normal[m, 2] = r[2, 0] * nx + r[2, 1] * ny + r[2, 2] * nz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, displacement, forces):
+    """Revises displacement (k, 3) and forces (k, 3) of the nodes ``near``.
+
+    Returns whether it converged, and the norm of the forces along the surface.
+    """
+    k = len(near)
+    block = gather(compliance, near)
+    gap, normal = np.empty(k), np.empty((k, 3))
+    active, was = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
+    joined, skirt = np.zeros(k, np.int64), np.zeros(k)
+    for m in range(k):
+        if forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0:
+            active[m] = True
+            joined[m] = 1
+            skirt[m] = SKIRT * spacing
+    point = displacement.copy()  # where the planes touch the probe
+    step, last_step = np.empty((k, 3)), np.empty((k, 3))
+    last_point = np.empty((k, 3))
+    points, steps = np.empty((_MEMORY, k, 3)), np.empty((_MEMORY, k, 3))
+    remembered = 0
+    converged, sliding = False, 0.0
+    for iteration in range(_ROUNDS):
+        gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
+        was[:] = active
+        _push(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
+        same = iteration > 0
+        for m in range(k):
+            if active[m] != was[m]:
+                same = False
+                if active[m]:
+                    joined[m] += 1
+                    skirt[m] = SKIRT * joined[m] * spacing
+        yielded(block, active, forces, displacement)
+        for m in range(k):
+            for axis in range(3):
+                step[m, axis] = displacement[m, axis] - point[m, axis]
+        gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
+        converged, sliding = _check(gap, normal, active, forces)
+        if converged or iteration == _ROUNDS - 1:
+            break
+        if same:
+            slot = remembered % _MEMORY
+            points[slot] = point - last_point
+            steps[slot] = step - last_step
+            remembered += 1
+        else:
+            remembered = 0
+        if iteration >= _MIXED:
+            point += _SHORT * step
+            continue
+        last_point[:] = point
+        last_step[:] = step
+        _mix(active, step, points, steps, min(remembered, _MEMORY), point)
+    return converged, sliding
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _push(block, point, gap, normal, limit, first, active, forces):
+    """Fills active (k,), which comes in as a guess, and forces (k, 3), with the planes of the probe
+    at point (k, 3) displaced nodes, where their gap is (k,) and its normal (k, 3).
+    """
+    k = len(gap)
+    chosen = np.flatnonzero((gap < limit) | (active & np.isfinite(gap)))
+    count = len(chosen)
+    delassus = np.empty((count, count))
+    offset, push, guess = np.empty(count), np.zeros(count), np.empty(count, np.bool_)
+    for p in range(count):
+        m = chosen[p]
+        x, y, z = normal[m, 0], normal[m, 1], normal[m, 2]
+        offset[p] = gap[m] - (x * point[m, 0] + y * point[m, 1] + z * point[m, 2])
+        guess[p] = active[m] or (first and gap[m] < 0.0)
+        a, b, c = block[3 * m], block[3 * m + 1], block[3 * m + 2]
+        for q in range(p + 1):
+            n = chosen[q]
+            value = 0.0
+            for axis in range(3):
+                j = 3 * n + axis
+                value += (x * a[j] + y * b[j] + z * c[j]) * normal[n, axis]
+            delassus[p, q] = value
+            delassus[q, p] = value
+    if count > 0:
+        pivot(delassus, offset, push, guess)
+    for m in range(k):
+        active[m] = False
+        forces[m, 0] = forces[m, 1] = forces[m, 2] = 0.0
+    for p in range(count):
+        m = chosen[p]
+        active[m] = push[p] > 0.0
+        for axis in range(3):
+            forces[m, axis] = push[p] * normal[m, axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def yielded(block, active, forces, displacement):
+    """Fills displacement (k, 3) with what forces (k, 3) at active nodes do."""
+    pushed = np.flatnonzero(active)
+    for i in range(len(block)):
+        row = block[i]
+        value = 0.0
+        for p in range(len(pushed)):
+            n = pushed[p]
+            for axis in range(3):
+                value += row[3 * n + axis] * forces[n, axis]
+        displacement[i // 3, i % 3] = value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _check(gap, normal, active, forces):
+    """Whether gaps and normals are as they should be, and the norm of forces along the surface."""
+    fits = True
+    load, sliding = 0.0, 0.0
+    for m in range(len(gap)):
+        if not active[m]:
+            fits &= gap[m] >= -CLOSED
+            continue
+        fits &= abs(gap[m]) <= CLOSED
+        along = 0.0
+        for axis in range(3):
+            along += forces[m, axis] * normal[m, axis]
+        for axis in range(3):
+            load += forces[m, axis] ** 2
+            sliding += (forces[m, axis] - along * normal[m, axis]) ** 2
+    return fits and sliding <= _SLIDING**2 * load, np.sqrt(sliding)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mix(active, step, points, steps, count, point):
+    """Moves point (k, 3) by its step, less what the last rounds' changes explain of it."""
+    gram = np.zeros((count, count))
+    weight = np.zeros(count)
+    for m in range(len(active)):
+        if active[m]:
+            for axis in range(3):
+                for a in range(count):
+                    weight[a] += steps[a, m, axis] * step[m, axis]
+                    for b in range(count):
+                        gram[a, b] += steps[a, m, axis] * steps[b, m, axis]
+    everyone = np.arange(count)
+    share = np.zeros(count)
+    if count > 0:
+        solve_active(gram, weight, everyone, count, np.empty((count, count)), share)
+    for m in range(len(active)):
+        for axis in range(3):
+            value = step[m, axis]
+            for a in range(count):
+                value -= share[a] * (points[a, m, axis] + steps[a, m, axis])
+            point[m, axis] += value

@@ -1,0 +1,1 @@
+"""Elastic forces and energies of tetrahedra and springs."""

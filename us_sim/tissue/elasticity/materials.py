@@ -1,0 +1,211 @@
+"""Elastic constants of tetrahedra, averaged over the labelled voxels that they contain.
+
+>>> import numpy as np
+>>> from us_sim.tissue.elasticity.materials import Material, average_over_labels
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
+>>> labels = np.ones((10, 10, 10), dtype=np.uint8)
+>>> index_from_patient = np.diag([1000.0, 1000.0, 1000.0, 1.0])
+>>> muscle = Material(young_modulus=12e3, poisson_ratio=0.45, density=1060.0)
+>>> average_over_labels(mesh, labels, index_from_patient, {1: muscle}).young_modulus
+array([12000., 12000., 12000., 12000., 12000.])
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.errors import MaterialError
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = [
+    "Material",
+    "TissueMaterials",
+    "average_over_labels",
+    "label_fractions",
+    "uniform_material",
+]
+
+# Samples of each tetrahedron: a fraction of its volume is known to about one percent.
+_SAMPLES = 1024
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear elastic constants.
+
+    Raises:
+        MaterialError: a constant is not physical.
+    """
+
+    young_modulus: float  # Pa, above 0
+    poisson_ratio: float  # above -1, below 0.5 (at 0.5 linear tetrahedra have no stiffness)
+    density: float = 1000.0  # kg/m3, above 0
+
+    def __post_init__(self) -> None:
+        for name in ("young_modulus", "density"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise MaterialError(f"{name} is {value!r}: give a number above zero")
+        if not -1 < self.poisson_ratio < 0.5:
+            raise MaterialError(
+                f"poisson_ratio is {self.poisson_ratio!r}: give a number above -1 and below 0.5"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class TissueMaterials:
+    """Constants of each tetrahedron of a mesh.
+
+    Raises:
+        MaterialError: different lengths, or a constant that is not physical.
+    """
+
+    young_modulus: NDArray[np.float64]  # (M,), Pa
+    poisson_ratio: NDArray[np.float64]  # (M,)
+    density: NDArray[np.float64]  # (M,), kg/m3
+
+    def __post_init__(self) -> None:
+        for name in ("young_modulus", "poisson_ratio", "density"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.ndim != 1 or len(values) != len(self.young_modulus):
+                raise MaterialError(f"{name} needs one number for each tetrahedron")
+            object.__setattr__(self, name, values)
+        unphysical = {
+            "young_modulus": ~(np.isfinite(self.young_modulus) & (self.young_modulus > 0)),
+            "poisson_ratio": ~((self.poisson_ratio > -1) & (self.poisson_ratio < 0.5)),
+            "density": ~(np.isfinite(self.density) & (self.density > 0)),
+        }
+        for name, bad in unphysical.items():
+            if bad.any():
+                where = int(np.flatnonzero(bad)[0])
+                others = f" and of {bad.sum() - 1} others" if bad.sum() > 1 else ""
+                raise MaterialError(
+                    f"{name} of tetrahedron {where}{others} is out of range, "
+                    f"{getattr(self, name)[where]:g}: moduli and densities are above zero, "
+                    f"Poisson's ratio is above -1 and below 0.5"
+                )
+
+
+def uniform_material(mesh: TetrahedralMesh, material: Material) -> TissueMaterials:
+    """The same material everywhere."""
+    count = len(mesh.tetrahedra)
+    return TissueMaterials(
+        np.full(count, material.young_modulus),
+        np.full(count, material.poisson_ratio),
+        np.full(count, material.density),
+    )
+
+
+def label_fractions(
+    mesh: TetrahedralMesh,
+    labels: NDArray[np.uint8],
+    index_from_patient: NDArray[np.float64],
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """How much of each tetrahedron each label fills.
+
+    The same 1024 low-discrepancy points (Kronecker sequence of the generalised golden ratio, mapped
+    to the simplex by sorting) are looked up in every tetrahedron, so that a tetrahedron smaller
+    than a voxel is served as well as one of a thousand voxels. Points beyond the volume take the
+    nearest voxel.
+
+    Args:
+        mesh: in frame ``patient``.
+        labels: (i, j, k).
+        index_from_patient: (4, 4) affine, patient metres to voxel indices (centres at integers).
+
+    Returns:
+        (L,) the labels that occur, ascending, and (M, L) their volume fractions; rows sum to 1.
+
+    Raises:
+        MaterialError: the labels are not a 3-D uint8 array, the map is not affine, or the mesh and
+            the labels do not overlap.
+    """
+    if labels.ndim != 3 or labels.dtype != np.uint8 or 0 in labels.shape:
+        raise MaterialError(
+            f"labels are {labels.dtype} of shape {labels.shape}: give a 3-D uint8 array"
+        )
+    affine = np.ascontiguousarray(index_from_patient, dtype=np.float64)
+    if affine.shape != (4, 4) or not np.isfinite(affine).all():
+        raise MaterialError("index_from_patient must be a finite 4x4 affine matrix")
+    indices = mesh.nodes @ affine[:3, :3].T + affine[:3, 3]
+    last = np.array(labels.shape) - 0.5
+    if (indices.max(axis=0) < -0.5).any() or (indices.min(axis=0) > last).any():
+        raise MaterialError(
+            f"the mesh lies outside the labelled volume: its voxel indices run from "
+            f"{indices.min(axis=0).round(1).tolist()} to {indices.max(axis=0).round(1).tolist()}, "
+            f"the volume has shape {list(labels.shape)}"
+        )
+    counts = _count_labels(indices, mesh.tetrahedra, np.asarray(labels), _simplex_points(_SAMPLES))
+    present = np.flatnonzero(counts.any(axis=0))
+    return present.astype(np.uint8), counts[:, present] / _SAMPLES
+
+
+def average_over_labels(
+    mesh: TetrahedralMesh,
+    labels: NDArray[np.uint8],
+    index_from_patient: NDArray[np.float64],
+    materials: Mapping[int, Material],
+) -> TissueMaterials:
+    """Constants of each tetrahedron: the average of its labels' constants by volume fraction.
+
+    Args:
+        mesh, labels, index_from_patient: as in `label_fractions`.
+        materials: of each label that occurs within the mesh.
+
+    Raises:
+        MaterialError: a label within the mesh has no material, or as `label_fractions`.
+    """
+    present, fractions = label_fractions(mesh, labels, index_from_patient)
+    missing = [int(label) for label in present if int(label) not in materials]
+    if missing:
+        raise MaterialError(
+            f"label {missing[0]} fills {fractions[:, present == missing[0]].sum():.2f} tetrahedra "
+            f"but has no material: add one for it"
+        )
+    constants = np.array(
+        [
+            (m.young_modulus, m.poisson_ratio, m.density)
+            for m in (materials[int(label)] for label in present)
+        ]
+    )
+    young_modulus, poisson_ratio, density = (fractions @ constants).T
+    return TissueMaterials(young_modulus, poisson_ratio, density)
+
+
+def _simplex_points(count: int) -> NDArray[np.float64]:
+    """(count, 4) barycentric coordinates spread evenly over a tetrahedron.
+
+    Points of the unit cube from M. Roberts' R3 sequence; the gaps between the sorted coordinates
+    of a uniform point are uniform on the simplex (Devroye 1986, V.3).
+    """
+    golden = 1.2207440846057596  # the real root of x**4 = x + 1
+    steps = golden ** -np.arange(1.0, 4.0)
+    cube = np.sort((0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0, axis=1)
+    return np.diff(cube, axis=1, prepend=0.0, append=1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_labels(indices, tetrahedra, labels, points):
+    """(M, 256) int32: in how many points (P, 4) of each tetrahedron each label is found.
+
+    indices (N, 3) are the nodes' voxel indices, labels (i, j, k).
+    """
+    counts = np.zeros((len(tetrahedra), 256), dtype=np.int32)
+    top = np.array([labels.shape[0] - 1, labels.shape[1] - 1, labels.shape[2] - 1])
+    voxel = np.empty(3, dtype=np.int64)
+    for t in range(len(tetrahedra)):
+        for p in range(len(points)):
+            for axis in range(3):
+                value = 0.5
+                for corner in range(4):
+                    value += points[p, corner] * indices[tetrahedra[t, corner], axis]
+                voxel[axis] = min(max(int(np.floor(value)), 0), top[axis])
+            counts[t, labels[voxel[0], voxel[1], voxel[2]]] += 1
+    return counts

@@ -1,0 +1,181 @@
+"""Nearly incompressible stable neo-Hookean tissue without a matrix: energy, forces, their slope.
+
+Linear tetrahedra with the energy of `neo_hookean_point`. What `bulk_shares` gives to the nodes
+resists the average change of volume around each of them:
+
+    sum over tetrahedra e of V (mu/2 (|F|^2 - 3) - mu (J - 1) + element/2 (J - 1)^2)
+    + 1/2 sum over nodes a of C q^2,   C = sum of c over a's e,   q = sum of c (J - 1) / C,
+
+with c = V nodal / 4, and what `neo_hookean_point` adds against being crushed. Linearised at rest it
+is the linear elasticity of the same shares.
+
+>>> import numpy as np
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+>>> mesh = box_mesh(*[uniform_planes(0.0, 0.1, 4)] * 3)
+>>> tissue = NeoHookean(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))
+>>> turned = mesh.nodes[:, [1, 2, 0]].T - mesh.nodes.T  # as a whole, by 120 degrees
+>>> displacement = np.ascontiguousarray(turned, dtype=np.float32)
+>>> bool(abs(tissue.forces(displacement)).max() < 1e-3), tissue.inverted(displacement)
+(True, 0)
+>>> round(tissue.smallest_volume_ratio(displacement), 5)
+1.0
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from us_sim.errors import SolverError
+from us_sim.tissue.elasticity.bulk_shares import bulk_shares
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
+from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["NeoHookean"]
+
+
+class NeoHookean:
+    """Energy, forces and tangent of a mesh whose fields are (3, N) arrays of one dtype.
+
+    Every node has its row, fixed ones too. Arrays given must be C-contiguous and of ``dtype``.
+    In single precision forces are right to about 1e-6 of the stresses that a displacement of its
+    own rounding makes, so a residual at Poisson's ratios above 0.499 wants double precision.
+
+    Args:
+        mesh: in frame ``patient``.
+        materials: of each tetrahedron.
+        dtype: float32, or float64.
+
+    Raises:
+        SolverError: another dtype; and from every method, a field of another shape or dtype.
+    """
+
+    def __init__(
+        self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike = np.float32
+    ) -> None:
+        self.dtype = np.dtype(dtype)
+        if self.dtype not in (np.float32, np.float64):
+            raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
+        self._count = len(mesh.nodes)
+        kind = TetrahedraSums if mesh.planes is None else CellSums
+        self._sums: TetrahedraSums | CellSums = kind(mesh, materials, self.dtype)
+        weight = bulk_shares(materials).nodal * mesh.volumes / 4
+        total = np.zeros(self._count)
+        np.add.at(total, mesh.tetrahedra, weight[:, None])
+        self._averaged = bool(total.any())
+        with np.errstate(divide="ignore"):
+            self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
+        self._nodal = np.zeros(self._count if self._averaged else 0, dtype=self.dtype)
+        self._nodal_blocks = _nodal_blocks(mesh, weight, total).astype(self.dtype)
+        self.linearise(np.zeros((3, self._count), dtype=self.dtype))
+
+    def energy(self, displacement: NDArray) -> float:
+        """J, summed in double precision."""
+        self._require(displacement)
+        energy = self._sums.energy(displacement)
+        if self._averaged:
+            self._sums.volume_changes(displacement, self._nodal)
+            energy += float(
+                np.einsum("i,i,i->", self._nodal, self._nodal, self._inverse, dtype=np.float64) / 2
+            )
+        return energy
+
+    def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
+        """(3, N) N, the slope of the energy: what must act on each node to hold it there."""
+        self._require(displacement)
+        out = np.empty_like(displacement) if out is None else out
+        self._require(out)
+        self._sums.forces(displacement, self._mean_change(displacement), out)
+        return out
+
+    def linearise(self, displacement: NDArray, positive: bool = False) -> None:
+        """Let `tangent_product` and `diagonal_blocks` be those at this displacement.
+
+        With ``positive`` the tangent has no negative eigenvalue (where no Poisson's ratio is
+        negative), as descent needs: it is the exact one wherever that has none by itself in a
+        tetrahedron, and elsewhere the stress there has less part in it.
+        """
+        self._require(displacement)
+        loosest = np.float32(0.0 if positive else np.inf)
+        self._sums.linearise(displacement, self._mean_change(displacement), loosest)
+
+    def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
+        """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
+        self._require(change)
+        out = np.empty_like(change) if out is None else out
+        self._require(out)
+        if self._averaged:
+            self._sums.volume_slopes(change, self._nodal)
+            self._nodal *= self._inverse
+        self._sums.tangent_product(change, self._nodal, out)
+        return out
+
+    def diagonal_blocks(self) -> NDArray:
+        """(6, N) N/m, the entries xx, xy, xz, yy, yz, zz of each node's block of the tangent.
+
+        The nodes' share of the bulk stiffness is counted as it is at rest.
+        """
+        blocks = np.empty((6, self._count), dtype=self.dtype)
+        self._sums.diagonal_blocks(blocks)
+        blocks += self._nodal_blocks
+        return blocks
+
+    def smallest_volume_ratio(self, displacement: NDArray) -> float:
+        """The smallest J, a tetrahedron's volume over its volume at rest; NaN if one is."""
+        self._require(displacement)
+        return self._sums.volume_ratios(displacement)[0]
+
+    def inverted(self, displacement: NDArray) -> int:
+        """How many tetrahedra have a J that is not above zero."""
+        self._require(displacement)
+        return self._sums.volume_ratios(displacement)[1]
+
+    def _require(self, field: NDArray) -> None:
+        if (
+            field.shape != (3, self._count)
+            or field.dtype != self.dtype
+            or not field.flags.c_contiguous
+        ):
+            raise SolverError(
+                f"a field of the neo-Hookean tissue is {field.dtype} of shape {field.shape}: give "
+                f"C-contiguous {self.dtype} of shape {(3, self._count)}"
+            )
+
+    def _mean_change(self, displacement: NDArray) -> NDArray:
+        if self._averaged:
+            self._sums.volume_changes(displacement, self._nodal)
+            self._nodal *= self._inverse
+        return self._nodal
+
+
+def _nodal_blocks(
+    mesh: TetrahedralMesh, weight: NDArray[np.float64], total: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(6, N) N/m, the diagonal blocks at rest of the nodes' share of the bulk stiffness.
+
+    Node n meets the average of each neighbour a, and its own, through s(a, n), the sum of c g over
+    the tetrahedra of both, g being n's shape gradient there; its block is the sum over a of
+    s s' / C(a).
+    """
+    count = len(mesh.nodes)
+    blocks = np.zeros((6, count))
+    if not total.any():
+        return blocks
+    pull = weight[:, None, None] * shape_gradients(mesh)
+    average = np.repeat(mesh.tetrahedra, 4, axis=1).ravel().astype(np.int64)
+    moved = np.tile(mesh.tetrahedra, (1, 4)).ravel()
+    pairs, place = np.unique(average * count + moved, return_inverse=True)
+    sums = np.empty((3, len(pairs)))
+    for axis in range(3):
+        sums[axis] = np.bincount(place, np.tile(pull[:, :, axis], (1, 4)).ravel(), len(pairs))
+    stiff = total[pairs // count] > 0
+    sums, pairs = sums[:, stiff], pairs[stiff]
+    for entry, (i, j) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+        products = sums[i] * sums[j] / total[pairs // count]
+        blocks[entry] = np.bincount(pairs % count, products, count)
+    return blocks

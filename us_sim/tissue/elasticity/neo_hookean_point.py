@@ -1,0 +1,282 @@
+"""The stable neo-Hookean material at one point, as a function of the displacement's gradient.
+
+Energy density of the deformation gradient F = I + h, with J = det F (B. Smith, F. de Goes and
+T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37, 2018, eq. 13, without the
+logarithmic barrier):
+
+    mu/2 (|F|^2 - 3) - mu (J - 1) + bulk/2 (J - 1)^2,    bulk = lambda + mu.
+
+It is a polynomial, so it holds for inverted tissue too, and linearised at rest it is Hooke's law.
+But it lets a tetrahedron be pressed to nothing by a finite force, as where a vein closes. So below
+a quarter of its volume (J0) a term is added that grows beyond bounds, twice continuously from zero,
+
+    mu (J0 - J)^3 / (3 J0 J),
+
+and below a sixty-fourth goes on as its Taylor polynomial of second order, to hold everywhere.
+
+Everything is written in h, not F, so that small strains keep all their digits in single precision.
+
+A 3x3 matrix is a tuple of nine numbers, row by row. These functions are compiled into the loops
+that call them, which LLVM then turns into vector instructions.
+
+>>> from us_sim.tissue.elasticity.neo_hookean_point import stress, volume_change
+>>> quarter_turn = (-1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0)
+>>> volume_change(quarter_turn)
+0.0
+>>> stress(quarter_turn, 3000.0, 0.0) == (0.0,) * 9
+True
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+__all__ = [
+    "HALF",
+    "INLINED",
+    "LOOP",
+    "ONE",
+    "block",
+    "cofactor_change",
+    "cofactor_slope",
+    "crowding",
+    "energy_density",
+    "inner",
+    "largest_stretch",
+    "limited",
+    "stress",
+    "stress_slope",
+    "volume_change",
+]
+
+# How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
+LOOP: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "nsz"},
+}
+INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
+
+# Exact in any precision, and they do not turn single precision into double, as literals would.
+ONE, HALF = np.float32(1.0), np.float32(0.5)
+_TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+
+# Parts of its volume: where a tetrahedron begins to resist being crushed, and where it is crushed.
+_CROWDED, _CRUSHED = np.float32(0.25), np.float32(1 / 64)
+
+# Below 1 over the root of 2.
+_LESS = np.float32(0.7)
+
+# Keeps quotients finite where nothing is strained.
+_TINY = np.float32(1e-30)
+_SMALL = np.float32(1e-3)
+
+
+@njit(**INLINED)
+def inner(a, b):
+    """The sum of the products of the entries of two matrices."""
+    return (
+        (a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+        + (a[3] * b[3] + a[4] * b[4] + a[5] * b[5])
+        + (a[6] * b[6] + a[7] * b[7] + a[8] * b[8])
+    )
+
+
+@njit(**INLINED)
+def cofactor_change(h):
+    """cof(I + h) - I; cof F is the derivative of det F."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
+    return (
+        (yy * zz - yz * zy) + (yy + zz),
+        (yz * zx - yx * zz) - yx,
+        (yx * zy - yy * zx) - zx,
+        (xz * zy - xy * zz) - xy,
+        (xx * zz - xz * zx) + (xx + zz),
+        (xy * zx - xx * zy) - zy,
+        (xy * yz - xz * yy) - xz,
+        (xz * yx - xx * yz) - yz,
+        (xx * yy - xy * yx) + (xx + yy),
+    )
+
+
+@njit(**INLINED)
+def cofactor_slope(h, d):
+    """The change of cof(I + h) for a small change d of h."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
+    dxx, dxy, dxz, dyx, dyy, dyz, dzx, dzy, dzz = d
+    return (
+        (yy * dzz + zz * dyy - yz * dzy - zy * dyz) + (dyy + dzz),
+        (yz * dzx + zx * dyz - yx * dzz - zz * dyx) - dyx,
+        (yx * dzy + zy * dyx - yy * dzx - zx * dyy) - dzx,
+        (xz * dzy + zy * dxz - xy * dzz - zz * dxy) - dxy,
+        (xx * dzz + zz * dxx - xz * dzx - zx * dxz) + (dxx + dzz),
+        (xy * dzx + zx * dxy - xx * dzy - zy * dxx) - dzy,
+        (xy * dyz + yz * dxy - xz * dyy - yy * dxz) - dxz,
+        (xz * dyx + yx * dxz - xx * dyz - yz * dxx) - dyz,
+        (xx * dyy + yy * dxx - xy * dyx - yx * dxy) + (dxx + dyy),
+    )
+
+
+@njit(**INLINED)
+def _volume_change_beyond_trace(h):
+    """det(I + h) - 1 - trace h."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
+    first = yy * zz - yz * zy
+    return (
+        first
+        + (xx * zz - xz * zx)
+        + (xx * yy - xy * yx)
+        + (xx * first + xy * (yz * zx - yx * zz) + xz * (yx * zy - yy * zx))
+    )
+
+
+@njit(**INLINED)
+def volume_change(h):
+    """J - 1, that is det(I + h) - 1."""
+    return (h[0] + h[4] + h[8]) + _volume_change_beyond_trace(h)
+
+
+@njit(**INLINED)
+def crowding(change):
+    """The term against being crushed, over mu, and its first and second slope by J = change + 1."""
+    ratio = ONE + change
+    held = _CRUSHED if ratio < _CRUSHED else ratio
+    beyond = ratio - held
+    missing = _CROWDED - held
+    missing = missing if missing > 0 else ONE - ONE
+    per = ONE / held
+    scale = missing / (_THREE * _CROWDED)
+    value = scale * missing * missing * per
+    slope = -scale * missing * (held + held + _CROWDED) * per * per
+    both = held * (held + _CROWDED) + _CROWDED * _CROWDED
+    curvature = (scale + scale) * both * per * per * per
+    return (
+        value + beyond * (slope + HALF * curvature * beyond),
+        slope + curvature * beyond,
+        curvature,
+    )
+
+
+@njit(**INLINED)
+def energy_density(h, shear, bulk):
+    """The energy density above."""
+    beyond = _volume_change_beyond_trace(h)
+    change = (h[0] + h[4] + h[8]) + beyond
+    plain = shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
+    return plain + shear * crowding(change)[0]
+
+
+@njit(**INLINED)
+def stress(h, shear, pressure):
+    """First Piola-Kirchhoff stress mu F + (p - mu) cof F, p being the slope of all else by J."""
+    c = cofactor_change(h)
+    k = pressure - shear
+    return (
+        (shear * h[0] + k * c[0]) + pressure,
+        shear * h[1] + k * c[1],
+        shear * h[2] + k * c[2],
+        shear * h[3] + k * c[3],
+        (shear * h[4] + k * c[4]) + pressure,
+        shear * h[5] + k * c[5],
+        shear * h[6] + k * c[6],
+        shear * h[7] + k * c[7],
+        (shear * h[8] + k * c[8]) + pressure,
+    )
+
+
+@njit(**INLINED)
+def stress_slope(h, c, d, shear, k, rise):
+    """The change of the stress for a small change d of h.
+
+    c is cof(I + h) - I, k = p - mu and rise the change of p.
+    """
+    e = cofactor_slope(h, d)
+    return (
+        (shear * d[0] + k * e[0]) + (rise * c[0] + rise),
+        (shear * d[1] + k * e[1]) + rise * c[1],
+        (shear * d[2] + k * e[2]) + rise * c[2],
+        (shear * d[3] + k * e[3]) + rise * c[3],
+        (shear * d[4] + k * e[4]) + (rise * c[4] + rise),
+        (shear * d[5] + k * e[5]) + rise * c[5],
+        (shear * d[6] + k * e[6]) + rise * c[6],
+        (shear * d[7] + k * e[7]) + rise * c[7],
+        (shear * d[8] + k * e[8]) + (rise * c[8] + rise),
+    )
+
+
+@njit(**INLINED)
+def block(g, c, shear, bulk):
+    """(xx, xy, xz, yy, yz, zz) of mu g.g I + bulk (cof F g)(cof F g)', c being cof F - I.
+
+    This is how a node with the shape gradient g resists its own displacement; the rest of the
+    stress has no part in it.
+    """
+    x = (c[0] * g[0] + c[1] * g[1] + c[2] * g[2]) + g[0]
+    y = (c[3] * g[0] + c[4] * g[1] + c[5] * g[2]) + g[1]
+    z = (c[6] * g[0] + c[7] * g[1] + c[8] * g[2]) + g[2]
+    plain = shear * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    return (
+        plain + bulk * x * x,
+        bulk * x * y,
+        bulk * x * z,
+        plain + bulk * y * y,
+        bulk * y * z,
+        plain + bulk * z * z,
+    )
+
+
+@njit(**INLINED)
+def largest_stretch(h):
+    """The largest singular value of I + h, to a thousandth, never less than it is.
+
+    A root of the characteristic polynomial of the strain is q + 2 p cos(acos(r) / 3); the cosine
+    is a root c of 4 c^3 - 3 c = r, found by a step of Newton's method from below.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
+    axx = (xx + xx) + (xx * xx + yx * yx + zx * zx)
+    ayy = (yy + yy) + (xy * xy + yy * yy + zy * zy)
+    azz = (zz + zz) + (xz * xz + yz * yz + zz * zz)
+    axy = (xy + yx) + (xx * xy + yx * yy + zx * zy)
+    axz = (xz + zx) + (xx * xz + yx * yz + zx * zz)
+    ayz = (yz + zy) + (xy * xz + yy * yz + zy * zz)
+    q = (axx + ayy + azz) / _THREE
+    axx, ayy, azz = axx - q, ayy - q, azz - q
+    square = (axx * axx + ayy * ayy + azz * azz) + _TWO * (axy * axy + axz * axz + ayz * ayz)
+    p = np.sqrt(square / (_THREE + _THREE))
+    per = ONE / (p + _TINY)
+    axx, ayy, azz, axy, axz, ayz = axx * per, ayy * per, azz * per, axy * per, axz * per, ayz * per
+    r = HALF * (
+        axx * (ayy * azz - ayz * ayz)
+        - axy * (axy * azz - ayz * axz)
+        + axz * (axy * ayz - ayy * axz)
+    )
+    r = -ONE if r < -ONE else r
+    r = ONE if r > ONE else r
+    below = np.sqrt(HALF + HALF * r)
+    below = _SMALL if below < _SMALL else below
+    c = HALF + HALF * below
+    c -= ((_TWO + _TWO) * c * c * c - _THREE * c - r) / (_TWELVE * c * c - _THREE)
+    stretch = ONE + q + _TWO * p * c
+    return np.sqrt(_TINY if stretch < _TINY else stretch)
+
+
+@njit(**INLINED)
+def limited(h, shear, k, loosest):
+    """k = p - mu, held within bounds where the stress's slope has no negative eigenvalue.
+
+    The slope's eigenvalues are mu + k s and mu - k s with s each singular value of F (Smith et al.,
+    section 4), and three more. All are positive or zero if |k| s <= mu, k has the sign opposite to
+    J's, |k| <= mu and bulk >= mu (Poisson's ratio is not negative); or if |k| s root 2 <= mu. The
+    bounds are never below ``loosest``.
+    """
+    s = largest_stretch(h)
+    usual = shear / (ONE if s < ONE else s)
+    other = _LESS * shear / s
+    bound = other if k * (ONE + volume_change(h)) > 0 else usual
+    bound = loosest if loosest > bound else bound
+    k = bound if k > bound else k
+    return -bound if k < -bound else k

@@ -1,0 +1,278 @@
+"""Sums of a stable neo-Hookean material over the tetrahedra of any mesh, sixty-four at a time.
+
+The gathering is in `tetrahedron_lanes`; a loop without branches runs over the lanes, which LLVM
+turns into vector instructions. The same input gives the same bytes.
+
+>>> import numpy as np
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
+>>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
+>>> sums = TetrahedraSums(mesh, uniform_material(mesh, Material(3e3, 0.2, 1000.0)), np.float64)
+>>> stretch = np.ascontiguousarray(mesh.nodes.T) * [[0.2], [0.0], [0.0]]
+>>> smallest, inverted = sums.volume_ratios(stretch)
+>>> f"{smallest:.6f} {inverted}"
+'1.200000 0'
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import DTypeLike, NDArray
+
+from us_sim.tissue.elasticity.bulk_shares import bulk_shares
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.neo_hookean_point import (
+    INLINED,
+    LOOP,
+    ONE,
+    block,
+    cofactor_change,
+    crowding,
+    energy_density,
+    inner,
+    limited,
+    stress,
+    stress_slope,
+    volume_change,
+)
+from us_sim.tissue.elasticity.tetrahedron_lanes import (
+    LANES,
+    OUT,
+    ROWS,
+    gather,
+    gather_scalar,
+    gradient,
+    in_lanes,
+    keep,
+    put_block,
+    put_forces,
+    scatter,
+    scatter_scalar,
+    stored,
+)
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["TetrahedraSums"]
+
+# Rows of the constants of sixty-four tetrahedra: three gradients, then V mu, V element, V nodal/4.
+_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = 9, 10, 11, 12
+
+# Rows of what the tangent needs: gradient of the displacement, and V (p - mu).
+_K, _TANGENT = 9, 10
+
+
+class TetrahedraSums:
+    """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
+
+    ``nodal`` arguments are (N,) sums or pressures of the nodes' share of the bulk stiffness.
+    """
+
+    def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
+        count = len(mesh.tetrahedra)
+        shares = bulk_shares(materials)
+        rows = np.empty((count, _CONSTANTS))
+        rows[:, :9] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
+        rows[:, _SHEAR] = mesh.volumes * shares.shear
+        rows[:, _ELEMENT] = mesh.volumes * shares.element
+        rows[:, _NODAL] = mesh.volumes * shares.nodal / 4
+        self._constants = in_lanes(rows).astype(dtype)
+        # Places beyond the last tetrahedron name node 0 and have no stiffness.
+        self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
+        self._tangent = np.zeros((len(self._nodes), _TANGENT * LANES), dtype=dtype)
+        self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
+
+    def energy(self, displacement: NDArray) -> float:
+        """J, of the tetrahedra's own share."""
+        return _energy(displacement, self._nodes, self._constants, self._lanes)
+
+    def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
+        """The smallest volume over rest volume, and how many are not above zero."""
+        return _volume_ratios(displacement, self._nodes, self._constants, self._lanes)
+
+    def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
+        """J, at each node the sum over its tetrahedra of their nodal weight times J - 1."""
+        _volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
+
+    def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
+        """(3, N) N, the energy's slope, given the nodes' mean volume change."""
+        _forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
+
+    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
+        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
+        _linearise(
+            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
+        )
+
+    def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
+        """J, how much `volume_changes` changes with the displacement."""
+        _volume_slopes(change, self._nodes, self._constants, self._tangent, self._lanes, nodal)
+
+    def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
+        """(3, N) N, how much the forces change, given the change of the nodes' mean."""
+        _tangent_product(
+            change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
+        )
+
+    def diagonal_blocks(self, out: NDArray) -> None:
+        """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' share."""
+        _diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
+
+
+@njit(**INLINED)
+def _nodal_sum(lanes, constants, w):
+    """The nodal weight times the sum of the nodes' values that `gather_scalar` has made."""
+    first = lanes[12 * LANES + w] + lanes[13 * LANES + w]
+    second = lanes[14 * LANES + w] + lanes[15 * LANES + w]
+    return constants[_NODAL * LANES + w] * (first + second)
+
+
+@njit(**INLINED)
+def _pressure(h, shear, lanes, rows, w):
+    """V times the slope of all energy but the shear's by J."""
+    change = volume_change(h)
+    own = rows[_ELEMENT * LANES + w] * change + shear * crowding(change)[1]
+    return own + _nodal_sum(lanes, rows, w)
+
+
+@njit(**LOOP)
+def _energy(displacement, nodes, constants, lanes):
+    total = 0.0
+    for chunk in range(len(nodes)):
+        gather(displacement, nodes[chunk], lanes)
+        rows = constants[chunk]
+        for w in range(LANES):
+            h = gradient(lanes, rows, w)
+            lanes[OUT * LANES + w] = energy_density(
+                h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w]
+            )
+        for w in range(LANES):
+            total += lanes[OUT * LANES + w]
+    return total
+
+
+@njit(**LOOP)
+def _volume_ratios(displacement, nodes, constants, lanes):
+    smallest = np.inf
+    inverted = 0
+    for chunk in range(len(nodes)):
+        gather(displacement, nodes[chunk], lanes)
+        rows = constants[chunk]
+        for w in range(LANES):
+            lanes[OUT * LANES + w] = ONE + volume_change(gradient(lanes, rows, w))
+        for w in range(LANES):
+            ratio = lanes[OUT * LANES + w]
+            if rows[_SHEAR * LANES + w] > 0:
+                if ratio < smallest or np.isnan(ratio):
+                    smallest = ratio
+                if not ratio > 0:
+                    inverted += 1
+    return smallest, inverted
+
+
+@njit(**LOOP)
+def _volume_changes(displacement, nodes, constants, lanes, nodal):
+    nodal[:] = 0
+    for chunk in range(len(nodes)):
+        gather(displacement, nodes[chunk], lanes)
+        rows = constants[chunk]
+        for w in range(LANES):
+            h = gradient(lanes, rows, w)
+            lanes[OUT * LANES + w] = rows[_NODAL * LANES + w] * volume_change(h)
+        scatter_scalar(lanes, nodes[chunk], nodal)
+
+
+@njit(**LOOP)
+def _forces(displacement, nodal, nodes, constants, lanes, forces):
+    forces[:, :] = 0
+    for chunk in range(len(nodes)):
+        gather(displacement, nodes[chunk], lanes)
+        if len(nodal):
+            gather_scalar(nodal, nodes[chunk], lanes)
+        rows = constants[chunk]
+        for w in range(LANES):
+            h = gradient(lanes, rows, w)
+            shear = rows[_SHEAR * LANES + w]
+            put_forces(stress(h, shear, _pressure(h, shear, lanes, rows, w)), rows, w, lanes)
+        scatter(lanes, nodes[chunk], forces)
+
+
+@njit(**LOOP)
+def _linearise(displacement, nodal, nodes, constants, lanes, tangent, loosest):
+    for chunk in range(len(nodes)):
+        gather(displacement, nodes[chunk], lanes)
+        if len(nodal):
+            gather_scalar(nodal, nodes[chunk], lanes)
+        rows = constants[chunk]
+        kept = tangent[chunk]
+        for w in range(LANES):
+            h = gradient(lanes, rows, w)
+            keep(h, kept, w)
+            shear = rows[_SHEAR * LANES + w]
+            pressure = _pressure(h, shear, lanes, rows, w)
+            kept[_K * LANES + w] = limited(h, shear, pressure - shear, loosest)
+
+
+@njit(**LOOP)
+def _volume_slopes(change, nodes, constants, tangent, lanes, nodal):
+    nodal[:] = 0
+    for chunk in range(len(nodes)):
+        gather(change, nodes[chunk], lanes)
+        rows = constants[chunk]
+        kept = tangent[chunk]
+        for w in range(LANES):
+            d = gradient(lanes, rows, w)
+            c = cofactor_change(stored(kept, w))
+            lanes[OUT * LANES + w] = rows[_NODAL * LANES + w] * (inner(c, d) + (d[0] + d[4] + d[8]))
+        scatter_scalar(lanes, nodes[chunk], nodal)
+
+
+@njit(**LOOP)
+def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
+    product[:, :] = 0
+    for chunk in range(len(nodes)):
+        gather(change, nodes[chunk], lanes)
+        if len(nodal):
+            gather_scalar(nodal, nodes[chunk], lanes)
+        rows = constants[chunk]
+        kept = tangent[chunk]
+        for w in range(LANES):
+            d = gradient(lanes, rows, w)
+            h = stored(kept, w)
+            c = cofactor_change(h)
+            shear = rows[_SHEAR * LANES + w]
+            bulk = rows[_ELEMENT * LANES + w] + shear * crowding(volume_change(h))[2]
+            rise = bulk * (inner(c, d) + (d[0] + d[4] + d[8])) + _nodal_sum(lanes, rows, w)
+            slope = stress_slope(h, c, d, shear, kept[_K * LANES + w], rise)
+            put_forces(slope, rows, w, lanes)
+        scatter(lanes, nodes[chunk], product)
+
+
+@njit(**LOOP)
+def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
+    blocks[:, :] = 0
+    for chunk in range(len(nodes)):
+        rows = constants[chunk]
+        kept = tangent[chunk]
+        for w in range(LANES):
+            h = stored(kept, w)
+            c = cofactor_change(h)
+            shear = rows[_SHEAR * LANES + w]
+            element = rows[_ELEMENT * LANES + w] + shear * crowding(volume_change(h))[2]
+            x = (rows[w], rows[LANES + w], rows[2 * LANES + w])
+            y = (rows[3 * LANES + w], rows[4 * LANES + w], rows[5 * LANES + w])
+            z = (rows[6 * LANES + w], rows[7 * LANES + w], rows[8 * LANES + w])
+            o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
+            put_block(block(o, c, shear, element), lanes, 0, w)
+            put_block(block(x, c, shear, element), lanes, 1, w)
+            put_block(block(y, c, shear, element), lanes, 2, w)
+            put_block(block(z, c, shear, element), lanes, 3, w)
+        for corner in range(4):
+            at = nodes[chunk, corner * LANES : (corner + 1) * LANES]
+            for entry in range(6):
+                values = blocks[entry]
+                added = lanes[(OUT + 6 * corner + entry) * LANES :]
+                for w in range(LANES):
+                    values[at[w]] += added[w]

@@ -1,0 +1,1 @@
+"""Direct and iterative solutions of the large sparse systems of tissue."""

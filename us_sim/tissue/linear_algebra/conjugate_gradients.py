@@ -1,0 +1,157 @@
+"""Preconditioned conjugate gradients on 3x3 blocks, with some nodes confined to planes.
+
+A mass point between two springs of 1 N/m, 1 m away from its rest, comes back in one iteration:
+
+>>> import numpy as np
+>>> from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients
+>>> start, columns = np.array([0, 1], dtype=np.int32), np.array([0], dtype=np.int32)
+>>> blocks = 2 * np.eye(3)[None]
+>>> displacement = np.array([[1.0, 0.0, 0.0]])
+>>> work = [np.zeros((1, 3)) for _ in range(3)]
+>>> slope, before, after = conjugate_gradients(
+...     start, columns, blocks, np.linalg.inv(blocks), np.empty(0, dtype=np.int64),
+...     np.empty((0, 3)), displacement, *work, -1.0, np.inf, 20, 1e-9,
+... )
+>>> before, after, displacement
+(2.0, 0.0, array([[0., 0., 0.]]))
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+__all__ = ["conjugate_gradients", "product_rows"]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def product_rows(start, columns, blocks, vector, rows):
+    """(len(rows), 3) those block rows of the matrix times vector (N, 3)."""
+    product = np.empty((len(rows), 3))
+    for k in range(len(rows)):
+        x = y = z = 0.0
+        for b in range(start[rows[k]], start[rows[k] + 1]):
+            v0 = vector[columns[b], 0]
+            v1 = vector[columns[b], 1]
+            v2 = vector[columns[b], 2]
+            x += blocks[b, 0, 0] * v0 + blocks[b, 0, 1] * v1 + blocks[b, 0, 2] * v2
+            y += blocks[b, 1, 0] * v0 + blocks[b, 1, 1] * v1 + blocks[b, 1, 2] * v2
+            z += blocks[b, 2, 0] * v0 + blocks[b, 2, 1] * v1 + blocks[b, 2, 2] * v2
+        product[k, 0] = x
+        product[k, 1] = y
+        product[k, 2] = z
+    return product
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(vector, touched, normal):
+    """Take the component along normal (T, 3) out of vector (N, 3) at the touched (T,) nodes."""
+    for t in range(len(touched)):
+        i = touched[t]
+        along = (
+            vector[i, 0] * normal[t, 0] + vector[i, 1] * normal[t, 1] + vector[i, 2] * normal[t, 2]
+        )
+        for axis in range(3):
+            vector[i, axis] -= along * normal[t, axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _multiply(start, columns, blocks, vector, product):
+    """product (N, 3) = matrix in 3x3 blocks times vector (N, 3); returns vector . product."""
+    energy = 0.0
+    for i in range(len(vector)):
+        x = y = z = 0.0
+        for b in range(start[i], start[i + 1]):
+            j = columns[b]
+            v0 = vector[j, 0]
+            v1 = vector[j, 1]
+            v2 = vector[j, 2]
+            x += blocks[b, 0, 0] * v0 + blocks[b, 0, 1] * v1 + blocks[b, 0, 2] * v2
+            y += blocks[b, 1, 0] * v0 + blocks[b, 1, 1] * v1 + blocks[b, 1, 2] * v2
+            z += blocks[b, 2, 0] * v0 + blocks[b, 2, 1] * v1 + blocks[b, 2, 2] * v2
+        product[i, 0] = x
+        product[i, 1] = y
+        product[i, 2] = z
+        energy += x * vector[i, 0] + y * vector[i, 1] + z * vector[i, 2]
+    return energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _precondition(preconditioner, residual, scaled):
+    """scaled (N, 3) = preconditioner (N, 3, 3) times residual (N, 3); returns r.z and r.r."""
+    slope = 0.0
+    square = 0.0
+    for i in range(len(residual)):
+        x = residual[i, 0]
+        y = residual[i, 1]
+        z = residual[i, 2]
+        m = preconditioner[i]
+        a = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
+        b = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
+        c = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+        scaled[i, 0] = a
+        scaled[i, 1] = b
+        scaled[i, 2] = c
+        slope += a * x + b * y + c * z
+        square += x * x + y * y + z * z
+    return slope, square
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def conjugate_gradients(
+    start,
+    columns,
+    blocks,
+    preconditioner,
+    touched,
+    normal,
+    displacement,
+    residual,
+    direction,
+    product,
+    slope,
+    norm,
+    iterations,
+    target,
+):
+    """Improve displacement (N, 3) by at most ``iterations``, until |residual| <= target.
+
+    Goes on with residual and direction when ``slope`` is positive, begins anew when it is negative,
+    and does nothing when it is 0; ``norm`` is then |residual|.
+
+    Returns:
+        The slope to go on with (0 when converged), and |residual| before and after.
+    """
+    if slope < 0.0:
+        _multiply(start, columns, blocks, displacement, residual)
+        for i in range(len(residual)):
+            for axis in range(3):
+                residual[i, axis] = -residual[i, axis]
+        _project(residual, touched, normal)
+        slope, square = _precondition(preconditioner, residual, direction)
+        norm = math.sqrt(square)
+    before = norm
+    if norm <= target or slope == 0.0:
+        return 0.0, before, norm
+    for _ in range(iterations):
+        energy = _multiply(start, columns, blocks, direction, product)
+        if not energy > 0.0:
+            return -1.0, before, norm
+        _project(product, touched, normal)
+        step = slope / energy
+        for i in range(len(displacement)):
+            for axis in range(3):
+                displacement[i, axis] += step * direction[i, axis]
+                residual[i, axis] -= step * product[i, axis]
+        last = slope
+        slope, square = _precondition(preconditioner, residual, product)
+        norm = math.sqrt(square)
+        if norm <= target:
+            return 0.0, before, norm
+        turn = slope / last
+        for i in range(len(direction)):
+            for axis in range(3):
+                direction[i, axis] = product[i, axis] + turn * direction[i, axis]
+    return slope, before, norm

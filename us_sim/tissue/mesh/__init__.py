@@ -1,0 +1,1 @@
+"""Tetrahedral meshes: made, read, checked, mended; points and surfaces in them."""

@@ -1,0 +1,127 @@
+"""Tetrahedral meshes of organs from files, placed in frame ``patient``.
+
+>>> import tempfile
+>>> from pathlib import Path
+>>> from us_sim.tissue.mesh.file import read_mesh
+>>> file = Path(tempfile.mkdtemp()) / "corner.msh"
+>>> _ = file.write_text("$NOD\\n4\\n1 0 0 0\\n2 90 0 0\\n3 0 90 0\\n4 0 0 90\\n$ENDNOD\\n"
+...                     "$ELM\\n1\\n1 4 1 1 4 1 2 3 4\\n$ENDELM\\n")
+>>> mesh, report = read_mesh(file, metres_per_unit=0.001)
+>>> f"{mesh.volumes.sum() * 1e6:.1f} ml"
+'121.5 ml'
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.mesh.gmsh_one import parse_gmsh_one
+from us_sim.tissue.mesh.repair import repair
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["read_mesh"]
+
+# A body smaller or larger than that, m, was given in the wrong unit.
+_SIZES = (1e-3, 10.0)
+
+# What a volume mesh may hold beside tetrahedra: their corners, edges and faces.
+_ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
+
+
+def read_mesh(
+    path: Path | str, metres_per_unit: float = 1.0, pose: Pose | None = None
+) -> tuple[TetrahedralMesh, tuple[str, ...]]:
+    """A mesh from a Gmsh, VTK or VTU file, or any other with tetrahedra that meshio reads.
+
+    Args:
+        path: the file.
+        metres_per_unit: the file's unit, 0.001 where it is in millimetres.
+        pose: of the file's own frame in ``patient``.
+
+    Returns:
+        The mesh, and a sentence on each thing that was repaired or left out.
+
+    Raises:
+        MeshError: the file is missing, unreadable or without tetrahedra, its size cannot be that of
+            a body, the mesh cannot be used, or meshio is needed and not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: there is no such mesh file")
+    if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
+        raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
+    try:
+        points, tetrahedra, left_out = _read(path)
+        nodes = points * metres_per_unit
+        if pose is not None:
+            nodes = pose.apply(nodes)
+        mesh, repaired = repair(nodes, tetrahedra)
+        size = float(np.ptp(mesh.nodes, axis=0).max())
+        if not _SIZES[0] <= size <= _SIZES[1]:
+            raise MeshError(
+                f"the mesh is {size:.3g} m long: give its unit, such as `unit: 1 mm` in a scene"
+            )
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    return mesh, (*left_out, *repaired)
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[str, ...]]:
+    """Points (N, 3), tetrahedra (M, 4), and what was left out."""
+    with path.open("rb") as file:
+        start = file.read(64).lstrip()
+    if start.startswith(b"$NOD"):
+        return *parse_gmsh_one(path.read_text(encoding="utf-8", errors="replace")), ()
+    content = _read_with_meshio(path)
+    parts: list[NDArray[np.integer]] = []
+    report = []
+    for block in content.cells:
+        if block.type == "tetra":
+            parts.append(block.data)
+        elif block.type == "tetra10":
+            parts.append(block.data[:, :4])
+            report.append(f"straightened the edges of {len(block.data)} quadratic tetrahedra")
+        elif block.type not in _ON_THEIR_SURFACE and len(block.data):
+            raise MeshError(
+                f"the file has {len(block.data)} cells of type {block.type}: mesh the body with "
+                f"tetrahedra only"
+            )
+    if not sum(map(len, parts)):
+        raise MeshError(
+            "the file has no tetrahedra: give a mesh of the body's volume, not of its surface"
+        )
+    points = np.asarray(content.points, dtype=np.float64)
+    return points, np.concatenate(parts), tuple(report)
+
+
+def _read_with_meshio(path: Path) -> Any:
+    try:
+        import meshio
+    except ImportError as error:
+        raise MeshError(
+            f"reading a {path.suffix or 'mesh'} file needs meshio; install it with "
+            f"`pip install meshio`"
+        ) from error
+    try:
+        # For a file that none of its readers takes, meshio prints and then leaves the process.
+        silence = io.StringIO()
+        with (
+            contextlib.redirect_stdout(silence),
+            contextlib.redirect_stderr(silence),
+            np.errstate(all="ignore"),
+        ):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise MeshError(
+            "this is not a tetrahedral mesh that can be read: give a Gmsh, VTK or VTU file, whole "
+            "and of an unstructured grid"
+        ) from error

@@ -1,0 +1,106 @@
+"""Which nodes of a mesh can be held or touched: by face, by where they look, and by label.
+
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> mesh = box_mesh([-0.05, 0.0, 0.05], [-0.05, 0.05], [0.0, 0.05, 0.1])
+>>> mesh.nodes[face_nodes(mesh, "top"), 2]
+array([0., 0., 0., 0., 0., 0.])
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError
+from us_sim.tissue.elasticity.materials import label_fractions
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["FACES", "face_nodes", "facing_nodes", "nodes_in_label"]
+
+#: Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue,
+#: so that the skin is the face of smallest z.
+FACES = {
+    "top": ((2, False),),
+    "bottom": ((2, True),),
+    "left": ((0, False),),
+    "right": ((0, True),),
+    "front": ((1, False),),
+    "back": ((1, True),),
+    "sides": ((0, False), (0, True), (1, False), (1, True)),
+}
+
+
+# Of a mesh that is no box: so near to its bounding box, as a fraction of the size, is at its face.
+_MARGIN = 0.05
+
+# The cosine to -z below which a probe that comes along +z would only graze the surface.
+_GRAZING = 0.1
+
+
+def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) -> NDArray[np.int32]:
+    """(K,) nodes at a face of the mesh's bounding box, ascending.
+
+    Of a box mesh, those in the plane of the face; of any other, those of its boundary that are
+    near to it, since an organ touches its bounding box at single nodes.
+
+    Args:
+        face: a name from `FACES`; ``top`` is the skin, ``sides`` are the four that stand on it.
+        margin: m, how near, for a mesh that is no box; a twentieth of its size along that axis
+            where it is not given.
+
+    Raises:
+        MeshError: there is no such face.
+    """
+    if face not in FACES:
+        raise MeshError(f"a box has no face {face!r}: name one of {', '.join(FACES)}")
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    rounding = 1e-9 * float((high - low).max())
+    eligible = np.ones(len(mesh.nodes), dtype=bool)
+    near = np.zeros(3)
+    if mesh.planes is None:
+        eligible[:] = False
+        eligible[mesh.boundary] = True
+        near[:] = _MARGIN * (high - low) if margin is None else margin
+    chosen = np.zeros(len(mesh.nodes), dtype=bool)
+    for axis, at_maximum in FACES[face]:
+        plane = (high if at_maximum else low)[axis]
+        chosen |= np.abs(mesh.nodes[:, axis] - plane) <= near[axis] + rounding
+    return np.flatnonzero(chosen & eligible).astype(np.int32)
+
+
+def facing_nodes(mesh: TetrahedralMesh) -> NDArray[np.int32]:
+    """(K,) nodes of the boundary that look towards the probe, which comes along +z, ascending.
+
+    Those whose normal, of the adjacent triangles weighted by area, is less than 84 degrees off -z.
+    """
+    a, b, c = (mesh.nodes[mesh.boundary[:, corner]] for corner in range(3))
+    areas = np.cross(b - a, c - a)
+    normals = np.zeros_like(mesh.nodes)
+    for corner in range(3):
+        np.add.at(normals, mesh.boundary[:, corner], areas)
+    lengths = np.linalg.norm(normals, axis=1)
+    return np.flatnonzero(-normals[:, 2] > _GRAZING * lengths).astype(np.int32)
+
+
+def nodes_in_label(
+    mesh: TetrahedralMesh,
+    labels: NDArray[np.uint8],
+    index_from_patient: NDArray[np.float64],
+    label: int,
+) -> NDArray[np.int32]:
+    """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending.
+
+    Args:
+        mesh, labels, index_from_patient: as in `tissue.elasticity.materials.label_fractions`.
+        label: its number in ``labels``.
+
+    Raises:
+        MaterialError: as `us_sim.tissue.elasticity.materials.label_fractions`.
+    """
+    present, fractions = label_fractions(mesh, labels, index_from_patient)
+    filled = fractions[:, present == label].sum(axis=1)
+    around = mesh.tetrahedra.ravel()
+    volume = np.bincount(around, np.repeat(mesh.volumes, 4), len(mesh.nodes))
+    inside = np.bincount(around, np.repeat(mesh.volumes * filled, 4), len(mesh.nodes))
+    return np.flatnonzero(inside > 0.5 * volume).astype(np.int32)

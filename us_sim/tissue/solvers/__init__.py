@@ -1,0 +1,1 @@
+"""Tissue solvers: one file each, behind one interface."""

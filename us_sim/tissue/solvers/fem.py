@@ -1,0 +1,169 @@
+"""The exact linear finite element method: every frame is solved to rounding, not iterated towards.
+
+The stiffness is constant. So what a force on each node that the probe can reach does to the whole
+tissue is computed once (`us_sim.tissue.linear_algebra.compliance`); in a frame the forces are found
+there, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and the field
+is their sum.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.solvers.fem import Fem
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> solver = Fem(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
+>>> deformation.residual < 1e-6, bool(deformation.force[2] < 0)
+(True, True)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import SolverError
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.compliant_contact import CompliantContact
+from us_sim.tissue.contact.friction import FrictionalContact
+from us_sim.tissue.contact.penetration import wrench_on_probe
+from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import TissueSolver, require_number
+
+__all__ = ["CONTACTS", "Fem"]
+
+#: What holds between the probe and the surface.
+CONTACTS = ("frictionless", "coulomb", "sticking")
+
+# From here on what rounding leaves is computed in every frame.
+_ROUNDING = 1e-5
+
+# How often nodes that were overlooked, because they were far from the probe, are added.
+_EXTENSIONS = 10
+
+
+class Fem(TissueSolver):
+    """Linear elasticity under a probe, by the compliance of the surface that it can reach.
+
+    The residual is what rounding leaves in the stored fields and the forces along the surface where
+    the probe is curved (without friction), or by which the forces had not settled (with it). What
+    rounding leaves is as measured when the fields were made, unless that is much, as with moduli
+    far apart: then it is computed in every frame.
+
+    Args:
+        model: at least three fixed nodes that are not on one line in every connected part.
+        contact: ``frictionless``, ``coulomb``, or ``sticking``: a touched node keeps its place on
+            the probe until it is pulled.
+        friction: Coulomb's coefficient.
+
+    Raises:
+        SolverError: a setting is out of range, or the tissue is not held.
+    """
+
+    name: ClassVar[str] = "fem"
+    farthest: ClassVar[float] = 3.0  # held as it is
+
+    def __init__(
+        self, model: TissueModel, *, contact: str = "frictionless", friction: float = 0.3
+    ) -> None:
+        if contact not in CONTACTS:
+            raise SolverError(f"fem.contact is {contact!r}: name one of {', '.join(CONTACTS)}")
+        require_number("fem.friction", friction, 0.0)
+        self._compliance = surface_compliance(model)
+        self._reached = self._compliance.nodes
+        surface = (
+            model.collider,
+            model.mesh.nodes[self._reached],
+            model.contact_spacing,
+            self._compliance.matrix,
+        )
+        if contact == "frictionless":
+            self._contact = CompliantContact(*surface)
+        else:
+            coefficient = friction if contact == "coulomb" else math.inf
+            self._contact = FrictionalContact(*surface, coefficient)
+        imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
+        self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
+        self._displacement = np.zeros_like(model.mesh.nodes)
+        super().__init__(model)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is; a quasi-static solver has no velocity."""
+        return TissueState(self._displacement.copy(), np.zeros_like(self._displacement))
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """Exact without friction; with it, how much a node may be dragged is not known."""
+        pushed = np.flatnonzero(self._contact.forces.any(axis=1))
+        if self._pose is None or len(pushed) == 0:
+            return np.zeros((6, 6))
+        if isinstance(self._contact, FrictionalContact):
+            return None
+        touched = self._reached[pushed]
+        return contact_stiffness(
+            self.model.collider,
+            self._pose,
+            self.model.mesh.nodes[touched] + self._displacement[touched],
+            self._contact.forces[pushed],
+            compliance_between(self._compliance.matrix, pushed),
+            self.model.contact_spacing,
+        )
+
+    def _restore(self, state: TissueState) -> None:
+        self._displacement = state.displacement.copy()
+        self._contact.clear()
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        contact, compliance = self._contact, self._compliance
+        action = ""
+        if pose is None:
+            contact.clear()
+        else:
+            solved = contact.press(pose)
+            displacement = compliance.field(contact.forces)
+            for _ in range(_EXTENSIONS):
+                if not contact.overlooked(pose, displacement[self._reached]):
+                    break
+                solved = contact.press_again(pose)
+                displacement = compliance.field(contact.forces)
+            else:
+                solved = False
+            if not solved:
+                action = "the contact did not settle, so the nearest solution found was kept"
+        self._settled = True
+        pushed = np.flatnonzero(contact.forces.any(axis=1))
+        if pose is None or len(pushed) == 0:
+            contact.clear()
+            self._displacement = np.zeros_like(self._displacement)
+            return self._resting()
+        displacement[self._reached[contact.near]] = contact.displacement[contact.near]
+        self._displacement = displacement
+        nodes = self.model.mesh.nodes + displacement
+        touched = self._reached[pushed]
+        forces = contact.forces[pushed]
+        force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        load = float(np.linalg.norm(forces))
+        residual = math.hypot(contact.sliding_force / load, self._rounding(touched, forces))
+        return Deformation(nodes, touched, force, torque, residual, action)
+
+    def _rounding(self, touched: NDArray[np.int32], forces: NDArray[np.float64]) -> float:
+        """Unbalanced force over the norm of the probe's forces (K, 3) N on touched (K,) nodes."""
+        if self._equations is None:
+            return self._compliance.rounding
+        balance = self._equations.forces(self._displacement)
+        balance[touched] -= forces
+        balance[self.model.fixed] = 0.0
+        return float(np.linalg.norm(balance) / np.linalg.norm(forces))

@@ -1,0 +1,203 @@
+"""The paper's finite element method: linear strain, a few conjugate-gradient iterations a frame.
+
+Quasi-static: every frame goes on from the last one's displacement towards K u = f, where the only
+load is a frictionless probe that may push and not pull. The nodes it pushes lie on its surface:
+their displacement along the normal is prescribed and projected out of the search space, as in
+D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section 5.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.solvers.fem_cg import FemCg
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> solver = FemCg(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> for _ in range(20):
+...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
+>>> deformation.residual < 1e-6, bool(deformation.nodes[:, 2].min() > -0.01)
+(True, True)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.active_set import ActiveSet
+from us_sim.tissue.contact.penetration import wrench_on_probe
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.linear_tetrahedra import free_stiffness, require_held, stiffness
+from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+
+__all__ = ["FemCg"]
+
+# How far the residual must fall before touched nodes that slid a little are corrected again.
+_REFINEMENT = 1e-2
+
+
+class FemCg(TissueSolver):
+    """Linear elasticity by preconditioned conjugate gradients with warm start.
+
+    The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
+    probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
+    of the contact forces; after a release, over the largest there were.
+
+    Args:
+        model: at least three fixed nodes that are not on one line in every connected part.
+        iterations: of the conjugate gradients in a frame (the paper's 20).
+        tolerance: residual at which a frame stops early.
+        contact_updates: how often in a frame the set of touched nodes is revised.
+
+    Raises:
+        SolverError: a setting is out of range, or the tissue is not held.
+    """
+
+    name: ClassVar[str] = "fem_cg"
+    farthest: ClassVar[float] = 3.0  # held as it is
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        iterations: int = 20,
+        tolerance: float = 1e-6,
+        contact_updates: int = 3,
+    ) -> None:
+        require_count("fem_cg.iterations", iterations)
+        require_count("fem_cg.contact_updates", contact_updates)
+        require_number("fem_cg.tolerance", tolerance, 0.0, 1.0)
+        require_held(model.mesh, model.fixed)
+        super().__init__(model)
+        self._tolerance = tolerance
+        updates = min(contact_updates, iterations)
+        self._rounds = np.diff(np.linspace(0, iterations, updates + 1).round().astype(int))
+
+        free = ~model.fixed
+        matrix = free_stiffness(stiffness(model.mesh, model.materials), model.fixed)
+        self._free = np.flatnonzero(free)
+        self._matrix = (matrix.indptr, matrix.indices, matrix.data)
+        rows = np.repeat(np.arange(len(self._free)), np.diff(matrix.indptr))
+        self._inverse = np.linalg.inv(matrix.data[rows == matrix.indices])
+        touchable = model.movable_contact_nodes
+        self._touchable = (np.cumsum(free) - 1)[touchable]
+        self._contact = ActiveSet(
+            model.collider, model.mesh.nodes[touchable], model.contact_spacing
+        )
+
+        self._displacement = np.zeros((len(self._free), 3))
+        self._residual = np.zeros_like(self._displacement)
+        self._direction = np.zeros_like(self._displacement)
+        self._product = np.zeros_like(self._displacement)
+        self._restore(self.state)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is; a quasi-static solver has no velocity."""
+        state = TissueState.at_rest(len(self.model.mesh.nodes))
+        state.displacement[self._free] = self._displacement
+        return state
+
+    def _restore(self, state: TissueState) -> None:
+        self._displacement[:] = state.displacement[self._free]
+        self._contact.clear()
+        self._renew_equations()
+        # N, norm of the contact forces that the residual refers to, and the largest since rest.
+        self._reference = self._heaviest = 0.0
+        self._taken_over = bool(self._displacement.any())
+
+    def _renew_equations(self) -> None:
+        """Constrain the preconditioner to the touched nodes' tangents, and search anew."""
+        touched = self._contact.touched
+        self._touched = self._touchable[touched]
+        self._normal = self._contact.normal[touched]
+        self._preconditioner = self._inverse.copy()
+        along = np.einsum("nij,nj->ni", self._inverse[self._touched], self._normal)
+        compliance = np.einsum("ni,ni->n", along, self._normal)
+        self._preconditioner[self._touched] -= (
+            along[:, :, None] * along[:, None, :] / compliance[:, None, None]
+        )
+        self._slope = -1.0
+        self._norm, self._refine_at = math.inf, 0.0
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        contact, displacement = self._contact, self._displacement
+        untouched = self._settled and not contact.touched.any()
+        if untouched and contact.consistent(pose, displacement[self._touchable]):
+            return self._resting()
+        if self._taken_over and pose is not None:
+            contact.adopt(pose, displacement[self._touchable])
+            self._renew_equations()
+        self._taken_over = False
+        moved = not same_pose(pose, self._pose)
+        for round_number, iterations in enumerate(self._rounds):
+            surface = displacement[self._touchable]
+            enough = 0.5 * self._tolerance * self._reference
+            exactly = self._norm <= max(self._refine_at, enough)
+            if contact.revise(pose, surface, exactly=exactly, moved=round_number == 0 and moved):
+                displacement[self._touchable] = surface
+                self._renew_equations()
+            anew = self._slope < 0.0
+            self._slope, before, self._norm = conjugate_gradients(
+                *self._matrix,
+                self._preconditioner,
+                self._touched,
+                self._normal,
+                displacement,
+                self._residual,
+                self._direction,
+                self._product,
+                self._slope,
+                self._norm,
+                iterations,
+                enough,
+            )
+            if anew:
+                self._refine_at = _REFINEMENT * before
+            contact.weigh(product_rows(*self._matrix, displacement, self._touchable))
+            load = float(np.linalg.norm(np.maximum(contact.push, 0.0)))
+            self._reference = load or self._heaviest
+        return self._outcome(pose)
+
+    def _outcome(self, pose: Pose | None) -> Deformation:
+        contact, displacement = self._contact, self._displacement
+        everywhere = np.arange(len(self._free), dtype=self._touchable.dtype)
+        unbalanced = product_rows(*self._matrix, displacement, everywhere)
+        normal = contact.normal_at(pose, displacement[self._touchable])
+        holding = np.einsum("ij,ij->i", unbalanced[self._touchable], normal)
+        push = np.where(contact.touched, np.maximum(holding, 0.0), 0.0)[:, None] * normal
+        unbalanced[self._touchable] -= push
+        imbalance = float(np.linalg.norm(unbalanced))
+        load = float(np.linalg.norm(push))
+        self._heaviest = max(self._heaviest, load) or imbalance  # taken over and not touched
+        self._reference = load or self._heaviest
+        residual = imbalance / self._reference if self._reference else 0.0
+        balanced = residual <= self._tolerance
+        self._settled = balanced and contact.consistent(pose, displacement[self._touchable])
+        nodes = self.model.mesh.nodes.copy()
+        nodes[self._free] += displacement
+        resting = self._settled or np.array_equal(nodes, self.model.mesh.nodes)
+        if resting and not contact.touched.any():
+            # Without a load the exact solution is the rest state.
+            nodes, displacement[:] = self.model.mesh.nodes.copy(), 0.0
+            self._heaviest = self._reference = residual = 0.0
+            self._slope = -1.0
+        elif not balanced and self._slope == 0.0:
+            # The updated residual has drifted from the true one.
+            self._slope = -1.0
+        pushing = push.any(axis=1)
+        pushed = self.model.movable_contact_nodes[pushing]
+        force, torque = np.zeros(3), np.zeros(3)
+        if pose is not None:
+            force, torque = wrench_on_probe(pose, nodes[pushed], push[pushing])
+        return Deformation(nodes, pushed, force, torque, residual)

@@ -1,0 +1,383 @@
+"""Large deformation of nearly incompressible tissue, in real time.
+
+Quasi-static: every frame the elastic energy of `neo_hookean` is made least among the displacements
+that keep out of the probe. A frame predicts by the exact linear answer to the probe's motion (on
+the surface compliance, its contact a complementarity problem) and by what the last frame added to
+that; then Newton steps of a few conjugate-gradient iterations, held on the probe's surface, correct
+it. Motion too large for one prediction is cut into sub-steps, which may go on in later frames; no
+step is taken that turns a tetrahedron inside out, or that lowers neither the unbalanced forces nor
+the energy.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> solver = FemNonlinear(model)
+>>> for _ in range(20):
+...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
+>>> deformation.residual <= 1e-5, deformation.action
+(True, '')
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.carried_correction import CarriedCorrection
+from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out, wrench_on_probe
+from us_sim.tissue.contact.prediction import predict_forces
+from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.linear_tetrahedra import require_held
+from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.newton import Newton
+from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+from us_sim.tissue.solvers.sub_steps import between, motion
+
+__all__ = ["FemNonlinear"]
+
+# One prediction carries the tissue this part of its smallest extent: 5 mm of 0.1 m.
+_STRIDE = 0.05
+
+# A prediction takes the time of so many iterations.
+_PREDICTION = 3
+
+# Conjugate-gradient iterations of a frame that may take 33 ms at 10,000 nodes, and of any frame.
+_BUDGET, _LEAST_BUDGET = 30, 12
+
+# Of one Newton step: solved further, a step after a large change overshoots.
+_NEWTON = 6
+
+# Iterations of a sub-step that others follow, and the residual with which they may.
+_PASSING, _PASSABLE = 4, 0.1
+
+# A sub-step is halved so often, if need be in later frames, before it is tried in full again.
+_HALVINGS = 4
+
+# Of a prediction that turns tetrahedra inside out, what is tried instead.
+_SHARES = (0.5, 0.0)
+
+# m. On taking over, a node this near the probe is taken to be pushed.
+_NEAR = 1e-4
+
+
+@dataclass(frozen=True)
+class _Effort:
+    least: int  # iterations
+    most: int  # iterations, until the goal is reached
+    goal: float  # residual
+    newton: int = _NEWTON  # iterations of one Newton step
+
+
+class FemNonlinear(TissueSolver):
+    """Stable neo-Hookean finite elements with frictionless contact, by Newton's method.
+
+    The residual is the norm of the unbalanced nodal forces (those on free nodes, those along the
+    probe's surface on touched nodes, and any with which the probe would have to pull) over the norm
+    of the contact forces (without any, over the largest since rest), in double precision and of
+    the displacement that is returned.
+
+    Args:
+        model: at least three fixed nodes that are not on one line in every connected part.
+        iterations: of the conjugate gradients in an ordinary frame.
+        frame_tolerance: residual down to which a frame goes on after those.
+        most_iterations: in any frame; what is then left to do waits for the next. By default 30,
+            less on meshes of more than 10,000 nodes.
+        tolerance: residual at which the tissue under an unmoved probe has settled.
+
+    Raises:
+        SolverError: a setting is out of range, or the tissue is not held.
+    """
+
+    name: ClassVar[str] = "fem_nonlinear"
+    farthest: ClassVar[float] = 3.0  # held as it is
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        iterations: int = 6,
+        frame_tolerance: float = 0.03,
+        most_iterations: int | None = None,
+        tolerance: float = 1e-5,
+    ) -> None:
+        require_count("fem_nonlinear.iterations", iterations)
+        if most_iterations is None:
+            most_iterations = max(
+                _LEAST_BUDGET, round(_BUDGET / max(1.0, len(model.mesh.nodes) / 1e4))
+            )
+        require_count("fem_nonlinear.most_iterations", most_iterations)
+        require_number("fem_nonlinear.frame_tolerance", frame_tolerance, 0.0, 1.0)
+        require_number("fem_nonlinear.tolerance", tolerance, 0.0, 1.0)
+        require_held(model.mesh, model.fixed)
+        super().__init__(model)
+        self._iterations = iterations
+        self._most_iterations = max(most_iterations, iterations)
+        self._frame_tolerance = frame_tolerance
+        self._tolerance = tolerance
+        self._surface = model.movable_contact_nodes
+        box = model.collider.offset_box
+        self._lever = float(np.linalg.norm(box[:3]) + box[3])
+        self._stride = _STRIDE * float(np.ptp(model.mesh.nodes, axis=0).min())
+        self._newton = Newton(model)
+        self._correction = CarriedCorrection(model.mesh)
+        if len(self._surface):
+            self._compliance = surface_compliance(model)
+        self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
+        self._restore(self.state)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is; a quasi-static solver has no velocity."""
+        displacement = self._newton.displacement.T.copy()
+        return TissueState(displacement, np.zeros_like(displacement))
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """As if the tissue yielded to a little more force as it does at rest."""
+        contact = self._newton.contact
+        pushed = np.flatnonzero(contact.push > 0.0)
+        if self._pose is None or len(pushed) == 0:
+            return np.zeros((6, 6))
+        return contact_stiffness(
+            self.model.collider,
+            self._pose,
+            self._newton.surface[pushed],
+            contact.push[pushed, None] * contact.normal[pushed],
+            compliance_between(self._compliance.matrix, pushed),
+            self.model.contact_spacing,
+        )
+
+    def _restore(self, state: TissueState) -> None:
+        self._newton.rest()
+        self._forget()
+        self._heaviest = 0.0  # N, norm of the contact forces, the largest since rest
+        if state.displacement.any():
+            self._newton.displacement = np.ascontiguousarray(state.displacement.T)
+            self._taken_over = True
+
+    def _forget(self) -> None:
+        self._followed: Pose | None = None  # the pose that the tissue is at
+        self._retreat = 0.0  # m, by which it is still kept off the probe there
+        self._taken_over = False
+        self._halvings = 0  # of the next step, as longer ones came out inside out
+        self._correction.forget()
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        newton = self._newton
+        depth = self._depth(pose, self.model.mesh.nodes[self._surface])
+        if pose is None or depth <= GAP_TOLERANCE:
+            # Nothing reaches the undeformed tissue: it is the solution.
+            newton.rest()
+            self._forget()
+            self._heaviest = 0.0
+            self._settled = True
+            return self._resting()
+        actions = []
+        if self._taken_over:
+            self._adopt(pose)
+        anew = math.ceil(depth / self._stride)
+        if self._followed is None or anew < self._steps_to(pose):
+            if self._followed is not None:
+                actions.append("began anew from rest")
+            newton.rest()
+            self._forget()
+            self._followed, self._retreat = pose, depth
+        imbalance, load = newton.imbalance, newton.load
+        taken = self._follow(pose)
+        if taken > 1:
+            actions.append(f"sub-stepped {taken} times")
+        if taken == 0:
+            effort = _Effort(self._iterations, self._most_iterations, self._frame_tolerance)
+            if newton.imbalance <= self._frame_tolerance * newton.load:
+                # So near the solution a long step does not overshoot.
+                half = max(self._most_iterations // 2, 1)
+                effort = _Effort(half, half, 1.0, half)
+            newton.settle_on(self._followed, self._retreat)
+            self._improve(self._followed, self._retreat, effort)
+        progress = taken > 0 or newton.imbalance != imbalance or newton.load != load
+        progress |= 0 < self._halvings <= _HALVINGS
+        return self._outcome(pose, progress, actions)
+
+    def _depth(self, pose: Pose | None, points: NDArray[np.float64]) -> float:
+        """How deep (m) the probe is in points (C, 3), at least 0."""
+        if pose is None or len(points) == 0:
+            return 0.0
+        gap, _ = push_out(self.model.collider, pose, points, self.model.contact_spacing)
+        return max(0.0, -float(gap.min()))
+
+    def _adopt(self, pose: Pose) -> None:
+        """Go on from another solver's displacement, or from rest where that is of no use."""
+        newton = self._newton
+        self._taken_over = False
+        if newton.tissue.smallest_volume_ratio(newton.displacement) <= 0.0:
+            return
+        self._followed, self._retreat = pose, self._depth(pose, newton.surface)
+        newton.contact.aim(pose, self._retreat, newton.surface)
+        newton.contact.touched = newton.contact.gap < _NEAR
+        newton.settle_on(pose, self._retreat)
+
+    def _steps_to(self, pose: Pose) -> int:
+        """Into how many steps the rest of the way is cut."""
+        assert self._followed is not None
+        if same_pose(self._followed, pose) and self._retreat == 0.0:
+            return 0
+        way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+        return max(1, math.ceil(max(way, self._retreat) / self._stride - 1e-6))
+
+    def _follow(self, pose: Pose) -> int:
+        """Step towards the pose as far as the frame's iterations go; returns the steps taken."""
+        newton, budget = self._newton, self._most_iterations
+        taken = 0
+        if self._halvings > _HALVINGS:
+            self._halvings = 0
+        ordinary = self._steps_to(pose) == 1
+        if not ordinary:
+            self._correction.forget()
+        while (steps := self._steps_to(pose)) and budget > 0:
+            assert self._followed is not None
+            share = 0.5**self._halvings / steps
+            target, retreat = between(self._followed, pose, share), self._retreat * (1 - share)
+            good = newton.snapshot()
+            effort = _Effort(_PASSING, budget - _PREDICTION, _PASSABLE)
+            if share == 1.0:
+                effort = replace(effort, least=self._iterations, goal=self._frame_tolerance)
+            used = self._attempt(target, retreat, effort, ordinary)
+            budget -= _PREDICTION + abs(used)
+            if used < 0:
+                newton.restore(good)
+                self._correction.forget()
+                self._halvings += 1
+                if self._halvings > _HALVINGS:
+                    break
+            else:
+                self._followed, self._retreat = target, retreat
+                self._halvings = max(self._halvings - 1, 0)
+                taken += 1
+        return taken
+
+    def _attempt(self, pose: Pose, retreat: float, effort: _Effort, ordinary: bool) -> int:
+        """One step; how many iterations it took, less than none when it came out inside out."""
+        newton = self._newton
+        assert self._followed is not None
+        start, touched = newton.displacement.copy(), newton.contact.touched.copy()
+        step = motion(self._followed, pose, self._lever)
+        guess = self._correction.guess(step, pose.rotation[:, 2])
+        if guess is not None:
+            newton.displacement = start + guess
+        self._predict(pose, retreat)
+        newton.displacement = newton.displacement + self._field
+        newton.settle_on(pose, retreat)
+        if newton.tissue.inverted(newton.displacement):
+            self._take_less(pose, retreat, start, touched)
+        used = self._improve(pose, retreat, effort)
+        inverted = newton.tissue.inverted(newton.displacement)
+        if inverted and inverted > newton.tissue.inverted(start):
+            return -max(used, 1)
+        if ordinary:
+            self._correction.learn(newton.displacement - start - self._field, step)
+        return used
+
+    def _take_less(
+        self,
+        pose: Pose,
+        retreat: float,
+        start: NDArray[np.float64],
+        touched: NDArray[np.bool_],
+    ) -> None:
+        """Start from what is left of a prediction that turns tetrahedra inside out, or from none.
+
+        Args:
+            pose, retreat: of the step.
+            start: (3, N) m, before the prediction.
+            touched: (S,), then.
+        """
+        newton = self._newton
+        least, best = newton.tissue.energy(newton.displacement), newton.snapshot()
+        change = newton.displacement - start
+        for share in _SHARES:
+            newton.displacement = start + share * change
+            newton.contact.touched = touched | (newton.contact.touched & (share > 0.0))
+            newton.settle_on(pose, retreat)
+            energy = newton.tissue.energy(newton.displacement)
+            if energy < least:
+                least, best = energy, newton.snapshot()
+        newton.restore(best)
+
+    def _rehearse(self) -> None:
+        newton = self._newton
+        newton.tissue.energy(newton.displacement)
+        self._correction.learn(np.zeros(newton.displacement.shape), np.eye(6)[0])
+        self._correction.guess(np.eye(6)[0], np.eye(3)[2])
+
+    def _improve(self, pose: Pose, retreat: float, effort: _Effort) -> int:
+        """Newton steps until the effort is spent; how many iterations were used."""
+        newton, used = self._newton, 0
+        while newton.imbalance > 0.0:
+            left = effort.least - used
+            if left <= 0 and newton.imbalance > effort.goal * newton.load:
+                left = effort.most - used
+            if left <= 0:
+                break
+            spent, better = newton.step(pose, retreat, min(left, effort.newton))
+            used += max(spent, 1)
+            if not better:
+                break
+        return used
+
+    def _predict(self, pose: Pose, retreat: float) -> None:
+        """Fill the field with the linear answer to the probe's new pose, and say who touches it."""
+        newton, contact = self._newton, self._newton.contact
+        before = contact.touched.copy()
+        contact.aim(pose, retreat, newton.surface)
+        change, contact.touched = predict_forces(
+            self._compliance.matrix,
+            contact.gap,
+            contact.normal,
+            newton.force[:, self._surface].T,
+            before,
+            2 * self._stride,
+        )
+        self._field[:] = 0.0
+        self._compliance.add_field(change, self._field)
+
+    def _outcome(self, pose: Pose, progress: bool, actions: list[str]) -> Deformation:
+        newton = self._newton
+        behind = self._steps_to(pose) > 0
+        assert self._followed is not None
+        kept = newton.snapshot()
+        if behind:
+            newton.weigh_on(pose)
+            way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+            actions.append(f"the tissue is {1e3 * max(way, self._retreat):.2g} mm behind")
+        contact = newton.contact
+        if newton.imbalance == 0.0 and newton.load == 0.0:
+            self._heaviest = 0.0  # still at rest
+        self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
+        reference = newton.load or self._heaviest
+        residual = newton.imbalance / reference if reference else 0.0
+        self._settled = not progress or (residual <= self._tolerance and not behind)
+        if not progress and residual > self._tolerance:
+            actions.append("no step led any further")
+        nodes = self.model.mesh.nodes + newton.displacement.T
+        pushed = contact.push > 0
+        touched = self._surface[pushed]
+        forces = contact.push[pushed, None] * contact.normal[pushed]
+        force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        newton.restore(kept)
+        return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))

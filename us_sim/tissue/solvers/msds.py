@@ -1,0 +1,310 @@
+"""The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.msds import Msds
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> solver = Msds(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
+masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import SolverError
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.penetration import only_forward, push_out
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
+from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
+from us_sim.tissue.elasticity.step_limit import highest_frequency, stabilised, step_limit
+from us_sim.tissue.elasticity.tangling import Tangling
+from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number
+from us_sim.tissue.solvers.symplectic_euler import advance_frame
+
+__all__ = ["Msds"]
+
+# s. Motion is watched for at least as long before the tissue counts as settled.
+_REST_TIME = 0.2
+
+# m. A released tissue that has settled this near its rest state is put there.
+_NEARLY_RESTING = 1e-4
+
+
+class Msds(TissueSolver):
+    """Point masses joined by Voigt elements (the paper's eqs. 1 to 5).
+
+    With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
+    so either each mass is raised to what the asked step needs or each step is divided. Both follow
+    the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
+    turn and stretch (`us_sim.tissue.elasticity.step_limit`).
+
+    The probe moves from the last pose to the new one over the frame. A node that would enter it
+    loses its velocity towards it, which is the measured push, and is put onto its surface.
+
+    The residual is the norm of the unbalanced elastic forces over the norm of the contact forces
+    (after a release, over the largest there were): how far the springs are from rest, not from
+    their own motion.
+
+    Args:
+        model: may be free; then the whole tissue moves away when pushed.
+        steps: in a frame.
+        time_step: s.
+        stiffness_factor: m, spring constant over Young's modulus.
+        damping_factor: s, damping constant over spring constant.
+        stiffness: of the springs: ``algorithm_1``, the paper's, or ``fitted`` to the elasticity of
+            the same mesh, which needs no stiffness_factor.
+        volume: whether tetrahedra resist changes of volume as the material does, and not only as
+            springs do, which have Poisson's ratio 1/4.
+        stabilisation: ``mass_scaling``, ``substeps``, or ``none``: a step beyond the limit then
+            ends in frames of which only the last good state is kept.
+        maximum_substeps: of one step; more are refused.
+        rest_tolerance: m, motion in a frame (in 0.2 s, or in damping_factor, if these are longer)
+            below which the tissue counts as settled.
+
+    Raises:
+        SolverError: a setting is out of range, or too many sub-steps would be needed.
+    """
+
+    name: ClassVar[str] = "msds"
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        steps: int = 20,
+        time_step: float = 0.01,
+        stiffness: str = "algorithm_1",
+        volume: bool = False,
+        stiffness_factor: float = 0.002,
+        damping_factor: float = 0.1,
+        stabilisation: str = "mass_scaling",
+        maximum_substeps: int = 100,
+        rest_tolerance: float = 1e-6,
+    ) -> None:
+        require_count("msds.steps", steps)
+        require_count("msds.maximum_substeps", maximum_substeps)
+        require_number("msds.time_step", time_step, 0.0)
+        require_number("msds.stiffness_factor", stiffness_factor, 0.0)
+        require_number("msds.rest_tolerance", rest_tolerance, 0.0)
+        if damping_factor != 0:
+            require_number("msds.damping_factor", damping_factor, 0.0)
+        if stabilisation not in ("mass_scaling", "substeps", "none"):
+            raise SolverError(
+                f"msds.stabilisation is {stabilisation!r}: choose mass_scaling, substeps or none"
+            )
+        super().__init__(model)
+        self._steps = steps
+        self._rest_tolerance = rest_tolerance
+        self._damping_factor = damping_factor
+        self._springs, self._volume = spring_tissue(
+            self.name,
+            model,
+            stiffness,
+            volume,
+            stiffness_factor,
+            damping_factor,
+            yielding=True,
+        )
+        self._volume_arrays = (
+            *self._volume.arrays,
+            np.empty_like(self._volume.rest_volume),
+            self._volume.yield_area,
+        )
+        self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
+        self.mass, self._substeps, self._action = stabilised(
+            model, self._factors, time_step, damping_factor, stabilisation, maximum_substeps
+        )  # mass: (N,) kg, as simulated
+        self._time_step = time_step / self._substeps
+        self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
+        self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
+        self._tangling = Tangling(model)
+        self._forward = only_forward(model.collider, model.contact_spacing)
+
+        self._positions = model.mesh.nodes.copy()
+        self._velocity = np.zeros_like(self._positions)
+        self._force = np.zeros_like(self._positions)
+        self._normal = np.zeros((len(model.movable_contact_nodes), 3))
+        self._restore(self.state)
+
+    @property
+    def step_limit(self) -> float:
+        """s, the longest stable step of small oscillations with the masses as simulated."""
+        if self.model.fixed.all():
+            return math.inf
+        frequency = highest_frequency(self._factors, self.mass, self.model.fixed)
+        return step_limit(frequency, self._damping_factor)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is and how fast it moves."""
+        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
+
+    def _restore(self, state: TissueState) -> None:
+        self._positions[:] = self.model.mesh.nodes + state.displacement
+        self._velocity[:] = state.velocity
+        self._velocity[self.model.fixed] = 0.0
+        self._touched = np.zeros(len(self._normal), dtype=bool)
+        self._balance.forget()
+        self._tangling.forget()
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        if self._settled and not self._touched.any() and not self._entered(pose):
+            return Deformation(
+                self._positions.copy(),
+                np.empty(0, np.int32),
+                np.zeros(3),
+                np.zeros(3),
+                self._last.residual,
+                self._action,
+            )
+        rotations, origins = self._path(pose)
+        wrench = np.zeros((2, 3))
+        self._touched[:] = False
+        advance_frame(
+            self._springs.edges,
+            self._springs.stiffness,
+            self._springs.damping,
+            self._springs.rest_length,
+            self._inverse_mass,
+            self._positions,
+            self._velocity,
+            self._force,
+            self._time_step,
+            self._substeps,
+            self._steps,
+            self.model.collider.offset_box,
+            self._forward,
+            rotations,
+            origins,
+            self.model.movable_contact_nodes,
+            self._touched,
+            self._normal,
+            wrench,
+            self._volume_arrays,
+            self._damping_factor,
+        )
+        return self._outcome(pose, wrench[0], wrench[1])
+
+    def _gap(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return push_out(
+            self.model.collider,
+            pose,
+            self._positions[self.model.movable_contact_nodes],
+            self.model.contact_spacing,
+        )
+
+    def _entered(self, pose: Pose | None) -> bool:
+        return pose is not None and bool((self._gap(pose)[0] < 0).any())
+
+    def _path(self, pose: Pose | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotations (S, 3, 3) and origins (S, 3) m of the probe at each step; S = 0 without one."""
+        if pose is None:
+            return np.empty((0, 3, 3)), np.empty((0, 3))
+        before = self._pose or self._lifted(pose)
+        way = np.arange(1, self._steps + 1)[:, None] / self._steps
+        origins = before.position + way * (pose.position - before.position)
+        if np.array_equal(before.orientation, pose.orientation):
+            rotations = np.repeat(pose.rotation[None], self._steps, axis=0)
+        else:
+            towards = pose.orientation * (1 if pose.orientation @ before.orientation >= 0 else -1)
+            turns = (1 - way) * before.orientation + way * towards
+            rotations = np.array([Pose(orientation=turn).rotation for turn in turns])
+        return rotations, origins
+
+    def _lifted(self, pose: Pose) -> Pose:
+        """Where a probe that was not there before has come from: straight up, until it is clear."""
+        gap, _ = self._gap(pose)
+        depth = max(0.0, -float(gap.min(initial=0.0)))
+        return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
+
+    def _outcome(
+        self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
+    ) -> Deformation:
+        action = self._put_back_if_tangled()
+        still = np.zeros_like(self._velocity)
+        elastic = self._springs.forces(self._positions, still)
+        elastic += self._volume.forces(self._positions, still)
+        elastic[self.model.fixed] = 0.0
+        touched = self.model.movable_contact_nodes[self._touched]
+        normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._touched]
+        residual = self._balance.residual(-elastic, touched, normal)
+
+        frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
+        speed = np.abs(self._velocity).max()
+        along = np.einsum("ij,ij->i", elastic[touched], normal)
+        elastic[touched] -= np.minimum(along, 0.0)[:, None] * normal
+        acceleration = np.abs(elastic * self._inverse_mass[:, None]).max()
+        self._settled = bool(
+            max(speed * max(frame, self._damping_factor), acceleration * frame**2)
+            < self._rest_tolerance
+            and not self._entered(pose)
+        )
+        if self._settled:
+            self._velocity[:] = 0.0
+            displaced = np.abs(self._positions - self.model.mesh.nodes).max()
+            if not self._touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
+                self._positions[:] = self.model.mesh.nodes
+                self._balance.forget()
+                residual = 0.0
+        return Deformation(self._positions.copy(), touched, force, torque, residual, action)
+
+    def _put_back_if_tangled(self) -> str:
+        """What was done about tetrahedra turned inside out, after what was done for stability."""
+        words, hopeless = self._tangling.judge(self._positions, bool(self._touched.any()))
+        if hopeless:
+            self._positions[:] = self.model.mesh.nodes
+            self._velocity[:] = 0.0
+            self._balance.forget()
+        return "; ".join(filter(None, [self._action, words]))
+
+
+def spring_tissue(
+    solver: str,
+    model: TissueModel,
+    stiffness: str,
+    volume: bool,
+    stiffness_factor: float,
+    damping_factor: float,
+    *,
+    yielding: bool = False,
+) -> tuple[SpringNetwork, VolumeTerm]:
+    """The springs, without those between fixed nodes, and the volume term that settings ask for.
+
+    Args:
+        solver: its name.
+        model, stiffness, volume, stiffness_factor, damping_factor: as in `Msds`.
+        yielding: as in `us_sim.tissue.elasticity.volume_term.volume_term`.
+
+    Raises:
+        SolverError: a setting is out of range.
+    """
+    if stiffness not in ("algorithm_1", "fitted"):
+        raise SolverError(f"{solver}.stiffness is {stiffness!r}: choose algorithm_1 or fitted")
+    if not isinstance(volume, bool):
+        raise SolverError(f"{solver}.volume is {volume!r}: give true or false")
+    mesh, materials = model.mesh, model.materials
+    if stiffness == "fitted":
+        springs = fitted_springs(mesh, materials, damping_factor, with_volume=volume)
+    else:
+        springs = springs_of(mesh, materials, stiffness_factor, damping_factor)
+    term = VolumeTerm.nothing(len(mesh.nodes))
+    if volume:
+        term = volume_term(mesh, materials, springs, damping_factor, yielding=yielding)
+    return springs.without(model.fixed), term

@@ -1,0 +1,347 @@
+"""Implicit Euler for the mass-spring tissue: one long step a frame, whatever its stiffness.
+
+The step is the minimum of `us_sim.tissue.elasticity.incremental_potential`. It is approached by
+conjugate gradients with the constant factored matrix of
+`us_sim.tissue.linear_algebra.scalar_preconditioner`; each of their steps lowers the function, so
+that no energy comes from nowhere and no time step is too long.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> solver = MsdsImplicit(model)
+>>> for _ in range(40):
+...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
+>>> deformation.residual < 1e-3, bool(deformation.force[2] < 0)
+(True, True)
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.active_set import ActiveSet
+from us_sim.tissue.contact.penetration import push_out, wrench_on_probe
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
+from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.springs import SpringNetwork
+from us_sim.tissue.elasticity.tangling import Tangling
+from us_sim.tissue.elasticity.volume_term import VolumeTerm
+from us_sim.tissue.linear_algebra.scalar_preconditioner import ScalarPreconditioner
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.msds import spring_tissue
+from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+
+__all__ = ["MsdsImplicit"]
+
+# s. Motion is watched for at least as long before the tissue counts as settled.
+_REST_TIME = 0.2
+
+# m. A released tissue that has settled this near its rest state is put there.
+_NEARLY_RESTING = 1e-4
+
+# How the preconditioner weighs springs and volumes, which resist in all directions alike there:
+# between what they resist to shear and to compression (found by trial).
+_SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
+
+# Part of a node's own stiffness that its inertia counts for at least in the preconditioner.
+_LEAST_INERTIA = 1e-9
+
+# How often a step that does not lower the function is halved.
+_HALVINGS = 20
+
+# Relative, of the function that is minimised.
+_ROUNDING = 1e-13
+
+
+class MsdsImplicit(TissueSolver):
+    """Point masses joined by springs and dampers, and tetrahedra that keep their volume.
+
+    Nodes that the probe enters are moved onto its surface and slide on it; they are let go when
+    they would be pulled. A probe that jumps takes the tissue along in one step.
+
+    The residual is the norm of the unbalanced elastic forces over the norm of the contact forces
+    (after a release, over the largest there were), as that of ``msds``.
+
+    Args:
+        model: may be free; then the whole tissue moves away when pushed.
+        iterations: of the conjugate gradients in a frame.
+        contact_updates: how often in a frame the set of touched nodes is revised.
+        tolerance: unbalanced force over contact force at which a frame stops early.
+        time_step: s, of a frame.
+        stiffness: of the springs: ``fitted`` to the elasticity of the same mesh, or
+            ``algorithm_1``, the paper's.
+        volume: whether tetrahedra resist changes of volume as the material does, and not only as
+            springs do, which have Poisson's ratio 1/4.
+        stiffness_factor: m, spring constant over Young's modulus, for ``algorithm_1``.
+        damping_factor: s, damping constant over spring constant.
+        rest_tolerance: m, motion in a frame (in 0.2 s, or in damping_factor, if these are longer)
+            below which the tissue counts as settled.
+
+    Raises:
+        SolverError: a setting is out of range.
+    """
+
+    name: ClassVar[str] = "msds_implicit"
+
+    def __init__(
+        self,
+        model: TissueModel,
+        *,
+        iterations: int = 2,
+        contact_updates: int = 1,
+        tolerance: float = 1e-4,
+        time_step: float = 0.2,
+        stiffness: str = "fitted",
+        volume: bool = True,
+        stiffness_factor: float = 0.002,
+        damping_factor: float = 0.1,
+        rest_tolerance: float = 1e-6,
+    ) -> None:
+        require_count("msds_implicit.iterations", iterations)
+        require_count("msds_implicit.contact_updates", contact_updates)
+        require_number("msds_implicit.tolerance", tolerance, 0.0, 1.0)
+        require_number("msds_implicit.time_step", time_step, 0.0)
+        require_number("msds_implicit.stiffness_factor", stiffness_factor, 0.0)
+        require_number("msds_implicit.rest_tolerance", rest_tolerance, 0.0)
+        if damping_factor != 0:
+            require_number("msds_implicit.damping_factor", damping_factor, 0.0)
+        super().__init__(model)
+        updates = min(contact_updates, iterations)
+        self._rounds = np.diff(np.linspace(0, iterations, updates + 1).round().astype(int))
+        self._tolerance = tolerance
+        self._time_step = time_step
+        self._rest_tolerance = rest_tolerance
+        self._rest_time = max(time_step, damping_factor, _REST_TIME)
+        springs, term = spring_tissue(
+            "msds_implicit", model, stiffness, volume, stiffness_factor, damping_factor
+        )
+        self.mass = model.lumped_mass
+        self._potential = IncrementalPotential(springs, term, self.mass, time_step, damping_factor)
+        self._touchable = model.movable_contact_nodes
+        self._contact = ActiveSet(
+            model.collider, model.mesh.nodes[self._touchable], model.contact_spacing
+        )
+        self._preconditioner = self._factored(springs, term, 1.0 + damping_factor / time_step)
+        self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
+        self._tangling = Tangling(model)
+        self._positions = model.mesh.nodes.copy()
+        self._velocity = np.zeros_like(self._positions)
+        self._restore(self.state)
+
+    def _factored(
+        self, springs: SpringNetwork, term: VolumeTerm, stiffening: float
+    ) -> ScalarPreconditioner:
+        mesh = self.model.mesh
+        ends, weights = [springs.edges], [_SPRING_WEIGHT * springs.stiffness]
+        if len(term.tetrahedra):
+            gradients = shape_gradients(mesh)
+            bulk = _VOLUME_WEIGHT * (term.element + term.nodal) * mesh.volumes
+            for a in range(4):
+                for b in range(a):
+                    ends.append(mesh.tetrahedra[:, [a, b]])
+                    dots = np.einsum("ij,ij->i", gradients[:, a], gradients[:, b])
+                    weights.append(-bulk * dots)
+        edges, weight = np.concatenate(ends), stiffening * np.concatenate(weights)
+        stiffest = np.zeros(len(mesh.nodes))
+        np.add.at(stiffest, edges, np.abs(weight)[:, None])
+        inertia = np.maximum(self.mass / self._time_step**2, _LEAST_INERTIA * stiffest)
+        return ScalarPreconditioner(edges, weight, inertia, ~self.model.fixed, self._touchable)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is and how fast it moves."""
+        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
+
+    def _restore(self, state: TissueState) -> None:
+        self._positions[:] = self.model.mesh.nodes + state.displacement
+        self._velocity[:] = state.velocity
+        self._velocity[self.model.fixed] = 0.0
+        self._contact.clear()
+        self._preconditioner.confine(np.zeros(0, np.intp), np.zeros((0, 3)))
+        self._tangling.forget()
+        self._energy = self._potential.elastic(self._positions)[0]  # J, of springs and volumes
+        self._balance.forget()
+        self._reference = 0.0  # N, what the tolerance refers to
+        self._taken_over = bool(state.displacement.any())
+
+    def _surface(self) -> NDArray[np.float64]:
+        """(C, 3) m, displacement of the nodes that the probe can touch."""
+        return (self._positions - self.model.mesh.nodes)[self._touchable]
+
+    def _advance(self, pose: Pose | None) -> Deformation:
+        contact = self._contact
+        untouched = self._settled and not contact.touched.any()
+        if self.model.fixed.all() or (untouched and contact.consistent(pose, self._surface())):
+            residual = self._last.residual
+            return Deformation(
+                self._positions.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), residual
+            )
+        if self._taken_over and pose is not None:
+            contact.adopt(pose, self._surface())
+            self._confine()
+        self._taken_over = False
+        moved = not same_pose(pose, self._pose)
+        before = self._positions.copy()
+        self._potential.begin(before, self._velocity)
+        if moved and self._goes_on(pose):
+            self._positions += self._time_step * self._velocity
+        given = -np.inf  # J, the most that the function was before it was lowered
+        for number, iterations in enumerate(self._rounds):
+            self._revise(pose, moved and number == 0)
+            given = max(given, self._minimise(iterations))
+        kinetic = self._kinetic()
+        self._velocity = (self._positions - before) / self._time_step
+        return self._outcome(pose, kinetic, given)
+
+    def _goes_on(self, pose: Pose | None) -> bool:
+        """Whether the touched nodes, moving on as they do, come nearer to the probe's surface."""
+        rows = self._touchable[self._contact.touched]
+        if pose is None or not len(rows):
+            return False
+        here = self._positions[rows]
+        gaps = []
+        for points in (here, here + self._time_step * self._velocity[rows]):
+            gap, _ = push_out(self.model.collider, pose, points, self.model.contact_spacing)
+            gaps.append(float(np.linalg.norm(gap)))
+        return gaps[1] < 0.5 * gaps[0]  # false where the probe has left a node
+
+    def _confine(self) -> None:
+        touched = np.flatnonzero(self._contact.touched)
+        self._preconditioner.confine(touched, self._contact.normal[touched])
+
+    def _revise(self, pose: Pose | None, moved: bool) -> None:
+        """Renew the set of touched nodes and put them onto the probe; the others go along."""
+        surface = self._surface()
+        was = surface.copy()
+        if not self._contact.revise(pose, surface, moved=moved):
+            return
+        self._confine()
+        touched = self._contact.touched
+        distance = np.einsum("ij,ij->i", surface - was, self._contact.normal)[touched]
+        self._preconditioner.move(self._positions, distance)
+        rows = self._touchable[touched]
+        self._positions[rows] = self.model.mesh.nodes[rows] + surface[touched]
+
+    def _unconfined(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The force (N, 3) without what holds fixed nodes and pushes touched ones."""
+        left = force.copy()
+        left[self.model.fixed] = 0.0
+        touched = self._contact.touched
+        rows, normal = self._touchable[touched], self._contact.normal[touched]
+        left[rows] -= np.einsum("ij,ij->i", left[rows], normal)[:, None] * normal
+        return left
+
+    def _minimise(self, iterations: int) -> float:
+        """Lower the function by so many iterations; its value before, J."""
+        potential = self._potential
+        value, force = potential.evaluate(self._positions)
+        start = value
+        left = self._unconfined(force)
+        stop = 0.5 * self._tolerance * self._reference
+        direction, previous, slope = np.zeros_like(left), left, np.inf
+        for _ in range(iterations):
+            if np.linalg.norm(left) <= stop:
+                break
+            step = self._preconditioner.solve(left)
+            # G. Polak and G. Ribiere's formula, started anew where it would turn back.
+            descent = float(np.vdot(left, step))
+            turn = max(0.0, (descent - float(np.vdot(step, previous))) / slope)
+            direction = step + turn * direction
+            if not np.vdot(direction, left) > 0:
+                direction = step
+            slope, previous = descent, left
+            along = float(np.vdot(direction, left))
+            bend = potential.curvature(self._positions, direction)
+            if not (along > 0 and bend > 0):
+                break
+            length = along / bend
+            for _halving in range(_HALVINGS):
+                tried = self._positions + length * direction
+                lower, force = potential.evaluate(tried)
+                if lower <= value - 1e-4 * length * along + _ROUNDING * abs(value):
+                    break
+                length *= 0.5
+            else:
+                break
+            self._positions, value = tried, lower
+            left = self._unconfined(force)
+        self._contact.weigh(-force[self._touchable])
+        load = float(np.linalg.norm(np.maximum(self._contact.push, 0.0)))
+        self._reference = load or self._balance.heaviest
+        return start
+
+    def _outcome(self, pose: Pose | None, kinetic: float, given: float) -> Deformation:
+        contact, touchable = self._contact, self._touchable
+        words, hopeless = self._tangling.judge(self._positions, bool(contact.touched.any()))
+        if hopeless:
+            self._positions = self.model.mesh.nodes.copy()
+            self._velocity[:] = 0.0
+            self._balance.forget()
+        energy, elastic = self._potential.elastic(self._positions)
+        self._limit_speed(kinetic, given, energy)
+        elastic[self.model.fixed] = 0.0
+        # As they slid, and were moved onto planes, the probe pushes them another way now.
+        normal = contact.normal_at(pose, self._surface())
+        loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
+        pushed = contact.touched & (loaded | (contact.push > 0))
+        residual = self._balance.residual(-elastic, touchable[pushed], normal[pushed])
+        self._settled = (
+            bool(np.abs(self._velocity).max() * self._rest_time < self._rest_tolerance)
+            and residual <= self._tolerance
+            and contact.consistent(pose, self._surface())
+        )
+        if self._settled:
+            self._velocity[:] = 0.0
+            displaced = np.abs(self._positions - self.model.mesh.nodes).max()
+            if not contact.touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
+                self._positions = self.model.mesh.nodes.copy()
+                self._balance.forget()
+                self._energy = residual = 0.0
+        force, torque = np.zeros(3), np.zeros(3)
+        if pose is not None:
+            pushes = np.maximum(contact.push[pushed, None], 0.0) * contact.normal[pushed]
+            rows = touchable[pushed]
+            force, torque = wrench_on_probe(pose, self._positions[rows], pushes)
+        return Deformation(
+            self._positions.copy(), touchable[pushed], force, torque, residual, words
+        )
+
+    def _kinetic(self) -> float:
+        """J."""
+        return 0.5 * float(self.mass @ np.einsum("ij,ij->i", self._velocity, self._velocity))
+
+    def _limit_speed(self, kinetic: float, given: float, energy: float) -> None:
+        """Take away what an unfinished minimisation or a jump of the probe brings in as speed.
+
+        What inertia, springs and volumes had at the start, with touched nodes where the probe has
+        put them, is the value of the function there; more than that cannot be left. And a jump
+        puts nodes elsewhere but does not throw them: kinetic energy grows by no more than the
+        springs' and volumes' energy has changed.
+
+        Args:
+            kinetic: J, before the frame.
+            given: J, the most that the function was before it was lowered.
+            energy: J, of springs and volumes now.
+        """
+        given += self._energy * self._potential.viscous_part
+        allowed = min(given - energy, kinetic + abs(energy - self._energy))
+        moving = self._kinetic()
+        if moving > max(allowed, 0.0):
+            self._velocity *= np.sqrt(max(allowed, 0.0) / moving)
+        self._energy = energy

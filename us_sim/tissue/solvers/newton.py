@@ -1,0 +1,257 @@
+"""Newton's method for tissue held on the probe: one step at a time, none for the worse.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import RoundedBox
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.newton import Newton
+>>> mesh = box_mesh(*[uniform_planes(0.0, 0.1, 4)] * 3)
+>>> top, bottom = np.flatnonzero(mesh.nodes[:, 2] == 0), mesh.nodes[:, 2] == 0.1
+>>> materials = uniform_material(mesh, Material(10e3, 0.3, 1000.0))
+>>> newton = Newton(TissueModel(mesh, materials, bottom, RoundedBox(0.5, 0.5, 0.1, 0.01), top))
+>>> newton.settle_on(Pose(position=[0.0, 0.0, 0.005]), 0.0)
+>>> unbalanced = newton.imbalance
+>>> for _ in range(4):
+...     used, better = newton.step(Pose(position=[0.0, 0.0, 0.005]), 0.0, 20)
+>>> newton.imbalance < 1e-3 * unbalanced
+True
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.sliding_contact import SlidingContact
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
+from us_sim.tissue.linear_algebra.projected_conjugate_gradients import (
+    Constraints,
+    apply_blocks,
+    inverse_blocks,
+    project,
+    projected_conjugate_gradients,
+)
+from us_sim.tissue.model import TissueModel
+
+__all__ = ["Newton"]
+
+# Young's moduli further apart than this leave nothing of the softer forces in single precision.
+_SINGLE_CONTRAST = 1e4
+
+# And the same for the resistance to a change of volume over that to one of shape.
+_SINGLE_BULK = 1e3
+
+# A step is halved so often before it is given up.
+_BACKTRACKS = 6
+
+# With a tetrahedron pressed to this part of its volume, steps along the exact tangent overshoot;
+# with none, those along one without negative eigenvalues fall short.
+_CROWDED = 0.2
+
+# Each step ends when its preconditioned residual has fallen to this part: the next one sees the
+# true slope again.
+_FORCING = 1e-2
+
+# Over the largest eigenvalue of the locally preconditioned stiffness at rest: 1 to 6 tried.
+_LOCAL_SHARE = 4.0
+
+# Power iterations towards the largest eigenvalue of the locally preconditioned stiffness.
+_POWER = 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Snapshot:
+    displacement: NDArray[np.float64]
+    force: NDArray[np.float64]
+    contact: SlidingContact
+    imbalance: float
+    load: float
+
+
+class Newton:
+    """Tissue somewhere, the forces in it, and the way to a better balance.
+
+    Args:
+        model: with at least one movable contact node.
+    """
+
+    def __init__(self, model: TissueModel) -> None:
+        mesh, modulus = model.mesh, model.materials.young_modulus
+        bulk = 1 / (1 - 2 * model.materials.poisson_ratio.max())  # lambda + mu over mu
+        single = modulus.max() <= _SINGLE_CONTRAST * modulus.min() and bulk <= _SINGLE_BULK
+        self._dtype: type[np.floating] = np.float32 if single else np.float64
+        self.tissue = NeoHookean(mesh, model.materials, np.float64)
+        # Conjugate gradients only correct; what they correct is in double precision.
+        self._tangent = NeoHookean(mesh, model.materials, self._dtype)
+        self._fixed = np.flatnonzero(model.fixed)
+        self._surface = model.movable_contact_nodes
+        self._surface_rest = mesh.nodes[self._surface]
+        self._grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
+        # As they are at rest: the deformed ones, computed anew at each step, save no iterations.
+        self._blocks: NDArray[np.floating] = self.tissue.diagonal_blocks().astype(self._dtype)
+        self._share = self._local_share()
+        shape = (3, len(mesh.nodes))
+        self._solution = np.empty(shape, self._dtype)
+        self._balance = np.empty(shape)
+        self.contact = SlidingContact(model.collider, model.contact_spacing)
+        self.displacement = np.zeros(shape)  # m
+        self.force = np.zeros(shape)  # N, what holds each node where it is
+        self.rest()
+
+    def rest(self) -> None:
+        """Undeformed, and touched nowhere."""
+        self.displacement = np.zeros_like(self.displacement)
+        self.force = np.zeros_like(self.force)
+        self.contact.clear(len(self._surface))
+        self.imbalance = 0.0  # N, norm of the unbalanced forces
+        self.load = 0.0  # N, norm of the contact forces
+
+    def snapshot(self) -> _Snapshot:
+        """What `restore` needs."""
+        return _Snapshot(
+            self.displacement.copy(),
+            self.force.copy(),
+            self.contact.copy(),
+            self.imbalance,
+            self.load,
+        )
+
+    def restore(self, snapshot: _Snapshot) -> None:
+        """Go back."""
+        self.displacement = snapshot.displacement.copy()
+        self.force = snapshot.force.copy()
+        self.contact = snapshot.contact.copy()
+        self.imbalance, self.load = snapshot.imbalance, snapshot.load
+
+    @property
+    def surface(self) -> NDArray[np.float64]:
+        """(C, 3) m, where the nodes are that the probe can touch."""
+        return self._surface_rest + self.displacement[:, self._surface].T
+
+    def settle_on(self, pose: Pose, retreat: float) -> None:
+        """Move nodes that touch or have entered the probe onto it, and weigh the forces."""
+        self.contact.aim(pose, retreat, self.surface)
+        self._hold(pose, retreat)
+        self._weigh()
+
+    def weigh_on(self, pose: Pose) -> None:
+        """Weigh the same forces against another pose's normals, moving nothing."""
+        self.contact.aim(pose, 0.0, self.surface)
+        self._weigh_contact()
+
+    def step(self, pose: Pose, retreat: float, iterations: int) -> tuple[int, bool]:
+        """One Newton step with a line search.
+
+        Args:
+            pose: of the probe, on which `settle_on` was called, or another step.
+            retreat: m, by which gaps are taken to be wider.
+            iterations: at most so many of the conjugate gradients.
+
+        Returns:
+            How many were used, and whether the step was taken; else nothing has changed.
+        """
+        contact = self.contact
+        contact.release()
+        touched = self._surface[contact.touched]
+        normal = contact.normal[contact.touched]
+        constraints = Constraints(self._fixed, touched, normal.astype(self._dtype))
+        residual = (self.force * (-1.0 / (self.imbalance or 1.0))).astype(self._dtype)
+        project(residual, constraints)
+        crowded = not self.tissue.smallest_volume_ratio(self.displacement) > _CROWDED
+        self._tangent.linearise(self.displacement.astype(self._dtype), positive=crowded)
+        blocks = self._blocks
+        turn = contact.curvature(pose, self.surface)
+        turn = (turn * contact.push[contact.touched][:, None, None]).astype(self._dtype)
+
+        def product(change: NDArray, image: NDArray) -> None:
+            self._tangent.tangent_product(change, image)
+            image[:, touched] -= np.einsum("kij,jk->ik", turn, change[:, touched])
+
+        self._grid.touch(touched, normal, _along(blocks[:, touched], normal))
+        inverse = inverse_blocks(blocks, self._share, constraints)
+        used, _ = projected_conjugate_gradients(
+            product,
+            inverse,
+            self._grid.add_correction,
+            constraints,
+            residual,
+            self._solution,
+            iterations,
+            _FORCING,
+        )
+        if self._search(pose, retreat, self._solution * np.float64(self.imbalance)):
+            return used, True
+        # Where a released node is driven back by its neighbours' move, its own way still leads on.
+        own = -self.force
+        project(own, constraints)
+        return used, self._search(pose, retreat, apply_blocks(inverse, own))
+
+    def _search(self, pose: Pose, retreat: float, change: NDArray[np.float64]) -> bool:
+        """Move by as much of the change as lowers the imbalance or the energy."""
+        before = self.snapshot()
+        inverted = energy = None
+        length = 1.0
+        for _ in range(_BACKTRACKS):
+            self.displacement = before.displacement + length * change
+            self.contact = before.contact.copy()
+            self._hold(pose, retreat)
+            smallest = self.tissue.smallest_volume_ratio(self.displacement)
+            if not smallest > 0.0 and inverted is None:
+                inverted = self.tissue.inverted(before.displacement)
+            if smallest > 0.0 or inverted:
+                self._weigh()
+                if self.imbalance < before.imbalance:
+                    return True
+                if energy is None:
+                    energy = self.tissue.energy(before.displacement)
+                if self.tissue.energy(self.displacement) < energy:
+                    return True
+            length /= 2
+        self.restore(before)
+        return False
+
+    def _hold(self, pose: Pose, retreat: float) -> None:
+        surface = self.surface
+        self.contact.hold(pose, retreat, surface)
+        self.displacement[:, self._surface] = (surface - self._surface_rest).T
+
+    def _weigh(self) -> None:
+        self.tissue.forces(self.displacement, self.force)
+        self._weigh_contact()
+
+    def _weigh_contact(self) -> None:
+        np.copyto(self._balance, self.force)
+        self._balance[:, self._fixed] = 0.0
+        held = self.force[:, self._surface].T
+        self._balance[:, self._surface] = self.contact.weigh(held).T
+        self.imbalance = float(np.linalg.norm(self._balance))
+        self.load = float(np.linalg.norm(np.maximum(self.contact.push, 0.0)))
+
+    def _local_share(self) -> float:
+        """What the local preconditioner weighs beside the coarse one, which needs no weight."""
+        none = np.zeros(0, np.int64)
+        constraints = Constraints(self._fixed, none, np.zeros((0, 3)))
+        inverse = inverse_blocks(self.tissue.diagonal_blocks(), 1.0, constraints)
+        shape = (3, inverse.shape[1])
+        vector = np.random.default_rng(0).standard_normal(shape)
+        largest = 0.0
+        for _ in range(_POWER):
+            project(vector, constraints)
+            largest = float(np.linalg.norm(vector))
+            if largest == 0.0:
+                return 1.0
+            vector = apply_blocks(inverse, self.tissue.tangent_product(vector / largest))
+        return _LOCAL_SHARE / largest
+
+
+def _along(blocks: NDArray[np.floating], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) n' D n of symmetric blocks (6, K) and normals (K, 3)."""
+    x, y, z = normal.T
+    xx, xy, xz, yy, yz, zz = blocks.astype(np.float64)
+    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)

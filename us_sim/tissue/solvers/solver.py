@@ -1,0 +1,258 @@
+"""The interface of all tissue solvers, and how one is made by its name.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.mesh.node_selection import face_nodes
+>>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.solver import create_solver
+>>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
+>>> mesh = box_mesh(across, across, deep)
+>>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
+>>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
+>>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> solver = create_solver("fem_cg", model)
+>>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
+>>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
+True
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from importlib import import_module
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import SolverError
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.tissue.model import TissueModel
+
+__all__ = [
+    "SOLVERS",
+    "TissueSolver",
+    "create_solver",
+    "require_count",
+    "require_number",
+    "same_pose",
+]
+
+#: Where each solver is found; a solver that is not asked for is not imported.
+SOLVERS = {
+    "fem": ("us_sim.tissue.solvers.fem", "Fem"),
+    "fem_nonlinear": ("us_sim.tissue.solvers.fem_nonlinear", "FemNonlinear"),
+    "fem_cg": ("us_sim.tissue.solvers.fem_cg", "FemCg"),
+    "msds": ("us_sim.tissue.solvers.msds", "Msds"),
+    "msds_implicit": ("us_sim.tissue.solvers.msds_implicit", "MsdsImplicit"),
+}
+
+# Frames in a row that may come to nothing before the tissue is put to rest.
+_PATIENCE = 5
+
+
+class TissueSolver(ABC):
+    """Deforms one tissue, frame by frame.
+
+    A solver never returns a number that is not finite, nor nodes that flew off: should a frame come
+    out so, the last good state stays and the deformation's ``action`` says it. Should that happen
+    again and again, the tissue is put back to rest.
+    """
+
+    name: ClassVar[str]
+
+    #: A node that moved by this many times the mesh's longest side has left the tissue.
+    farthest: ClassVar[float] = 10.0
+
+    def __init__(self, model: TissueModel) -> None:
+        self.model = model
+        self._pose: Pose | None = None
+        self._settled = True
+        self._failures = 0  # frames in a row that came to nothing
+        self._reach = self.farthest * float(np.ptp(model.mesh.nodes, axis=0).max())
+        self._last = self._resting()
+
+    def deform(self, probe_pose: Pose | None) -> Deformation:
+        """One frame: move the probe and let the tissue follow.
+
+        With a probe that has not moved and a tissue that has settled, nothing is computed.
+
+        Args:
+            probe_pose: in frame ``patient``, or None when no probe is near.
+        """
+        if self._settled and same_pose(probe_pose, self._pose):
+            return self._last
+        good = self.state
+        deformation = self._advance(probe_pose)
+        if self._is_plausible(deformation):
+            self._pose = probe_pose
+            self._failures = 0
+        else:
+            deformation = self._recovered(good)
+        self._last = deformation
+        return deformation
+
+    def _recovered(self, good: TissueState) -> Deformation:
+        """What stands for a frame that came to nothing; the next one tries again."""
+        action = "the frame came out not finite or far away, so the last good state was kept"
+        self._failures += 1
+        if self._failures < _PATIENCE:
+            self._restore(good)
+        else:
+            self.reset()
+            action = (
+                f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
+            )
+        self._settled = False
+        return replace(self._last, action=action)
+
+    def reset(self) -> None:
+        """Back to the undeformed tissue, with no probe near."""
+        self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
+        self._pose = None
+        self._settled = True
+        self._failures = 0
+        self._last = self._resting()
+
+    def take_over(self, state: TissueState) -> None:
+        """Go on from where another solver of the same model is.
+
+        Raises:
+            SolverError: the state has another number of nodes, is not finite, or moves a fixed one.
+        """
+        shape = self.model.mesh.nodes.shape
+        if state.displacement.shape != shape or state.velocity.shape != shape:
+            raise SolverError(
+                f"the state to take over has {len(state.displacement)} nodes, the mesh "
+                f"{shape[0]}: hand over a state of the same mesh"
+            )
+        if not (np.isfinite(state.displacement).all() and np.isfinite(state.velocity).all()):
+            raise SolverError("the state to take over is not finite: reset the solver instead")
+        if state.displacement[self.model.fixed].any():
+            raise SolverError("the state to take over moves fixed nodes: it is of another model")
+        self._restore(state)
+        self._pose = None
+        self._settled = not (state.displacement.any() or state.velocity.any())
+        self._last = replace(self._resting(), nodes=self.model.mesh.nodes + state.displacement)
+
+    def warm_up(self) -> None:
+        """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
+
+        It is like this one in what decides which kernels are used: a box mesh or another, the
+        highest Poisson's ratio, and how far moduli are apart.
+        """
+        side = np.linspace(-0.01, 0.01, 3)
+        mesh = box_mesh(side, side, side + 0.01)
+        if self.model.mesh.planes is None:
+            mesh = TetrahedralMesh(mesh.nodes, mesh.tetrahedra)
+        own, count = self.model.materials, len(mesh.tetrahedra)
+        model = TissueModel(
+            mesh,
+            TissueMaterials(
+                np.linspace(own.young_modulus.min(), own.young_modulus.max(), count),
+                np.full(count, own.poisson_ratio.max()),
+                np.full(count, own.density.max()),
+            ),
+            mesh.nodes[:, 2] > 0.015,
+            self.model.collider,
+            np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
+        )
+        solver = type(self)(model)
+        for depth in (0.002, 0.004):
+            solver.deform(Pose(position=np.array([depth, 0.0, depth])))
+        solver._rehearse()
+        solver.deform(None)
+
+    def _rehearse(self) -> None:  # noqa: B027 - most solvers have none of these
+        """Call, for `warm_up`, the kernels that only some frames need."""
+
+    @property
+    @abstractmethod
+    def state(self) -> TissueState:
+        """A copy of where the tissue is."""
+
+    def contact_stiffness(self) -> NDArray[np.float64] | None:
+        """How the wrench of the last frame changes with the probe's pose.
+
+        Returns:
+            (6, 6) as `us_sim.tissue.contact.stiffness` says, zero without contact; None where this
+            solver does not know it.
+        """
+        return None
+
+    @abstractmethod
+    def _advance(self, pose: Pose | None) -> Deformation:
+        """One frame; sets ``_settled``. ``_pose`` is still the frame before's."""
+
+    @abstractmethod
+    def _restore(self, state: TissueState) -> None:
+        """Put the tissue where a state says."""
+
+    def _is_plausible(self, deformation: Deformation) -> bool:
+        numbers = (deformation.force, deformation.torque, deformation.residual)
+        # A comparison with NaN is false.
+        moved = np.abs(deformation.nodes - self.model.mesh.nodes).max()
+        return bool(moved <= self._reach) and all(
+            bool(np.isfinite(number).all()) for number in numbers
+        )
+
+    def _resting(self) -> Deformation:
+        return Deformation(
+            self.model.mesh.nodes.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), 0.0
+        )
+
+
+def create_solver(name: str, model: TissueModel, **settings: Any) -> TissueSolver:
+    """A solver by the name that scenes and reports use.
+
+    Raises:
+        SolverError: no such solver or setting, a setting out of range, or a model it cannot solve.
+    """
+    if name not in SOLVERS:
+        raise SolverError(f"there is no tissue solver {name!r}: name one of {', '.join(SOLVERS)}")
+    module, class_name = SOLVERS[name]
+    solver = getattr(import_module(module), class_name)
+    known = [p for p in inspect.signature(solver).parameters if p != "model"]
+    for setting in settings:
+        if setting not in known:
+            raise SolverError(
+                f"solver {name} has no setting {setting!r}: its settings are {', '.join(known)}"
+            )
+    return solver(model, **settings)
+
+
+def require_count(setting: str, value: object) -> None:
+    """Check a number of iterations or steps.
+
+    Raises:
+        SolverError: it is not an integer from 1 to 10000.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 10_000:
+        raise SolverError(f"{setting} is {value!r}: give an integer from 1 to 10000")
+
+
+def require_number(setting: str, value: object, low: float, high: float = math.inf) -> None:
+    """Check a setting's range.
+
+    Raises:
+        SolverError: it is not a number above ``low`` and below ``high``.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+        below = f" and below {high:g}" if math.isfinite(high) else ""
+        raise SolverError(f"{setting} is {value!r}: give a number above {low:g}{below}")
+
+
+def same_pose(a: Pose | None, b: Pose | None) -> bool:
+    """Whether two poses are the same, to the last bit."""
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)

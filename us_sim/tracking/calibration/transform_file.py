@@ -1,0 +1,205 @@
+"""A rigid transform in a YAML file, with what is known of how well it was found.
+
+What `us-sim calibrate` writes and what a scene takes as `registration:` or `calibration:`. The
+pose is that of the frame `from` in the frame `to`, so it turns points of `from` into points of
+`to`: a registration is from the device's frame to `patient`, a calibration from `probe` to the
+tracked body.
+
+>>> import pathlib, tempfile
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.calibration.transform_file import read_transform, write_transform
+>>> with tempfile.TemporaryDirectory() as folder:
+...     file = pathlib.Path(folder, "registration.yaml")
+...     write_transform(file, Pose([0.0, 0.0, 0.4]), from_frame="tracker", to_frame="patient",
+...                     method="point registration", residuals={"fre": 0.0003})
+...     read_transform(file).position
+array([0. , 0. , 0.4])
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from us_sim.errors import CalibrationError, PoseError
+from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+
+__all__ = [
+    "TransformFile",
+    "read_transform",
+    "read_transform_file",
+    "write_calibration",
+    "write_transform",
+]
+
+_KEYS = ("from", "to", "position", "orientation")
+
+
+@dataclass(frozen=True, eq=False)
+class TransformFile:
+    """A pose and what its file says of it."""
+
+    pose: Pose  # of from_frame in to_frame
+    from_frame: str
+    to_frame: str
+    method: str = ""
+    date: str = ""  # ISO 8601
+    residuals: Mapping[str, Any] = field(default_factory=dict)  # SI units, by name
+    more: Mapping[str, Any] = field(default_factory=dict)  # whatever else the method found
+
+
+def read_transform(path: str | Path) -> Pose:
+    """The pose of the file's frame `from` in its frame `to`, m.
+
+    Raises:
+        CalibrationError: see :func:`read_transform_file`.
+    """
+    return read_transform_file(path).pose
+
+
+def read_transform_file(path: str | Path) -> TransformFile:
+    """All that a transform's file says.
+
+    Raises:
+        CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
+            these are not 3 and 4 finite numbers.
+    """
+    path = Path(path)
+    document = _document(path)
+    for key in ("position", "orientation"):
+        if key not in document:
+            raise CalibrationError(
+                f"{path}: {key}: is missing; a transform has a position (x, y, z in metres) and "
+                f"an orientation (quaternion x, y, z, w), as `us-sim calibrate` writes them"
+            )
+    position = _numbers(path, "position", document["position"], 3, Quantity("length"))
+    orientation = _numbers(path, "orientation", document["orientation"], 4, Quantity("number"))
+    residuals = document.get("residuals", {})
+    if not isinstance(residuals, dict):
+        raise CalibrationError(f"{path}: residuals: must be a mapping of names, not {residuals!r}")
+    try:
+        pose = Pose(position, orientation)
+    except PoseError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+    known = {*_KEYS, "method", "date", "residuals"}
+    return TransformFile(
+        pose,
+        str(document.get("from", "")),
+        str(document.get("to", "")),
+        str(document.get("method", "")),
+        str(document.get("date", "")),
+        residuals,
+        {key: value for key, value in document.items() if key not in known},
+    )
+
+
+def write_transform(
+    path: str | Path,
+    pose: Pose,
+    *,
+    from_frame: str,
+    to_frame: str,
+    method: str,
+    residuals: Mapping[str, Any] | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a transform that a scene takes.
+
+    Args:
+        path: of the new file.
+        pose: of from_frame in to_frame, m.
+        from_frame: the frame whose points it takes.
+        to_frame: the frame in which it gives them.
+        method: what found it, in a few words.
+        residuals: numbers, arrays and mappings of them by name, SI units.
+        more: further keys, of the same kinds.
+
+    Raises:
+        CalibrationError: the file exists already or cannot be written.
+    """
+    write_calibration(
+        path,
+        {
+            "from": from_frame,
+            "to": to_frame,
+            "position": pose.position,  # m
+            "orientation": pose.orientation,  # x, y, z, w
+            "method": method,
+            "residuals": residuals or {},
+            **(more or {}),
+        },
+    )
+
+
+def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write what a calibration found as YAML, with the date.
+
+    Raises:
+        CalibrationError: the file exists already or cannot be written.
+    """
+    path = Path(path)
+    date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    document = {"date": date} | {key: _plain(value) for key, value in content.items()}
+    text = yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True
+    )
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise CalibrationError(f"{path}: exists already; choose another name") from None
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CalibrationError(
+            f"{path}: there is no such file; `us-sim calibrate` writes transforms"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}:" if mark else ""
+        problem = getattr(error, "problem", None) or "unreadable"
+        raise CalibrationError(f"{path}:{where} is not YAML: {problem}") from error
+    if not isinstance(document, dict):
+        raise CalibrationError(
+            f"{path}: holds no transform; it needs the keys position and orientation"
+        )
+    return document
+
+
+def _numbers(
+    path: Path, key: str, value: object, count: int, quantity: Quantity
+) -> NDArray[np.float64]:
+    if not isinstance(value, list) or len(value) != count:
+        raise CalibrationError(f"{path}: {key}: must be {count} numbers, not {value!r}")
+    try:
+        return np.array([quantity.parse(number) for number in value])
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {key}: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    """What YAML's safe subset can hold, of arrays and NumPy's numbers."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

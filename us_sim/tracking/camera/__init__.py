@@ -1,0 +1,1 @@
+"""A camera that sees markers: bodies, lenses, corners, poses."""

@@ -1,0 +1,358 @@
+"""What a camera would see of a body of markers at a known pose, pixel by pixel.
+
+>>> import cv2, numpy as np
+>>> from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.camera.model import CameraModel
+>>> from us_sim.tracking.camera.source import CameraSource
+>>> from us_sim.tracking.camera.rigid_body import RigidBody
+>>> camera = CameraModel(320, 240, [[300, 0, 160], [0, 300, 120], [0, 0, 1]], [-0.2, 0, 0, 0, 0])
+>>> marker = RigidBody.single("4X4_50", 7, 0.04)
+>>> image = RenderedView(camera, marker).render(Pose([0.02, 0.0, 0.25], [1, 0.1, 0, 0]), SHARP)
+>>> image.shape, image.dtype
+((240, 320), dtype('uint8'))
+>>> CameraSource(camera, marker).measure(image, 0).pose.position.round(3) + 0.0
+array([0.02, 0.  , 0.25])
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import rotation_exp
+from us_sim.tracking.camera.markers import dictionary
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.rigid_body import Chessboard, RigidBody
+
+__all__ = ["SHARP", "Conditions", "RenderedView"]
+
+_BLACK, _WHITE = 26.0, 225.0  # grey, of print in full light
+_AMBIENT = 0.35  # of the light, which comes from everywhere
+_LIGHT = np.array([0.3, -0.5, -0.8]) / math.sqrt(0.98)  # unit, from the scene towards the lamp
+_SKIN = 150.0  # grey
+_SAMPLES = 8  # a side, of the rays through a pixel that an edge crosses
+_FLAT = 1e-6  # m
+_STEP = 0.5  # pixels that a body moves between the moments of which an exposure is summed
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What comes between a body and its image."""
+
+    defocus: float = 0.6  # pixels, standard deviation of the lens's blur
+    read_noise: float = 1.0  # grey, standard deviation of what every pixel adds
+    shot_noise: float = 0.01  # grey, variance that comes with each level of light
+    gradient: float = 0.0  # share of the light that is lost from one side of the image to the other
+    occlusion: float = 0.0  # share of the body's extent in the image that a hand covers
+
+
+SHARP = Conditions(defocus=0.0, read_noise=0.0, shot_noise=0.0)
+"""Only pixels and their grey levels."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """A printed rectangle."""
+
+    origin: NDArray[np.float64]  # (3,) m, its upper left corner, frame of the body
+    along: NDArray[np.float64]  # (3,) m, its upper edge
+    down: NDArray[np.float64]  # (3,) m, its left edge
+    print: NDArray[np.bool_]  # (rows, columns) of equal cells; True is white
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """(4, 3) m."""
+        a, b, c = self.origin, self.along, self.down
+        return np.array([a, a + b, a + b + c, a + c])
+
+
+class RenderedView:
+    """A camera before a background, in which a body can be put anywhere.
+
+    Every pixel that the edge of a cell of a marker crosses is the mean of 64 rays through the lens;
+    then come the lens's blur, the light, and the sensor's noise and grey levels. The same arguments
+    give the same bytes.
+
+    Args:
+        camera: what looks.
+        body: what is looked at. Sheets of paper around its markers are white.
+        seed: of the background.
+    """
+
+    def __init__(self, camera: CameraModel, body: RigidBody, seed: int = 0) -> None:
+        self.camera = camera
+        self.body = body
+        self._sheets = _sheets(body)
+        columns, rows = np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        self._rays = camera.rays(grid).reshape(camera.height + 1, camera.width + 1, 2)
+        self._background = _background(camera, np.random.default_rng(seed))
+
+    def render(
+        self,
+        pose: Pose,
+        conditions: Conditions | None = None,
+        seed: int = 0,
+        motion: NDArray[np.float64] | None = None,
+        frame: int = 0,
+    ) -> NDArray[np.uint8]:
+        """The image (rows, columns), grey.
+
+        Args:
+            pose: of the body in ``camera_optical``, in the middle of the exposure.
+            conditions: what makes the image worse.
+            seed: of the hand and the light's direction, and with the frame of the noise.
+            motion: (6,) m and rad, shift and rotation about the camera's axes from the beginning
+                to the end of the exposure.
+            frame: of a sequence in which the hand and the light stay as they are.
+        """
+        conditions = conditions or Conditions()
+        random = np.random.default_rng(seed)
+        light = np.empty_like(self._background)
+        moments = self._moments(pose, motion)
+        for number, moment in enumerate(moments):
+            image = self._background.copy()
+            self._draw(image, moment)
+            light = image if number == 0 else light + image
+        if len(moments) > 1:
+            light /= len(moments)
+        if conditions.occlusion > 0:
+            self._draw_hand(light, pose, conditions.occlusion, random)
+        if conditions.defocus > 0:
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), conditions.defocus))
+        if conditions.gradient > 0:
+            light *= self._gradient(conditions.gradient, random)
+        noise = np.random.default_rng([seed, frame]).standard_normal(light.shape, np.float32)
+        image8 = np.empty(light.shape, dtype=np.uint8)
+        _expose(light, noise, conditions.read_noise**2, conditions.shot_noise, image8)
+        return image8
+
+    def _moments(self, pose: Pose, motion: NDArray[np.float64] | None) -> list[Pose]:
+        """Poses during the exposure, so close that their sum is smooth."""
+        if motion is None:
+            return [pose]
+        ends = [_moved(pose, share * motion) for share in (-0.5, 0.5)]
+        corners = self.body.corners.reshape(-1, 3)
+        first, last = (self.camera.project(end.apply(corners)) for end in ends)
+        way = np.linalg.norm(last - first, axis=1)
+        longest = float(way.max()) if np.isfinite(way).all() else 0.0
+        count = max(1, math.ceil(longest / _STEP))
+        return [_moved(pose, ((i + 0.5) / count - 0.5) * motion) for i in range(count)]
+
+    def _draw(self, image: NDArray[np.float32], pose: Pose) -> None:
+        """Print the sheets that face the camera, one over the other in their order."""
+        turn = pose.rotation
+        for sheet in self._sheets:
+            corners = pose.apply(sheet.corners)
+            along, down = turn @ sheet.along, turn @ sheet.down
+            normal = np.cross(down, along)
+            if normal @ corners[0] >= 0 or corners[:, 2].min() <= 1e-3:
+                continue
+            pixels = self.camera.project(corners)
+            if not np.isfinite(pixels).all():
+                continue
+            # The lens bends edges, outwards by less than the sheet's own size.
+            margin = 2 + 0.05 * float(np.ptp(pixels, axis=0).max())
+            size = [self.camera.width, self.camera.height]
+            low = np.clip(np.floor(pixels.min(axis=0) - margin), 0, size).astype(np.int64)
+            high = np.clip(np.ceil(pixels.max(axis=0) + margin), 0, size).astype(np.int64)
+            if (high <= low).any():
+                continue
+            towards = float(normal @ _LIGHT) / float(np.linalg.norm(normal))
+            shade = _AMBIENT + (1 - _AMBIENT) * max(0.0, towards)
+            inverse = np.linalg.inv(np.column_stack([along, down, corners[0]]))
+            window = (slice(low[1], high[1] + 1), slice(low[0], high[0] + 1))
+            _print(
+                image[low[1] : high[1], low[0] : high[0]],
+                self._rays[window],
+                inverse,
+                sheet.print,
+                np.float32(shade * _BLACK),
+                np.float32(shade * _WHITE),
+            )
+
+    def _draw_hand(
+        self,
+        image: NDArray[np.float32],
+        pose: Pose,
+        share: float,
+        random: np.random.Generator,
+    ) -> None:
+        """Fingers that come from one side and reach over so much of the body's extent."""
+        corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        if not np.isfinite(corners).all():
+            return
+        angle = random.uniform(0, 2 * np.pi)
+        reach = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-reach[1], reach[0]])
+        ways, widths = corners @ reach, corners @ across
+        tip = ways.min() + share * np.ptp(ways)
+        finger = max(4.0, float(np.ptp(widths)) / 3.2)
+        start = float(widths.min()) + random.uniform(-0.3, 0.3) * finger
+        far = float(np.hypot(*image.shape))
+        for number in range(4):
+            # The tips lie on an arc, a little apart from each other, with dark gaps between.
+            end = tip - finger * (0.5 + 0.35 * abs(number - 1.3)) + random.uniform(-2, 2)
+            side = start + finger * (number + 0.5)
+            for width, grey in ((1.0, 0.6 * _SKIN), (0.85, _SKIN)):
+                ends = (end * reach + side * across, (end - far) * reach + side * across)
+                points = [tuple(round(16 * float(value)) for value in point) for point in ends]
+                cv2.line(
+                    image,
+                    points[0],
+                    points[1],
+                    grey,
+                    max(1, int(width * finger)),
+                    lineType=cv2.LINE_8,
+                    shift=4,
+                )
+
+    def _gradient(self, loss: float, random: np.random.Generator) -> NDArray[np.float32]:
+        """(rows, columns) share of the light, 1 at one side of the image."""
+        angle = random.uniform(0, 2 * np.pi)
+        width, height = self.camera.width, self.camera.height
+        x = (np.arange(width, dtype=np.float32) / width - 0.5) * np.float32(np.cos(angle))
+        y = (np.arange(height, dtype=np.float32) / height - 0.5) * np.float32(np.sin(angle))
+        extent = 0.5 * (abs(np.cos(angle)) + abs(np.sin(angle)))
+        slope = np.float32(0.5 * loss / extent)
+        return np.asarray(1 - 0.5 * loss + slope * (x[None] + y[:, None]), dtype=np.float32)
+
+
+def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
+    """Shifted and turned about its own origin, both along the camera's axes."""
+    turned = Pose(np.zeros(3), rotation_exp(motion[3:])) @ Pose(np.zeros(3), pose.orientation)
+    return Pose(pose.position + motion[:3], turned.orientation)
+
+
+def _sheets(body: RigidBody) -> list[_Sheet]:
+    """White paper first, then what is printed on it."""
+    if body.chessboard is not None:
+        return _chessboard(body.chessboard)
+    cells = dictionary(body.dictionary).markerSize + 2
+    blank = np.ones((1, 1), dtype=np.bool_)
+    papers: list[_Sheet] = []
+    prints: list[_Sheet] = []
+    for number, corners in zip(body.ids.tolist(), body.corners, strict=True):
+        along, down = corners[1] - corners[0], corners[3] - corners[0]
+        code = cv2.aruco.generateImageMarker(dictionary(body.dictionary), number, cells) > 0
+        prints.append(_Sheet(corners[0], along, down, code))
+        a, b = along / cells, down / cells
+        papers.append(_Sheet(corners[0] - a - b, along + 2 * a, down + 2 * b, blank))
+    return [*_joined(papers), *prints]
+
+
+def _joined(papers: list[_Sheet]) -> list[_Sheet]:
+    """One paper where all markers lie in a plane."""
+    first = papers[0]
+    points = np.concatenate([paper.corners for paper in papers]) - first.origin
+    right, down = (edge / np.linalg.norm(edge) for edge in (first.along, first.down))
+    normal = np.cross(right, down)
+    if len(papers) == 1 or np.abs(points @ normal).max() > _FLAT:
+        return papers
+    x, y = points @ right, points @ down
+    origin = first.origin + x.min() * right + y.min() * down
+    return [_Sheet(origin, np.ptp(x) * right, np.ptp(y) * down, first.print)]
+
+
+def _chessboard(board: Chessboard) -> list[_Sheet]:
+    """A ChArUco board as OpenCV draws it, in cells that its squares and markers are made of."""
+    bits = dictionary(board.dictionary).markerSize + 2
+    # Squares, markers and the margin between them are whole numbers of cells.
+    ratio = Fraction(board.square / board.size * bits).limit_denominator(32)
+    whole = 2 * ratio.denominator
+    side = int(ratio * whole)
+    size = (board.columns * side, board.rows * side)
+    drawn = np.asarray(board.board.generateImage(size, marginSize=0, borderBits=1)) > 127
+    along = np.array([board.columns * board.square, 0.0, 0.0])
+    down = np.array([0.0, board.rows * board.square, 0.0])
+    a, b = (0.5 * board.square * edge / np.linalg.norm(edge) for edge in (along, down))
+    blank = np.ones((1, 1), dtype=np.bool_)
+    return [
+        _Sheet(-a - b, along + 2 * a, down + 2 * b, blank),
+        _Sheet(np.zeros(3), along, down, drawn),
+    ]
+
+
+def _background(camera: CameraModel, random: np.random.Generator) -> NDArray[np.float32]:
+    """A room out of focus, with things in it that have edges."""
+    size = (camera.width, camera.height)
+    coarse = random.uniform(50, 170, (9, 12)).astype(np.float32)
+    room = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)
+    for _ in range(14):
+        middle = random.uniform(0, 1, 2) * size
+        extent = random.uniform(0.03, 0.2, 2) * camera.height
+        box = cv2.boxPoints((middle.tolist(), extent.tolist(), float(random.uniform(0, 180))))
+        cv2.fillPoly(room, [np.round(box).astype(np.int32)], float(random.uniform(30, 190)))
+    return np.asarray(cv2.GaussianBlur(room, (0, 0), camera.height / 400), dtype=np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _print(image, rays, inverse, cells, black, white):
+    """Draw a sheet into a window of the image, over what is there.
+
+    Args:
+        image: (h, w) grey, changed in place.
+        rays: (h + 1, w + 1, 2) x / z and y / z at the pixels' corners.
+        inverse: (3, 3) of the matrix of the sheet's upper edge, left edge and upper left corner,
+            so that it takes a ray to the place on the sheet, times what depth is divided by.
+        cells: (rows, columns), True is white.
+        black, white: grey.
+    """
+    height, width = image.shape
+    rows, columns = cells.shape
+    x = np.empty((height + 1, width + 1))
+    y = np.empty((height + 1, width + 1))
+    for i in range(height + 1):
+        for j in range(width + 1):
+            a, b = rays[i, j]
+            scale = inverse[2, 0] * a + inverse[2, 1] * b + inverse[2, 2]
+            if not scale > 0:
+                x[i, j] = np.nan
+                y[i, j] = np.nan
+                continue
+            x[i, j] = columns * (inverse[0, 0] * a + inverse[0, 1] * b + inverse[0, 2]) / scale
+            y[i, j] = rows * (inverse[1, 0] * a + inverse[1, 1] * b + inverse[1, 2]) / scale
+    for i in range(height):
+        for j in range(width):
+            xa, xb, xc, xd = x[i, j], x[i, j + 1], x[i + 1, j], x[i + 1, j + 1]
+            ya, yb, yc, yd = y[i, j], y[i, j + 1], y[i + 1, j], y[i + 1, j + 1]
+            left, right = min(min(xa, xb), min(xc, xd)), max(max(xa, xb), max(xc, xd))
+            top, bottom = min(min(ya, yb), min(yc, yd)), max(max(ya, yb), max(yc, yd))
+            if not (right > 0 and left < columns and bottom > 0 and top < rows):
+                continue
+            column, row = int(np.floor(left)), int(np.floor(top))
+            if right <= column + 1 and bottom <= row + 1 and column >= 0 and row >= 0:
+                image[i, j] = white if cells[row, column] else black
+                continue
+            total, inside = 0.0, 0
+            for k in range(_SAMPLES):
+                for m in range(_SAMPLES):
+                    # No two samples share a line or a column, so that no slant is favoured.
+                    s = (k + (m + 0.5) / _SAMPLES) / _SAMPLES
+                    t = (m + (k + 0.5) / _SAMPLES) / _SAMPLES
+                    across = (1 - t) * ((1 - s) * xa + s * xb) + t * ((1 - s) * xc + s * xd)
+                    along = (1 - t) * ((1 - s) * ya + s * yb) + t * ((1 - s) * yc + s * yd)
+                    if 0 <= across < columns and 0 <= along < rows:
+                        inside += 1
+                        total += white if cells[int(along), int(across)] else black
+            share = 1.0 / (_SAMPLES * _SAMPLES)
+            image[i, j] = share * total + (1 - share * inside) * image[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _expose(light, noise, read_variance, shot_variance, image):
+    """Grey levels (h, w) of the light, with noise that grows with it."""
+    for i in range(light.shape[0]):
+        for j in range(light.shape[1]):
+            value = light[i, j]
+            deviation = np.sqrt(read_variance + shot_variance * max(value, 0.0))
+            value += deviation * noise[i, j]
+            image[i, j] = int(min(max(value, 0.0), 255.0) + 0.5)

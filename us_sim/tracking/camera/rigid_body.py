@@ -1,0 +1,227 @@
+"""Rigid bodies of fiducial markers: one marker, a board, or markers around a probe's grip.
+
+>>> from us_sim.tracking.camera.rigid_body import RigidBody
+>>> board = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
+>>> board.ids[-1], (board.corners[-1, 2] * 1e3).round(1)
+(np.int64(19), array([165. , 207.5,   0. ]))
+>>> RigidBody.single("4X4_50", 50, 0.04)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: marker 50: dictionary 4X4_50 has only markers 0 to 49
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
+from us_sim.tracking.camera.settings import MARKER_SIZE
+
+__all__ = ["Chessboard", "RigidBody"]
+
+_FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """The squares of a ChArUco board: a chessboard with a marker in every white square."""
+
+    columns: int  # squares
+    rows: int  # squares
+    square: float  # m, edge of a square
+    size: float  # m, edge of a marker
+    dictionary: str
+    legacy: bool = False  # white upper left square where the rows are even, as before OpenCV 4.6
+
+    def __post_init__(self) -> None:
+        _require_counts(self.columns, self.rows, 2)
+        _require_size(self.size)
+        if not self.size < self.square:
+            raise TrackingError(
+                f"a ChArUco board's markers ({self.size:g} m) must be smaller than its squares "
+                f"({self.square:g} m)"
+            )
+        object.__setattr__(self, "dictionary", proper_name(self.dictionary))
+        _require_in_dictionary(self.dictionary, self.columns * self.rows // 2 - 1)
+
+    @cached_property
+    def board(self) -> cv2.aruco.CharucoBoard:
+        """As OpenCV has it."""
+        size = (self.columns, self.rows)
+        board = cv2.aruco.CharucoBoard(
+            size, float(self.square), float(self.size), dictionary(self.dictionary)
+        )
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @cached_property
+    def corners(self) -> NDArray[np.float64]:
+        """(K, 3) m: where four squares meet, row by row."""
+        return np.asarray(self.board.getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBody:
+    """Markers of one dictionary that move together.
+
+    The corners of a marker are those of its black square, in its own order: the upper left one
+    as it is printed, and on clockwise as one sees it.
+
+    Raises:
+        TrackingError: a marker twice, one that the dictionary lacks, or no flat quadrilateral.
+    """
+
+    dictionary: str
+    ids: NDArray[np.int64]  # (M,)
+    corners: NDArray[np.float64]  # (M, 4, 3) m, in the body's own frame
+    chessboard: Chessboard | None = None
+
+    def __post_init__(self) -> None:
+        ids = np.array(self.ids, dtype=np.int64)
+        corners = np.array(self.corners, dtype=np.float64)
+        object.__setattr__(self, "dictionary", proper_name(self.dictionary))
+        if ids.ndim != 1 or not len(ids) or corners.shape != (len(ids), 4, 3):
+            raise TrackingError(
+                f"a body needs markers with 4 corners of 3 coordinates each, not "
+                f"{ids.shape} numbers and {corners.shape} coordinates"
+            )
+        for number, quadrilateral in zip(ids.tolist(), corners, strict=True):
+            _require_in_dictionary(self.dictionary, number)
+            _require_marker(number, quadrilateral)
+        numbers, counts = np.unique(ids, return_counts=True)
+        if counts.max() > 1:
+            raise TrackingError(f"marker {numbers[counts.argmax()]} is in the body twice")
+        for array in (ids, corners):
+            array.flags.writeable = False
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "corners", corners)
+
+    @classmethod
+    def single(cls, dictionary: str, number: int, size: float) -> RigidBody:
+        """One marker; its middle is the origin, x to its right, y up and z out of the paper.
+
+        Raises:
+            TrackingError: there is no such marker, or the size (m) is impossible.
+        """
+        _require_size(size)
+        return cls(dictionary, np.array([number]), square(size)[None])
+
+    @classmethod
+    def grid(
+        cls,
+        dictionary: str,
+        columns: int,
+        rows: int,
+        size: float,
+        separation: float,
+        first: int = 0,
+    ) -> RigidBody:
+        """A board of markers, numbered row by row from ``first``.
+
+        The origin is the upper left corner of the board, x to the right, y down and z into the
+        paper, as OpenCV has it.
+
+        Raises:
+            TrackingError: a count or a size (m) is impossible, or the dictionary is too small.
+        """
+        _require_counts(columns, rows, 1)
+        _require_size(size)
+        if not 0 < separation < 1:
+            raise TrackingError(
+                f"the separation of a board's markers is {separation:g} m: it must be more than "
+                f"0 and less than 1 m"
+            )
+        marker = size * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        row, column = np.divmod(np.arange(columns * rows), columns)
+        places = np.stack([column, row, 0 * row], axis=1) * (size + separation)
+        return cls(dictionary, first + np.arange(columns * rows), places[:, None] + marker)
+
+    @classmethod
+    def charuco(
+        cls,
+        dictionary: str,
+        columns: int,
+        rows: int,
+        square: float,
+        size: float,
+        legacy: bool = False,
+    ) -> RigidBody:
+        """A ChArUco board of so many squares; its frame is as that of `grid`.
+
+        Raises:
+            TrackingError: a count or a size (m) is impossible, or the dictionary is too small.
+        """
+        chessboard = Chessboard(columns, rows, square, size, dictionary, legacy)
+        markers = np.asarray(chessboard.board.getObjPoints(), dtype=np.float64).reshape(-1, 4, 3)
+        ids = np.asarray(chessboard.board.getIds()).ravel()
+        return cls(dictionary, ids, markers, chessboard)
+
+    @cached_property
+    def rows(self) -> dict[int, int]:
+        """Which of `ids` a number is."""
+        return {int(number): row for row, number in enumerate(self.ids)}
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """(M, 3) m: the middle of each marker."""
+        return self.corners.mean(axis=1)
+
+    @cached_property
+    def normals(self) -> NDArray[np.float64]:
+        """(M, 3): unit normal of each marker, towards who sees its front."""
+        return _normals(self.corners)
+
+
+def _normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    normals = np.cross(
+        corners[..., 1, :] - corners[..., 3, :], corners[..., 0, :] - corners[..., 2, :]
+    )
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _require_counts(columns: int, rows: int, least: int) -> None:
+    for name, count in (("columns", columns), ("rows", rows)):
+        if count != int(count) or not least <= count <= 100:
+            raise TrackingError(f"a board's {name} are {count}: they must be {least} to 100")
+
+
+def _require_size(size: float) -> None:
+    try:
+        MARKER_SIZE.parse(size)
+    except ValueError as error:
+        raise TrackingError(f"a marker's size: {error}") from error
+
+
+def _require_in_dictionary(name: str, number: int) -> None:
+    count = marker_count(name)
+    if not 0 <= number < count:
+        raise TrackingError(f"marker {number}: dictionary {name} has only markers 0 to {count - 1}")
+
+
+def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
+    """Refuse what is no flat convex quadrilateral of a marker's size."""
+    if not np.isfinite(corners).all():
+        raise TrackingError(f"marker {number}: a corner is not finite")
+    edges = np.roll(corners, -1, axis=0) - corners
+    lengths = np.linalg.norm(edges, axis=1)
+    for length in lengths:
+        try:
+            MARKER_SIZE.parse(float(length))
+        except ValueError as error:
+            raise TrackingError(f"marker {number}: the length of an edge: {error}") from error
+    areas = np.cross(edges, np.roll(edges, -1, axis=0))
+    total = areas.sum(axis=0)
+    if (areas @ total <= 1e-3 * lengths.min() ** 2 * np.linalg.norm(total)).any():
+        raise TrackingError(
+            f"marker {number}: its corners are no convex quadrilateral; give them in order: the "
+            f"upper left one as printed, and on clockwise"
+        )
+    normal = total / np.linalg.norm(total)
+    if np.abs((corners - corners.mean(axis=0)) @ normal).max() > _FLATNESS * lengths.min():
+        raise TrackingError(f"marker {number}: its corners are not in one plane")

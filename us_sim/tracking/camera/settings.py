@@ -1,0 +1,88 @@
+"""What a scene says of the camera source: the body to look for, and when to believe it.
+
+>>> import math
+>>> from us_sim.tracking.camera.settings import CameraSettings
+>>> settings = CameraSettings(dictionary="6X6_250", size="30 mm", marker=7)
+>>> settings.size, round(math.degrees(settings.view_angle_limit))
+(0.03, 75)
+>>> CameraSettings(minimum_markers=0)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: camera.minimum_markers: 0 is outside 1 to 1000
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from us_sim.errors import TrackingError
+from us_sim.settings.quantity import Quantity, given, require_given
+
+__all__ = ["DICTIONARIES", "MARKER_SIZE", "CameraSettings"]
+
+DICTIONARIES = (
+    *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "ARUCO_ORIGINAL",
+    "ARUCO_MIP_36h12",
+    *(f"APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
+)
+"""The marker dictionaries, by OpenCV's names without ``DICT_``."""
+
+MARKER_SIZE = Quantity("length", 1e-3, 0.25)
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    body: str = given(
+        default="",
+        file=True,
+        description="file of the rigid body of markers; empty for one marker",
+    )
+    marker: int = given(
+        Quantity("number", 0, 65535), default=0, description="number of the one marker"
+    )
+    size: float = given(
+        MARKER_SIZE, default=0.04, description="m, edge of the one marker's black square"
+    )
+    dictionary: str = given(
+        default="4X4_50",
+        choices=DICTIONARIES,
+        description="dictionary of the marker, or of a body's file that names none",
+    )
+    minimum_markers: int = given(
+        Quantity("number", 1, 1000),
+        default=1,
+        description="markers that must be seen for a pose to be taken",
+    )
+    reprojection_limit: float = given(
+        Quantity("number", 0.1, 50.0),
+        default=2.0,
+        description="pixels, root mean square between the corners seen and those of the pose",
+    )
+    view_angle_limit: float = given(
+        Quantity("angle", 0.1, 1.5),
+        default=math.radians(75.0),
+        description="rad, between a marker's normal and the line of sight, beyond which it is "
+        "not used",
+    )
+    corner_deviation: float = given(
+        Quantity("number", 0.01, 10.0),
+        default=0.1,
+        description="pixels, standard deviation of a corner, the least that the covariance of "
+        "the pose is made with",
+    )
+    latency: float = given(
+        Quantity("time", -1.0, 1.0),
+        default=0.0,
+        description="s, from the middle of the exposure to the image's stamp",
+    )
+
+    def __post_init__(self) -> None:
+        require_given(self, "camera", TrackingError)

@@ -1,0 +1,254 @@
+"""Where a body of markers is, by a camera: one image in, one measurement out.
+
+>>> import cv2, numpy as np
+>>> from us_sim.tracking.camera.model import CameraModel
+>>> from us_sim.tracking.camera.settings import CameraSettings
+>>> from us_sim.tracking.camera.source import CameraSource
+>>> from us_sim.tracking.camera.markers import dictionary
+>>> from us_sim.tracking.camera.rigid_body import RigidBody
+>>> camera = CameraModel(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+>>> source = CameraSource(camera, RigidBody.single("4X4_50", 7, 0.04))
+>>> image = np.full((480, 640), 255, np.uint8)
+>>> image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 80)
+>>> source.measure(image, 0).pose.position.round(2) + 0.0
+array([0.  , 0.  , 0.25])
+>>> source.measure(np.zeros_like(image), 33_000_000), source.last_problem
+(None, 'no marker of 4X4_50 is in the image, which is black: uncover the lens or add light')
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.camera.body_pose import BodyPose, body_poses
+from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
+from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.plane_ambiguity import PlaneAmbiguity
+from us_sim.tracking.camera.rigid_body import RigidBody
+from us_sim.tracking.camera.settings import CameraSettings
+from us_sim.tracking.camera.stray_markers import StrayMarkers, counted
+from us_sim.tracking.measurement import Measurement
+
+__all__ = ["CameraSource"]
+
+REMEMBERED = 0.5
+"""s, how long the last pose helps to find the next one and to tell it from its mirror image."""
+
+_BLACK = 24  # grey, below which all of an image is when it shows nothing
+_MARGIN = 0.35  # of the body's size in the image, around where it is looked for
+_LEAST_MARGIN = 24  # pixels
+_SEARCHED = 500_000  # pixels, of an image in which all is looked for at once
+_SHORTEST = 40.0  # pixels, of a marker's edge in an image that is reduced to find it
+
+
+class CameraSource:
+    """Tracks one body of markers through the images of one camera.
+
+    Args:
+        camera: of the images.
+        body: what to look for.
+        settings: when to believe it.
+    """
+
+    def __init__(
+        self, camera: CameraModel, body: RigidBody, settings: CameraSettings | None = None
+    ) -> None:
+        self.camera = camera
+        self.body = body
+        self.settings = settings or CameraSettings()
+        self.last_problem = ""
+        """Why the last image gave no measurement, or what was left out of it; empty when all is
+        well."""
+        self.seen = 0
+        """Markers of the body that the last measurement is made from."""
+        self._detector = FiducialDetector(body)
+        self._last: tuple[int, Pose] | None = None
+        self._ambiguity = PlaneAmbiguity(self.settings.corner_deviation)
+        self._strays = StrayMarkers(body)
+
+    def reset(self) -> None:
+        """Forget the last pose."""
+        self._last = None
+        self._ambiguity.reset()
+
+    def measure(self, image: NDArray[np.uint8], stamp: int) -> Measurement | None:
+        """The body's pose in ``camera_optical``, or None with the reason in ``last_problem``.
+
+        Args:
+            image: (rows, columns) grey.
+            stamp: ns, the image's own; the measurement's is earlier by the settings' latency.
+
+        Raises:
+            TrackingError: the image is not grey or not of the camera's size.
+        """
+        image = self.camera.require_image(image)
+        self.last_problem = ""
+        self.seen = 0
+        before = self._before(stamp)
+        detection = self._detect(image, before)
+        if detection.doubled:
+            self.last_problem = _copies(detection.doubled)
+        measured = self._pose(image, detection, before)
+        if measured is None:
+            return None
+        pose, covariance = measured
+        self._last = stamp, pose.pose
+        exposed = stamp - round(self.settings.latency * 1e9)
+        return Measurement(exposed, pose.pose, covariance, pose.error)
+
+    def _before(self, stamp: int) -> Pose | None:
+        """The last pose, where it is from shortly before."""
+        if self._last is None:
+            return None
+        if not 0 <= stamp - self._last[0] <= REMEMBERED * 1e9:
+            self.reset()
+            return None
+        return self._last[1]
+
+    def _detect(self, image: NDArray[np.uint8], before: Pose | None) -> Detection:
+        """The body's markers, near where they were or else anywhere."""
+        near = self._near(before) if before is not None else None
+        if near is not None:
+            detection = self._detector.detect(image, *near)
+            if self._is_enough(detection):
+                return detection
+        if image.size >= 4 * _SEARCHED:
+            reduction = int(math.sqrt(image.size / _SEARCHED))
+            detection = self._detector.detect(image, reduction=reduction)
+            if self._is_enough(detection):
+                return detection
+        return self._detector.detect(image)
+
+    def _is_enough(self, detection: Detection) -> bool:
+        """Whether there is no need to look further."""
+        return (
+            len(detection.ids) >= self.settings.minimum_markers
+            or len(detection.chessboard_ids) >= 4
+        )
+
+    def _near(self, pose: Pose) -> tuple[tuple[int, int, int, int], int] | None:
+        """The window around the body as it was, and by how much to reduce the image there."""
+        corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
+        if not np.isfinite(corners).all():
+            return None
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        margin = max(_LEAST_MARGIN, _MARGIN * float((high - low).max()))
+        size = np.array([self.camera.width, self.camera.height])
+        left, top = np.clip(np.floor(low - margin), 0, size).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(high + margin), 0, size).astype(int).tolist()
+        if right - left < _LEAST_MARGIN or bottom - top < _LEAST_MARGIN:
+            return None
+        ways = corners.reshape(-1, 4, 2)
+        edge = float(np.linalg.norm(ways[:, [0, 1]] - ways[:, [1, 2]], axis=2).max(axis=1).min())
+        return (left, top, right, bottom), max(1, min(4, int(edge / _SHORTEST)))
+
+    def _pose(
+        self, image: NDArray[np.uint8], detection: Detection, before: Pose | None
+    ) -> tuple[BodyPose, NDArray[np.float64]] | None:
+        """The pose and its covariance; see `measure`."""
+        points, pixels, owners = detection.correspondences(self.body)
+        if not len(points):
+            self.last_problem = self.last_problem or self._nothing(image, detection)
+            return None
+        least = self.settings.minimum_markers
+        refusal = ""
+        # Each round leaves out what the pose of the round before shows to be unfit.
+        while True:
+            markers = np.unique(owners[owners >= 0])
+            if len(markers) < least and self.body.chessboard is None:
+                count = len(markers)
+                self.last_problem = refusal or (
+                    f"{counted(count)} of the body {'is' if count == 1 else 'are'} seen, fewer "
+                    f"than the {least} of camera.minimum_markers"
+                )
+                return None
+            found = body_poses(
+                self.camera,
+                points,
+                pixels,
+                owners,
+                guess=before,
+                deviation=self.settings.corner_deviation,
+            )
+            if not found:
+                self.last_problem = (
+                    "what is seen of the body does not tell its pose: show more of it, and check "
+                    "the camera info and the body's file"
+                )
+                return None
+            pose = self._ambiguity.chosen(found, before)
+            unfit, refusal = self._unfit(pose, owners)
+            if not len(unfit):
+                break
+            kept = ~np.isin(owners, unfit)
+            if not kept.any():
+                self.last_problem = refusal
+                return None
+            points, pixels, owners = points[kept], pixels[kept], owners[kept]
+            self.last_problem = refusal
+        board = self.body.chessboard is not None
+        self.seen = len(detection.ids) + len(detection.unclear) if board else len(markers)
+        return pose, self._ambiguity.settled(found, pose, before)
+
+    def _unfit(self, pose: BodyPose, owners: NDArray[np.int64]) -> tuple[NDArray[np.int64], str]:
+        """Owners of points that cannot be used in a pose, and why."""
+        markers = np.unique(owners)
+        angles = self._view_angles(pose.pose, markers)
+        limit = self.settings.view_angle_limit
+        steep = angles > limit
+        if steep.any():
+            worst = int(np.argmax(angles))
+            return markers[steep], (
+                f"{self._name(markers[worst])} is seen at "
+                f"{math.degrees(angles[worst]):.0f}° from its normal, beyond the "
+                f"{math.degrees(limit):.0f}° of camera.view_angle_limit: it is not used"
+            )
+        if pose.error <= self.settings.reprojection_limit:
+            return markers[:0], ""
+        squares = (pose.residuals**2).sum(axis=1)
+        errors = np.array([math.sqrt(squares[owners == marker].mean()) for marker in markers])
+        worst = int(np.argmax(errors))
+        if len(markers) > 2:
+            return markers[[worst]], (
+                f"{self._name(markers[worst])} is {errors[worst]:.1f} pixels from where "
+                f"the others say: it is not used; check its place in the body's file"
+            )
+        return markers, (
+            f"the corners are {pose.error:.1f} pixels from those of the best pose, more than the "
+            f"{self.settings.reprojection_limit:g} of camera.reprojection_limit: check the "
+            f"marker's size, the body's file and the camera info"
+        )
+
+    def _name(self, row: int) -> str:
+        return "the chessboard" if row < 0 else f"marker {self.body.ids[row]}"
+
+    def _view_angles(self, pose: Pose, markers: NDArray[np.int64]) -> NDArray[np.float64]:
+        """rad, of each marker's normal to the line from it to the camera.
+
+        The chessboard (-1) counts as the last marker on it.
+        """
+        normals = self.body.normals[markers] @ pose.rotation.T
+        centres = pose.apply(self.body.centres[markers])
+        cosines = -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
+        return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+    def _nothing(self, image: NDArray[np.uint8], detection: Detection) -> str:
+        if detection.unclear:
+            return (
+                f"of marker {detection.unclear[0]} an edge is covered, cut off or blurred: it is "
+                f"not used"
+            )
+        start = f"no marker of {self.body.dictionary} is in the image"
+        if int(image.max()) <= _BLACK:
+            return f"{start}, which is black: uncover the lens or add light"
+        return self._strays.look(image, start)
+
+
+def _copies(numbers: tuple[int, ...]) -> str:
+    listed = ", ".join(str(number) for number in numbers)
+    plural = "marker" if len(numbers) == 1 else "markers"
+    return f"the image has two copies of {plural} {listed}: none is used; show only one"

@@ -1,0 +1,1 @@
+"""Filters of poses, and which poses are not believed."""

@@ -1,0 +1,1 @@
+"""A haptic arm: its handle moves the probe, and feels the tissue."""

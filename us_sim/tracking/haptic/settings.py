@@ -1,0 +1,97 @@
+"""What a scene says of a haptic arm: how it moves the probe, and what it may give back.
+
+>>> from us_sim.tracking.haptic.settings import HapticSettings
+>>> HapticSettings(scale=2, ramp="500 ms").ramp
+0.5
+>>> HapticSettings(force_limit=1000)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: haptic.force_limit: 1000 is outside 0 to 50
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from us_sim.errors import TrackingError
+from us_sim.settings.quantity import Quantity, given, require_given
+
+__all__ = ["HapticSettings"]
+
+
+@dataclass(frozen=True)
+class HapticSettings:
+    """The settings of a haptic arm; each is a key of a scene's ``tracker.haptic:``.
+
+    The defaults suit a small desktop arm that gives 3 N at most and no torque.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    scale: float = given(
+        Quantity("number", 0.01, 100.0),
+        default=1.0,
+        description="how far the probe moves for a movement of the handle",
+    )
+    force_scale: float = given(
+        Quantity("number", 0.0, 100.0),
+        default=1.0,
+        description="how hard the handle is pushed for a force on the probe",
+    )
+    force_limit: float = given(
+        Quantity("number", 0.0, 50.0), default=3.0, description="N on the handle, the most"
+    )
+    torque_limit: float = given(
+        Quantity("number", 0.0, 5.0),
+        default=0.0,
+        description="N m on the handle, the most; 0 for an arm that gives none",
+    )
+    rate: float = given(
+        Quantity("frequency", 50.0, 4000.0), default=1000.0, description="Hz, of the wrenches"
+    )
+    ramp: float = given(
+        Quantity("time", 0.01, 30.0),
+        default=1.0,
+        description="s, in which the force grows from nothing, at the start and after any doubt",
+    )
+    hand_over: float = given(
+        Quantity("time", 1e-3, 1.0),
+        default=0.03,
+        description="s, from one model of the contact to the next",
+    )
+    pose_timeout: float = given(
+        Quantity("time", 2e-3, 1.0),
+        default=0.05,
+        description="s without a pose after which the wrench is zero",
+    )
+    model_timeout: float = given(
+        Quantity("time", 5e-3, 5.0),
+        default=0.3,
+        description="s, age of the model of the contact from which on the wrench is zero",
+    )
+    jump: float = given(
+        Quantity("length", 1e-4, 1.0),
+        default=0.01,
+        description="m of the handle between two poses, beyond which the wrench is zero",
+    )
+    rotation_jump: float = given(
+        Quantity("angle", 1e-3, 3.0),
+        default=0.3,
+        description="rad of the handle between two poses, beyond which the wrench is zero",
+    )
+    model_reach: float = given(
+        Quantity("length", 1e-4, 1.0),
+        default=0.02,
+        description="m of the probe from where the contact is known, beyond which the wrench is "
+        "zero",
+    )
+    model_rotation_reach: float = given(
+        Quantity("angle", 1e-3, 3.0),
+        default=0.5,
+        description="rad of the probe from where the contact is known, beyond which the wrench "
+        "is zero",
+    )
+
+    def __post_init__(self) -> None:
+        require_given(self, "haptic", TrackingError)

@@ -1,0 +1,149 @@
+"""A 6-DOF mouse moves the probe: by velocity, or by displacement from where it was let go.
+
+>>> from us_sim.tracking.mouse.six_dof_mouse import SixDofMouse
+>>> from us_sim.tracking.mouse.settings import SixDofMouseSettings
+>>> mouse = SixDofMouse(SixDofMouseSettings(speed=["50 mm/s", "-50 mm/s", "-50 mm/s"]))
+>>> pushed_down = [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]
+>>> for tick in range(101):  # a second at 100 Hz
+...     probe = mouse.axes(pushed_down, [], tick * 10_000_000)
+>>> probe.pose.position.round(6).tolist()  # from 10 mm above
+[0.0, 0.0, 0.04]
+>>> mouse.axes([0.0, 0.0, 0.0], [], 1_010_000_000)
+>>> mouse.last_problem
+'the message has 3 axes, but axis 5 is used: remap the joystick, or set six_dof_mouse.axes'
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry import se3
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.mouse.settings import SixDofMouseSettings
+
+__all__ = ["SixDofMouse"]
+
+_ROUNDING = 1e-3
+"""How far an axis may be beyond ±1: some drivers divide by a rounded full scale."""
+
+
+class SixDofMouse:
+    """Turns deflections of a cap into poses of the probe in ``patient``.
+
+    While the clutch is held the probe stays where it is; in position mode deflections then count
+    from where the cap was let go, so nothing jumps. At a side of the workspace the probe stops, and
+    comes back as soon as the cap does.
+    """
+
+    def __init__(self, settings: SixDofMouseSettings) -> None:
+        self._settings = settings
+        self._used = list(settings.axes)
+        rate = settings.mode == "rate"
+        self._full = np.array(
+            [
+                *(settings.speed if rate else settings.reach),
+                *(settings.angular_speed if rate else settings.angular_reach),
+            ]
+        )
+        self._home = Pose(np.array(settings.home), np.array(settings.home_orientation))
+        self.last_problem = ""
+        self.reset()
+
+    def reset(self) -> None:
+        """Bring the probe home and forget all messages."""
+        self.pose = self._home
+        self._stamp: int | None = None  # ns, of the last message
+        self._twist = np.zeros(6)  # of the last message, m and rad, a second in rate mode
+        self._held: dict[int, bool] = {}
+        self._let_go()
+
+    def axes(self, axes: Sequence[float], buttons: Sequence[int], stamp: int) -> Measurement | None:
+        """The probe after a message, or None where it cannot be used: `last_problem` says why.
+
+        Args:
+            axes: deflections in ±1.
+            buttons: 1 where pressed. One that is not listed is as it was: the usual driver lists
+                those up to the one that has just changed, and none with a mere movement.
+            stamp: ns.
+        """
+        deflection = self._deflection(axes)
+        if deflection is None:
+            return None
+        step, before = self._step(stamp), self._twist
+        self._stamp, self._twist = stamp, self._full * deflection
+        clutch, home = (
+            self._is_held(button, buttons)
+            for button in (self._settings.clutch_button, self._settings.reset_button)
+        )
+        if home:
+            self.pose = self._home
+        if home or clutch:
+            self._let_go()
+        elif self._settings.mode == "rate":
+            # The velocity goes evenly from the last message's to this one's.
+            self.pose = self._within(self._moved(self.pose, 0.5 * step * (before + self._twist)))
+        else:
+            self.pose = self._within(self._displaced(self._point, self._twist - self._from))
+        return Measurement(stamp, self.pose)
+
+    def _let_go(self) -> None:
+        """Count displacements from here."""
+        self._point, self._from = self.pose, self._twist.copy()
+
+    def _deflection(self, axes: Sequence[float]) -> NDArray[np.float64] | None:
+        """(6,) of the axes used, those in the dead band at 0 and the rest from there on."""
+        last = max(self._used)
+        if len(axes) <= last:
+            self.last_problem = (
+                f"the message has {len(axes)} axes, but axis {last} is used: remap the joystick, "
+                f"or set six_dof_mouse.axes"
+            )
+            return None
+        deflection = np.array([axes[axis] for axis in self._used], dtype=np.float64)
+        if not np.isfinite(deflection).all():
+            self.last_problem = f"the axes {deflection.tolist()} are not finite"
+            return None
+        beyond = int(np.abs(deflection).argmax())
+        if abs(deflection[beyond]) > 1.0 + _ROUNDING:
+            self.last_problem = (
+                f"axis {self._used[beyond]} is {deflection[beyond]:g}, beyond 1: set the driver's "
+                f"full scale to what the device gives at full deflection"
+            )
+            return None
+        band = self._settings.dead_band
+        past = np.clip((np.abs(deflection) - band) / (1.0 - band), 0.0, 1.0)
+        return np.copysign(past, deflection)
+
+    def _step(self, stamp: int) -> float:
+        """s since the last message; 0 after a long gap, or where stamps jump back."""
+        if self._stamp is None:
+            return 0.0
+        step = 1e-9 * (stamp - self._stamp)
+        return step if 0.0 < step <= self._settings.longest_gap else 0.0
+
+    def _is_held(self, button: int, buttons: Sequence[int]) -> bool:
+        if 0 <= button < len(buttons):
+            self._held[button] = bool(buttons[button])
+        return self._held.get(button, False)
+
+    def _moved(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
+        """With a velocity (6,) m, rad that stays the same in the frame that the motion is in."""
+        if self._settings.frame == "probe":
+            return pose @ se3.exp(twist)
+        return self._displaced(pose, twist)
+
+    def _displaced(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
+        """Moved by (3,) m and turned about the probe's face by (3,) rad."""
+        turn = se3.rotation_exp(twist[3:])
+        if self._settings.frame == "probe":
+            return pose @ Pose(twist[:3], turn)
+        return Pose(pose.position + twist[:3], se3.product(turn, pose.orientation))
+
+    def _within(self, pose: Pose) -> Pose:
+        """The pose, in the workspace."""
+        low, high = self._settings.workspace_low, self._settings.workspace_high
+        return Pose(np.clip(pose.position, low, high), pose.orientation)

@@ -1,0 +1,1 @@
+"""OpenIGTLink: messages, client and server."""
