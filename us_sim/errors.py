@@ -8,6 +8,7 @@ __all__ = [
     "PoseError",
     "ProbeError",
     "SceneError",
+    "SettingsError",
     "SolverError",
     "TrackingError",
     "UsSimError",
@@ -17,6 +18,15 @@ __all__ = [
 
 class UsSimError(Exception):
     """Base of every error that this package raises for bad input."""
+
+    key: str = ""
+    """The setting that is wrong, where it is one: its path of keys below the section."""
+    problem: str = ""
+    """What is wrong with it."""
+
+
+class SettingsError(UsSimError):
+    """A setting is unknown, or has a value that will not do."""
 
 
 class SceneError(UsSimError):

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import ProbeError
-from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 

@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import SolverError
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.skin.membrane import CONTACT_TOLERANCE, SkinMembrane
+from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface
 
 COLLIDERS = [Sphere(0.03), Capsule(0.01, 0.04), RoundedBox(0.05, 0.02, 0.06, 0.006)]
@@ -28,7 +30,7 @@ def settled(membrane, pose, frames=200):
 def test_anchored_particles_alone_lie_on_the_nearest_point_of_the_collider():
     """Without springs the anchors' energy is least there: a known equilibrium."""
     sheet = plane_surface((0.1, 0.1), 0.01)
-    skin = SkinMembrane(sheet, Sphere(0.03), stiffness=0.0)
+    skin = SkinMembrane(sheet, Sphere(0.03), MembraneSettings(stiffness=0.0))
     pose = Pose([0.002, -0.001, 0.008])
     found = settled(skin, pose).vertices
     centre = np.array([0.002, -0.001, 0.008 - 0.03])
@@ -45,9 +47,12 @@ def test_a_released_particle_is_a_damped_oscillator():
         np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), np.array([[0, 2, 1]])
     )
     skin = SkinMembrane(
-        triangle, Sphere(0.03), stiffness=0.0, anchor_stiffness=4.0, damping=1.5, density=5.0,
-        time_step=1e-3, steps=1,
-    )  # fmt: skip
+        triangle,
+        Sphere(0.03),
+        MembraneSettings(
+            stiffness=0.0, anchor_stiffness=4.0, damping=1.5, density=5.0, time_step=1e-3, steps=1
+        ),
+    )
     assert skin.step_limit > 1e-3
     np.testing.assert_allclose(skin.mass, 5.0 * 0.005 / 3)
     skin.deform(Pose([0, 0, 0.004]))
@@ -66,7 +71,9 @@ def test_a_released_particle_is_a_damped_oscillator():
 def test_edge_springs_conserve_momentum():
     """All that changes the sum of momenta is the anchors and their dampers."""
     sheet = bent_surface((0.1, 0.06), 0.01, flat_width=0.04, radius=0.05)
-    skin = SkinMembrane(sheet, Sphere(0.03), stiffness=400.0, anchor_stiffness=1.0, steps=1)
+    skin = SkinMembrane(
+        sheet, Sphere(0.03), MembraneSettings(stiffness=400.0, anchor_stiffness=1.0, steps=1)
+    )
     for k in range(5):
         skin.deform(Pose([0, 0, 0.002 * k]))
     before = skin.deform(None)
@@ -132,7 +139,7 @@ def test_a_probe_that_appears_deep_in_the_skin_pushes_it_all_forwards():
 
 def test_a_far_jump_is_taken_in_more_steps_and_said():
     sheet = plane_surface((0.12, 0.12), 0.004)
-    skin = SkinMembrane(sheet, Capsule(0.004, 0.03), steps=5)
+    skin = SkinMembrane(sheet, Capsule(0.004, 0.03), MembraneSettings(steps=5))
     skin.deform(Pose([-0.03, 0, 0.002]))
     found = skin.deform(Pose([-0.005, 0, 0.002]))
     assert "25 steps for a probe that moved 25 mm" in found.action
@@ -157,7 +164,12 @@ def test_prestrain_is_what_smooths_it():
     sheet = plane_surface((0.1, 0.1), 0.0025)
     pose = Pose([0, 0, 0.0005])
     moved = [
-        np.abs(settled(SkinMembrane(sheet, Sphere(0.01), prestrain=p), pose).vertices[:, 2] - 0)
+        np.abs(
+            settled(
+                SkinMembrane(sheet, Sphere(0.01), MembraneSettings(prestrain=p)), pose
+            ).vertices[:, 2]
+            - 0
+        )
         for p in (0.0, 0.2)
     ]
     beside = (np.hypot(*sheet.vertices[:, :2].T) > 0.0035) & (
@@ -168,8 +180,8 @@ def test_prestrain_is_what_smooths_it():
 
 def test_masses_are_raised_to_what_the_step_needs():
     sheet = plane_surface((0.05, 0.05), 0.005)
-    heavy = SkinMembrane(sheet, Sphere(0.03), density=2.0, time_step=1e-4)
-    light = SkinMembrane(sheet, Sphere(0.03), density=2.0, time_step=0.01)
+    heavy = SkinMembrane(sheet, Sphere(0.03), MembraneSettings(density=2.0, time_step=1e-4))
+    light = SkinMembrane(sheet, Sphere(0.03), MembraneSettings(density=2.0, time_step=0.01))
     # The stiffest row is a vertex with 8 springs, in the sheet's own lumped masses.
     valence = np.bincount(sheet.edges.ravel())
     limit = np.sqrt((4 * 2.0 * sheet.vertex_areas / (2 * 40.0 * valence + 4.0)).min())
@@ -199,9 +211,17 @@ def test_no_settings_make_it_diverge(
     rng = np.random.default_rng(seed)
     sheet = plane_surface((0.08, 0.08), 0.01)
     skin = SkinMembrane(
-        sheet, Sphere(0.02), stiffness=stiffness, anchor_stiffness=anchor, damping=damping,
-        density=density, prestrain=prestrain, time_step=time_step,
-    )  # fmt: skip
+        sheet,
+        Sphere(0.02),
+        MembraneSettings(
+            stiffness=stiffness,
+            anchor_stiffness=anchor,
+            damping=damping,
+            density=density,
+            prestrain=prestrain,
+            time_step=time_step,
+        ),
+    )
     for _ in range(20):
         skin.deform(Pose(rng.uniform(-0.02, 0.02, 3), rng.normal(size=4)))
     pressed = skin.energy()
@@ -257,9 +277,7 @@ def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
     skin = SkinMembrane(
         plane_surface((0.1, 0.1), 0.01),
         Sphere(0.03),
-        stiffness=1e308,
-        density=1e300,
-        time_step=1e-9,
+        MembraneSettings(stiffness=1e308, density=1e300, time_step=1e-9),
     )
     before = skin.deform(None).vertices
     found = skin.deform(Pose([0, 0, 0.01]))
@@ -292,4 +310,4 @@ def test_warming_up_leaves_the_membrane_as_it_is():
 )
 def test_settings_out_of_range_are_refused(change, words):
     with pytest.raises(SolverError, match=words):
-        SkinMembrane(plane_surface((0.1, 0.1), 0.05), Sphere(0.03), **change)
+        SkinMembrane(plane_surface((0.1, 0.1), 0.05), Sphere(0.03), MembraneSettings(**change))

@@ -67,10 +67,11 @@ def path_video(
         UsSimError: the scene's tracker is no camera, its camera does not see the body, or the
             cache or the video cannot be written.
     """
-    if scene.tracker.source != "camera":
+    if scene.tracker.source.name != "camera":
         raise UsSimError(
-            f"--source camera: the tracker of {scene.origin} is `{scene.tracker.source}`; name a "
-            f"scene whose tracker is a camera, such as upper_arm_camera"
+            f"--source camera: the tracker of {scene.origin} is "
+            f"`{scene.tracker.source.name}`; name a scene whose tracker is a camera, such as "
+            f"upper_arm_camera"
         )
     body = camera_body_of(scene)
     registration, calibration = tracker_poses_of(scene)

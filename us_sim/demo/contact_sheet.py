@@ -51,7 +51,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
             axes.set_ylabel("depth, mm")
     if areas is not None:
         _plot_areas(figure.add_subplot(grid[2, :]), areas, [(s - first) * 1e-9 for _, s in moments])
-    figure.suptitle(f"us_sim: {scene.name} ({scene.volume_name})", fontsize=15)
+    figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
     figure.savefig(file, dpi=80)
 
 

@@ -1,24 +1,23 @@
-"""The probe's shape where it touches the patient, as a signed distance shared by tissue and skin.
+"""The probe's shape where it touches the patient, shared by tissue and skin.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere, signed_distance
->>> from us_sim.geometry.pose import Pose
->>> distance, normal = signed_distance(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.01]]))
->>> distance, normal
-(array([0.01]), array([[0., 0., 1.]]))
+How far points are from it is `us_sim.geometry.collider_distance`.
+
+>>> from us_sim.geometry.collider import RoundedBox
+>>> RoundedBox(length="46 mm", width="14 mm", height="40 mm", rounding="4 mm").offset_box
+array([0.019, 0.003, 0.016, 0.004])
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import ProbeError
-from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 
 __all__ = [
     "Capsule",
@@ -26,27 +25,26 @@ __all__ = [
     "Convex",
     "RoundedBox",
     "Sphere",
-    "curved_box_distance",
-    "offset_box_distance",
-    "signed_distance",
 ]
 
-# A curved face is refused when it is steeper than this at its ends, rad.
 _STEEPEST = math.radians(75)
+"""A curved face is refused when it is steeper than this at its ends, rad."""
+_SIZE = Quantity("length", 1e-4, 0.5)
+_ROUNDING = Quantity("length", 1e-5, 0.25)
 
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(Settings):
     """The paper's spherical collision volume; touches z = 0 of the probe at the origin.
 
     Raises:
-        ProbeError: the radius is not a positive number.
+        ProbeError: the radius is out of its range.
     """
 
-    radius: float  # m
+    section = "probe.collider"
+    error = ProbeError
 
-    def __post_init__(self) -> None:
-        _require_positive_lengths(self)
+    radius: float = setting(_SIZE, "of the sphere")
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
@@ -55,18 +53,18 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Capsule:
+class Capsule(Settings):
     """A cylinder along the probe's x with hemispherical ends, as a linear array has.
 
     Raises:
-        ProbeError: a dimension is not a positive number.
+        ProbeError: a dimension is out of its range.
     """
 
-    radius: float  # m
-    length: float  # m, between the centres of the two end caps
+    section = "probe.collider"
+    error = ProbeError
 
-    def __post_init__(self) -> None:
-        _require_positive_lengths(self)
+    radius: float = setting(_SIZE, "of the cylinder and of its ends")
+    length: float = setting(_SIZE, "between the centres of the two end caps")
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
@@ -75,25 +73,29 @@ class Capsule:
 
 
 @dataclass(frozen=True)
-class RoundedBox:
+class RoundedBox(Settings):
     """A flat transducer face with rounded edges.
 
     Raises:
-        ProbeError: a dimension is not a positive number, or the rounding is more than half of one.
+        ProbeError: a dimension is out of its range, or the rounding is more than half of one.
     """
 
-    length: float  # m, along the probe's x, over everything
-    width: float  # m, along the probe's y, over everything
-    height: float  # m, along the probe's z, over everything
-    rounding: float  # m, radius of edges and corners
+    section = "probe.collider"
+    error = ProbeError
 
-    def __post_init__(self) -> None:
-        _require_positive_lengths(self)
+    length: float = setting(_SIZE, "along the probe's x, over everything")
+    width: float = setting(_SIZE, "along the probe's y, over everything")
+    height: float = setting(_SIZE, "along the probe's z, over everything")
+    rounding: float = setting(_ROUNDING, "radius of edges and corners")
+
+    def check(self) -> None:
+        """Refuse dimensions that do not go together."""
         smallest = min(self.length, self.width, self.height)
         if 2 * self.rounding > smallest:
-            raise ProbeError(
-                f"RoundedBox.rounding is {self.rounding:g} m, more than half of the smallest "
-                f"side ({smallest:g} m): give at most {smallest / 2:g} m"
+            raise self.refused(
+                "rounding",
+                f"{self.rounding:g} m is more than half of the smallest side ({smallest:g} m): "
+                f"give at most {smallest / 2:g} m",
             )
 
     @property
@@ -104,41 +106,45 @@ class RoundedBox:
 
 
 @dataclass(frozen=True)
-class Convex:
+class Convex(Settings):
     """A curved array: a rounded box whose face is part of a cylinder about a line along y.
 
     Raises:
-        ProbeError: a dimension is not a positive number, or they do not go together.
+        ProbeError: a dimension is out of its range, or they do not go together.
     """
 
-    radius: float  # m, of the face's curvature
-    length: float  # m, along the probe's x, over everything
-    width: float  # m, along the probe's y, over everything
-    height: float  # m, along the probe's z, over everything
-    rounding: float  # m, radius of edges and corners
+    section = "probe.collider"
+    error = ProbeError
 
-    def __post_init__(self) -> None:
-        _require_positive_lengths(self)
+    radius: float = setting(_SIZE, "of the face's curvature")
+    length: float = setting(_SIZE, "along the probe's x, over everything")
+    width: float = setting(_SIZE, "along the probe's y, over everything")
+    height: float = setting(_SIZE, "along the probe's z, over everything")
+    rounding: float = setting(_ROUNDING, "radius of edges and corners")
+
+    def check(self) -> None:
+        """Refuse dimensions that do not go together."""
         smallest = min(self.length, self.width, 2 * self.radius)
         if 2 * self.rounding > smallest:
-            raise ProbeError(
-                f"Convex.rounding is {self.rounding:g} m, more than half of the smallest of its "
-                f"length, width and 2 radius ({smallest:g} m): give at most {smallest / 2:g} m"
+            raise self.refused(
+                "rounding",
+                f"{self.rounding:g} m is more than half of the smallest of length, width and twice "
+                f"the radius ({smallest:g} m): give at most {smallest / 2:g} m",
             )
         core = self.radius - self.rounding
         longest = 2 * (core * math.sin(_STEEPEST) + self.rounding)
         if self.length > longest:
-            raise ProbeError(
-                f"Convex.length is {self.length:g} m, but a face of radius {self.radius:g} m "
-                f"would be steeper than {math.degrees(_STEEPEST):g} degrees at its ends: give at "
-                f"most {longest:.4g} m"
+            raise self.refused(
+                "length",
+                f"{self.length:g} m: a face of radius {self.radius:g} m would be steeper than "
+                f"{math.degrees(_STEEPEST):g} degrees at its ends: give at most {longest:.4g} m",
             )
         half = 0.5 * self.length - self.rounding
         least = 2 * self.rounding + core - math.sqrt(core * core - half * half)
         if self.height < least:
-            raise ProbeError(
-                f"Convex.height is {self.height:g} m, less than the face is bent: give at least "
-                f"{least:.4g} m"
+            raise self.refused(
+                "height",
+                f"{self.height:g} m is less than the face is bent: give at least {least:.4g} m",
             )
 
     @property
@@ -151,126 +157,3 @@ class Convex:
 
 
 Collider = Sphere | Capsule | RoundedBox | Convex
-
-
-def signed_distance(
-    collider: Collider, pose: Pose, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance of points to the collider's surface, and its outward normal there.
-
-    Every shape here is a box (for a sphere a point, for a capsule a segment) grown by a rounding;
-    the box of a curved array has a curved front. The formulas are exact. Where the nearest surface
-    point is not unique, on the core itself, the normal is the probe's +z if that is one of the
-    nearest directions.
-
-    Args:
-        collider: the shape, which lies in frame ``probe``.
-        pose: of the probe in the frame of the points.
-        points: (N, 3) m.
-
-    Returns:
-        (N,) m, negative inside, and (N, 3) unit normals in the frame of the points.
-    """
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    distance = np.empty(len(points))
-    normal = np.empty_like(points)
-    _signed_distances(
-        collider.offset_box, pose.rotation, np.array(pose.position), points, distance, normal
-    )
-    return distance, normal
-
-
-def _require_positive_lengths(collider: Collider) -> None:
-    for field in fields(collider):
-        value = getattr(collider, field.name)
-        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-            raise ProbeError(
-                f"{type(collider).__name__}.{field.name} is {value!r}: give a length in metres "
-                f"above zero"
-            )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def offset_box_distance(box, x, y, z):
-    """Distance and normal for one point of frame ``probe``: (distance, nx, ny, nz).
-
-    ``box`` is a collider's ``offset_box``; its foremost face is z = 0.
-    """
-    if len(box) > 4:
-        return curved_box_distance(box, 0.0, x, y, z)
-    z = z + box[2] + box[3]
-    dx = abs(x) - box[0]
-    dy = abs(y) - box[1]
-    dz = abs(z) - box[2]
-    sx = 1.0 if x >= 0 else -1.0
-    sy = 1.0 if y >= 0 else -1.0
-    sz = 1.0 if z >= 0 else -1.0
-    ox = max(dx, 0.0)
-    oy = max(dy, 0.0)
-    oz = max(dz, 0.0)
-    length = math.sqrt(ox * ox + oy * oy + oz * oz)
-    if length > 0.0:
-        return length - box[3], sx * ox / length, sy * oy / length, sz * oz / length
-    if dz >= dx and dz >= dy:
-        return dz - box[3], 0.0, 0.0, sz
-    if dx >= dy:
-        return dx - box[3], sx, 0.0, 0.0
-    return dy - box[3], 0.0, sy, 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def curved_box_distance(box, grip, x, y, z):
-    """As `offset_box_distance`, of a box with a curved front that goes on behind by ``grip`` m."""
-    radius = 1.0 / box[4]
-    end = math.sqrt(radius * radius - box[0] * box[0])  # of the arc, above its centre
-    ahead = z + box[3]  # of the foremost point of the core
-    above = ahead + radius  # the arc's centre
-    behind = -(ahead + 2 * box[2] + grip)
-    sx = 1.0 if x >= 0 else -1.0
-    sy = 1.0 if y >= 0 else -1.0
-    dx = sx * x - box[0]
-    dy = sy * y - box[1]
-    # The way to the core in the plane of the image: its length, negative inside, and direction.
-    if above > 0.0 and sx * x * end <= box[0] * above:  # the arc is nearer than its ends
-        reach = math.sqrt(x * x + above * above)
-        across, ux, uz = reach - radius, x / reach, above / reach
-        if across <= 0.0:
-            if behind > across:
-                across, ux, uz = behind, 0.0, -1.0
-            if dx > across:
-                across, ux, uz = dx, sx, 0.0
-    elif dx > 0.0 or behind > 0.0:
-        ox = max(dx, 0.0)
-        oz = max(above - end, 0.0) - max(behind, 0.0)
-        across = math.sqrt(ox * ox + oz * oz)
-        ux, uz = sx * ox / across, oz / across
-    elif dx >= behind:
-        across, ux, uz = dx, sx, 0.0
-    else:
-        across, ux, uz = behind, 0.0, -1.0
-    oa = max(across, 0.0)
-    oy = max(dy, 0.0)
-    length = math.sqrt(oa * oa + oy * oy)
-    if length > 0.0:
-        return length - box[3], ux * oa / length, sy * oy / length, uz * oa / length
-    if across >= dy:
-        return across - box[3], ux, 0.0, uz
-    return dy - box[3], 0.0, sy, 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _signed_distances(box, rotation, origin, points, distance, normal):
-    """Fills distance (N,) and normal (N, 3) for points (N, 3) of the parent frame."""
-    r = rotation
-    for i in range(len(points)):
-        a = points[i, 0] - origin[0]
-        b = points[i, 1] - origin[1]
-        c = points[i, 2] - origin[2]
-        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
-        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
-        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
-        d, nx, ny, nz = offset_box_distance(box, x, y, z)
-        distance[i] = d
-        normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
-        normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz
-        normal[i, 2] = r[2, 0] * nx + r[2, 1] * ny + r[2, 2] * nz

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from rclpy.node import Node
 
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
+from us_sim.nodes.settings import AwaitedSettings
 
 __all__ = ["Awaited"]
 
 
 class Awaited:
-    """The node's parameters ``await_topics`` and ``await_subscriber``, and whether they are met.
+    """The node's parameters of `AwaitedSettings`, and whether they are met.
 
     Each of the topics must have a publisher and, where a node is named, that node among its
     subscribers.
@@ -18,18 +19,14 @@ class Awaited:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._topics = fixed_parameter(node, "await_topics", [""], "begin when these are published")
-        self._subscriber = fixed_parameter(
-            node, "await_subscriber", "", "and this node subscribes to them"
-        )
+        settings = declared(node, AwaitedSettings())
+        self._topics, self._subscriber = settings.await_topics, settings.await_subscriber
 
     def are_there(self) -> bool:
         """Whether playing can begin, as far as this goes."""
         return all(map(self._is_there, self._topics))
 
     def _is_there(self, topic: str) -> bool:
-        if not topic:
-            return True
         node = self._node
         if not node.count_publishers(topic):
             return False

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
@@ -20,9 +19,10 @@ from us_sim.errors import TrackingError
 from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import bgr_image_message, image_message
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.tracking.camera.info import read_camera_info
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.video_source import VideoSource
@@ -43,35 +43,23 @@ A best-effort subscriber may find this publisher a little later than it is found
 class CameraDriver(Node):
     """``camera/image_raw`` and, with the same stamp, ``camera/camera_info`` of each image.
 
-    Parameters: ``source`` (a camera's number, a stream's address or a video file),
-    ``camera_info`` (the YAML file of `us-sim calibrate camera`; its size is asked of the camera),
-    ``frame_id``, ``encoding`` (mono8 or bgr8), ``rate`` (images a second: asked of a camera, that
-    of a file), ``loop`` (a file starts again at its end, else the node ends), ``latency`` (s from
-    the middle of the exposure to the image's arrival; the stamp is so much earlier),
-    ``await_topics`` and ``await_subscriber`` (see `Awaited`).
+    Its parameters are those of `CameraDriverSettings` and `AwaitedSettings`. A camera is asked for
+    the size in its calibration; a stamp is by ``latency`` earlier than the image came.
 
     A file begins when somebody subscribes, and what is awaited is there.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("camera_driver", **kwargs)
-        source = self._source()
-        info = fixed_parameter(self, "camera_info", "", "YAML file of the camera's calibration")
-        self._frame = fixed_parameter(self, "frame_id", "camera_optical", "frame of the images")
-        encoding = fixed_parameter(self, "encoding", "mono8", "mono8 or bgr8")
-        rate = fixed_parameter(self, "rate", 0.0, "images a second; 0: as it is", within=(0.0, 1e3))
-        self._loop = fixed_parameter(self, "loop", False, "start a file again at its end")
-        latency = fixed_parameter(
-            self, "latency", 0.0, "s from exposure to arrival", within=(-1.0, 10.0)
-        )
+        settings = declared(self, CameraDriverSettings())
+        source, info = settings.source, settings.camera_info
+        self._frame, self._loop = settings.frame_id, settings.loop
         self._awaited = Awaited(self)
-        if encoding not in ("mono8", "bgr8"):
-            raise TrackingError(f"encoding is '{encoding}'; it must be mono8 or bgr8")
-        self._grey = encoding == "mono8"
-        self._latency = round(1e9 * latency)
+        self._grey = settings.encoding == "mono8"
+        self._latency = round(1e9 * settings.latency)
         self._camera = read_camera_info(Path(info).expanduser()) if info else None
         size = (self._camera.width, self._camera.height) if self._camera else None
-        self._video = VideoSource(source, size=size, rate=rate)
+        self._video = VideoSource(source, size=size, rate=settings.rate)
         self.finished = Future()
         self.health = Health(self, source)
         self._images = self._publisher(Image, "camera/image_raw")
@@ -100,13 +88,6 @@ class CameraDriver(Node):
         if not self._thread.is_alive():  # a camera that hangs is left to the process's end
             self._video.close()
         super().destroy_node()
-
-    def _source(self) -> str:
-        """A camera's number may be written as one."""
-        descriptor = ParameterDescriptor(
-            description="camera's number, stream or video file", read_only=True, dynamic_typing=True
-        )
-        return str(self.declare_parameter("source", "0", descriptor).value)
 
     def _publisher(self, message_type: Any, topic: str) -> Any:
         return self.create_publisher(

@@ -19,8 +19,7 @@ from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.tracker_building import haptic_rendering_of
-from us_sim.tracking.haptic.settings import HapticSettings
+from us_sim.scene.tracker_building import haptic_rendering_of, source_settings
 
 __all__ = ["HapticRenderer", "main"]
 
@@ -46,7 +45,7 @@ class HapticRenderer(SceneNode):
         super().__init__("haptic_renderer", **kwargs)
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can be felt")
-        settings = self.scene.tracker.haptic or HapticSettings()
+        settings = source_settings(self.scene, "haptic")
         self._rendering = haptic_rendering_of(self.scene)
         self._frame = self.scene.tracker.frame
         self._is_taken = False

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import pixels_from
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, overridable
+from us_sim.nodes.settings import ImageWriterSettings
 
 __all__ = ["ImageWriter"]
 
@@ -22,10 +23,7 @@ class ImageWriter(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("image_writer", **kwargs)
-        folder = self.declare_parameter(
-            "folder", "images", ParameterDescriptor(description="where the PNG files go")
-        ).value
-        self._folder = Path(folder)
+        self._folder = Path(declared(self, ImageWriterSettings()).folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         self.count = 0
         self.create_subscription(

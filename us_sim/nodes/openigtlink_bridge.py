@@ -12,13 +12,13 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
-from us_sim.errors import SceneError, UsSimError
-from us_sim.geometry.pose import Pose
+from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import affine_from, pixels_from, pose_from
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
 from us_sim.tracking.openigtlink.message import image_message, transform_message
 from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
 
@@ -34,37 +34,25 @@ class OpenIGTLinkBridge(SceneNode):
     """``probe/pose`` and ``ultrasound/image`` in; an OpenIGTLink server out.
 
     It sends the image ``Image_Reference``, which lies in the reference by itself, and the
-    transforms ``ImageToReference`` and ``ProbeToReference``. Parameters beside those of every
-    scene's node: ``host`` (address to listen at), ``port``, ``reference`` (``volume``: the own
-    frame of the scene's volume, so that the volume's file loaded in Slicer fits; or ``patient``),
-    ``world`` (``ras``, as Slicer takes it, or ``lps``).
+    transforms ``ImageToReference`` and ``ProbeToReference``. Its own parameters are those of
+    `OpenIGTLinkBridgeSettings`; with the volume's own frame as the reference, the volume's file
+    loaded in Slicer fits.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("openigtlink_bridge", **kwargs)
-        host = fixed_parameter(self, "host", "localhost", "address to listen at; empty: all")
-        port = fixed_parameter(self, "port", 18944, "TCP port")
-        reference = fixed_parameter(self, "reference", "volume", "volume or patient")
-        self._world = fixed_parameter(self, "world", "ras", "ras or lps")
-        for name, value, choices in (
-            ("reference", reference, ("volume", "patient")),
-            ("world", self._world, ("ras", "lps")),
-        ):
-            if value not in choices:
-                raise SceneError(f"{name} is '{value}'; it must be {' or '.join(choices)}")
-        if not 0 <= port <= 65535:
-            raise SceneError(f"port is {port}; it must be from 0 (any that is free) to 65535")
-        place = self.scene.volume.pose
-        volume = Pose(np.array(place.position), np.array(place.orientation))
+        settings = declared(self, OpenIGTLinkBridgeSettings())
+        self._world = settings.world
+        volume = self.scene.volume.pose.pose
         # Volumes are read in LPS; RAS has x and y turned round.
         self._from_patient = np.diag([-1.0, -1.0, 1.0, 1.0] if self._world == "ras" else np.ones(4))
-        if reference == "volume":
+        if settings.reference == "volume":
             self._from_patient = self._from_patient @ volume.inverse().matrix
         self._image_to_probe: NDArray[np.float64] | None = None
         self._poses: dict[int, NDArray[np.float64]] = {}
         self._image: Image | None = None
         self._connected = -1
-        self._server = OpenIGTLinkServer(host, port)
+        self._server = OpenIGTLinkServer(settings.host or "", settings.port)
         self.listen(Float64MultiArray, "ultrasound/image_to_probe", self._take_place, LATCHED)
         self.listen(PoseStamped, "probe/pose", self._take_pose)
         self.newest(Image, "ultrasound/image", self._take_image)

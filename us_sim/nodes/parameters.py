@@ -1,26 +1,203 @@
-"""Parameters that are given at the start and stay."""
+"""Settings as ROS parameters: declared with unit and range, read, and changed while running.
+
+A number that need not be given is 0 in a parameter where it is not, and such a text is empty,
+since ROS parameters have no value for nothing.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from array import array
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar, get_args, get_origin
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
-__all__ = ["fixed_parameter"]
+from us_sim.errors import UsSimError
+from us_sim.nodes.settings import is_live
+from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
+
+__all__ = ["Group", "LiveSettings", "declared"]
+
+S = TypeVar("S", bound=Settings)
 
 
-def fixed_parameter(
-    node: Node,
-    name: str,
-    value: Any,
-    description: str,
-    *,
-    within: tuple[float, float] | None = None,
-) -> Any:
-    """Declare a read-only parameter; its value, from the command line or the default ``value``."""
-    descriptor = ParameterDescriptor(description=description, read_only=True)
-    if within is not None:
-        low, high = within
+def declared(node: Node, settings: S, names: Collection[str] | None = None, prefix: str = "") -> S:
+    """The settings with what the node's parameters were given at the start; these are declared.
+
+    Args:
+        node: that gets the parameters.
+        settings: the values by default.
+        names: the settings that are parameters; None is all.
+        prefix: what goes before their names.
+
+    Raises:
+        SettingsError: or the settings' own error: a value will not do; the node's name and the
+            parameter's come first.
+    """
+    cls = type(settings)
+    chosen = [name for name in rules_of(cls) if names is None or name in names]
+    for name in chosen:
+        descriptor = _descriptor(cls, name)
+        node.declare_parameter(prefix + name, _default(settings, name), descriptor)
+    values = {prefix + name: node.get_parameter(prefix + name).value for name in chosen}
+    return _changed(settings, values, prefix, f"{node.get_name()}.")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Settings that are parameters together."""
+
+    settings: Settings  # the values by default
+    prefix: str = ""  # before the parameters' names
+    names: Collection[str] | None = None  # of the settings that are parameters; None is all
+
+
+class LiveSettings:
+    """Settings of a node as parameters, some of which may change while it runs.
+
+    Args:
+        node: that gets the parameters.
+        groups: by a name for each.
+        prepare: called with the settings of all groups, by the groups' names, before a change is
+            taken; what it raises refuses it.
+        use: called likewise when parameters have been set.
+
+    Raises:
+        SettingsError: or the settings' own error: a value given at the start will not do.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        groups: Mapping[str, Group],
+        prepare: Callable[[dict[str, Any]], None] | None = None,
+        use: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self._node, self._groups = node, groups
+        self._prepare, self._use = prepare, use
+        self.values: dict[str, Any] = {
+            key: declared(node, group.settings, group.names, group.prefix)
+            for key, group in groups.items()
+        }
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._change)
+
+    def restore(self, values: Mapping[str, Any]) -> None:
+        """Set parameters back to what settings were, by the groups' names."""
+        back = []
+        for key, settings in values.items():
+            group = self._groups[key]
+            for name in rules_of(type(settings)):
+                is_parameter = group.names is None or name in group.names
+                if is_parameter and getattr(settings, name) != getattr(self.values[key], name):
+                    back.append(Parameter(group.prefix + name, value=_default(settings, name)))
+        self._node.set_parameters(back)
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            wanted = self._with(parameters)
+            if wanted != self.values and self._prepare is not None:
+                self._prepare(wanted)
+        except UsSimError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _change(self, parameters: list[Parameter]) -> None:
+        wanted = self._with(parameters)
+        if wanted != self.values:
+            self.values = wanted
+            if self._use is not None:
+                self._use(wanted)
+
+    def _with(self, parameters: list[Parameter]) -> dict[str, Any]:
+        values = {parameter.name: parameter.value for parameter in parameters}
+        return {
+            key: _changed(settings, values, self._groups[key].prefix)
+            for key, settings in self.values.items()
+        }
+
+
+def _changed(settings: S, values: Mapping[str, Any], prefix: str, before: str = "") -> S:
+    """The settings with the values of parameters that are theirs."""
+    changes = {}
+    for name, kind in kinds_of(type(settings)).items():
+        if prefix + name not in values:
+            continue
+        value = values[prefix + name]
+        if kind is str and isinstance(value, int | float):
+            value = str(value)  # a camera's number, say
+        if _may_be_none(kind) and (value == 0 or value == ""):
+            value = None
+        elif get_origin(kind) is tuple and get_args(kind)[0] is str:
+            value = tuple(text for text in value or () if text)
+        changes[name] = value
+    if not changes:
+        return settings
+    try:
+        changed: S = dataclasses.replace(settings, **changes)
+    except UsSimError as error:
+        at = f"{before}{prefix}{error.key}: {error.problem}" if error.key else str(error)
+        raise type(error)(at) from error
+    return changed
+
+
+def _default(settings: Settings, name: str) -> Any:
+    """A setting's value as a parameter's."""
+    value, kind = getattr(settings, name), kinds_of(type(settings))[name]
+    if get_origin(kind) is tuple:
+        if get_args(kind)[0] is str:
+            return list(value) or [""]
+        return array("d", value or (0.0,))  # an empty list would have no type
+    if value is not None:
+        return value
+    return next({int: 0, float: 0.0}.get(each, "") for each in get_args(kind))
+
+
+def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
+    """What `ros2 param describe` says of a setting."""
+    rule, kind = rules_of(settings)[name], kinds_of(settings)[name]
+    live = is_live(settings, name)
+    unit = rule.quantity.unit if rule.quantity else ""
+    constraints = ["may change while running" if live else "given at the start"]
+    names = rule.choice.names if rule.choice else rule.choices
+    if names:
+        constraints.insert(0, f"one of {', '.join(names)}")
+    if _may_be_none(kind):
+        none = "0" if {int, float} & set(get_args(kind)) else "''"
+        constraints.insert(0, f"{none} for none")
+    descriptor = ParameterDescriptor(
+        description=f"{rule.description} ({unit})" if unit else rule.description,
+        additional_constraints="; ".join(constraints),
+        read_only=not live,
+        dynamic_typing=kind is str and not live,
+    )
+    _set_range(descriptor, rule, kind)
+    return descriptor
+
+
+def _set_range(descriptor: ParameterDescriptor, rule: Rule, kind: Any) -> None:
+    """Tell ROS the range of a number; it has none for lists."""
+    if rule.quantity is None:
+        return
+    low, high = rule.quantity.minimum, rule.quantity.maximum
+    if _may_be_none(kind):
+        low = min(low, 0.0)
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    if kind is float:
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    return node.declare_parameter(name, value, descriptor).value
+    elif kind is int:
+        whole = IntegerRange(from_value=int(low), to_value=int(high), step=1)
+        descriptor.integer_range = [whole]
+
+
+def _may_be_none(kind: Any) -> bool:
+    return type(None) in get_args(kind)

@@ -18,9 +18,10 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.nodes.settings import PathPlayerSettings
 from us_sim.recording.path import ProbePath, read_path
 
 __all__ = ["PathPlayer", "main"]
@@ -32,26 +33,19 @@ CHECK_S, CHECKS = 0.05, 6
 class PathPlayer(Node):
     """A bag's poses on ``tracker/pose``.
 
-    Parameters: ``path`` (bag), ``topic`` (empty: its only PoseStamped topic), ``rate`` (speed
-    factor), ``loop``, ``restamp`` (stamp with the time of sending; else the recorded stamps),
-    ``lockstep`` (send the next pose when the image of the last has come), ``await_topics`` (begin
-    when each has a publisher), ``await_subscriber`` (and that node subscribes to each).
+    Its parameters are those of `PathPlayerSettings` and `AwaitedSettings`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("path_player", **kwargs)
-        path = fixed_parameter(self, "path", "", "bag with a PoseStamped topic")
-        topic = fixed_parameter(
-            self, "topic", "", "topic in the bag; empty: the only one of that type"
-        )
-        self._rate = fixed_parameter(self, "rate", 1.0, "speed factor", within=(0.01, 100.0))
-        self._loop = fixed_parameter(self, "loop", False, "start again at the end")
-        self._restamp = fixed_parameter(self, "restamp", True, "stamp poses when they are sent")
-        self._lockstep = fixed_parameter(self, "lockstep", False, "wait for each pose's image")
+        settings = declared(self, PathPlayerSettings())
+        path = settings.path
+        self._rate, self._loop = settings.rate, settings.loop
+        self._restamp, self._lockstep = settings.restamp, settings.lockstep
         self._awaited = Awaited(self)
         if not path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
-        self._path = read_path(path, topic or None)
+        self._path = read_path(path, settings.topic)
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
         self._begun = 0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from builtin_interfaces.msg import Time as TimeMessage
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.time import Time
+
+from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.settings import PoseAgeSettings
 
 __all__ = ["PoseAge"]
 
@@ -16,8 +16,8 @@ class PoseAge:
     """How long ago the newest pose was taken, and what that makes of an image at it.
 
     A pose ages by its stamp, and from its arrival too, so that a tracker whose clock is ahead
-    does not look live when it has gone. The parameters ``stale_after`` and ``lost_after`` (s)
-    may change while running.
+    does not look live when it has gone. How long is too long are the parameters of
+    `PoseAgeSettings`.
 
     Args:
         node: whose clock is used, and which gets the parameters.
@@ -27,8 +27,7 @@ class PoseAge:
         self._node = node
         self._stamp: int | None = None  # ns, of the newest pose
         self._arrived = 0  # ns
-        self._declare("stale_after", 0.5, "s without a new pose before the image is marked stale")
-        self._declare("lost_after", 2.0, "s without a new pose before the probe counts as lost")
+        self._settings = LiveSettings(node, {"age": Group(PoseAgeSettings())})
 
     def came(self, stamp: TimeMessage) -> None:
         """A pose with that stamp has come."""
@@ -52,22 +51,10 @@ class PoseAge:
         """``live``, ``stale``, ``lost``, or ``waiting`` for the first."""
         if age is None:
             return "waiting"
-        if age > self._value("lost_after"):
+        limits = self._settings.values["age"]
+        if age > limits.lost_after:
             return "lost"
-        return "stale" if age > self._value("stale_after") else "live"
-
-    def _declare(self, name: str, seconds: float, description: str) -> None:
-        self._node.declare_parameter(
-            name,
-            seconds,
-            ParameterDescriptor(
-                description=f"{description}; may change while running",
-                floating_point_range=[FloatingPointRange(from_value=0.01, to_value=3600.0)],
-            ),
-        )
-
-    def _value(self, name: str) -> Any:
-        return self._node.get_parameter(name).value
+        return "stale" if age > limits.stale_after else "live"
 
     def _now(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

@@ -14,15 +14,18 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from us_sim.errors import PoseError, SceneError
+from us_sim.errors import PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import pose_from, pose_message, transform_message
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.newest import Newest
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.tracker_inputs import INPUTS, create_input
-from us_sim.scene.tracker_building import tracking_of
+from us_sim.nodes.settings import ProbeTrackerSettings
+from us_sim.nodes.tracker_inputs.device import TrackerInput
+from us_sim.scene.tracker_building import source_settings, tracking_of
+from us_sim.settings.registry import TRACKERS
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.state import TrackingState
 
@@ -54,16 +57,16 @@ class ProbeTracker(SceneNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
-        self._source = fixed_parameter(self, "source", "", "replaces tracker.source of the scene")
-        self._source = self._source or self.scene.tracker.source
-        if self._source not in INPUTS:
-            raise SceneError(f"source is '{self._source}'; it must be one of {', '.join(INPUTS)}")
+        given = declared(self, ProbeTrackerSettings()).source
+        self._source = given or self.scene.tracker.source.name
         self._tracking = tracking_of(self.scene)
         self._state = TrackingState.WAITING
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
         self._status = self.latched(DiagnosticStatus, "probe/status")
-        self._input = create_input(self._source, self)
+        self._input: TrackerInput = TRACKERS.load(self._source)(
+            self, source_settings(self.scene, self._source)
+        )
         self.health.state = "waiting for poses"
         self._say_status()
         if not self.lockstep:
@@ -71,9 +74,8 @@ class ProbeTracker(SceneNode):
 
     def destroy_node(self) -> None:
         """Let go of the device, where it is held by more than subscriptions."""
-        close = getattr(self._input, "close", None)
-        if close is not None:
-            close()
+        if hasattr(self, "_input"):  # it may have refused to be made
+            self._input.close()
         super().destroy_node()
 
     def listen_to_device(
@@ -81,7 +83,7 @@ class ProbeTracker(SceneNode):
         message_type: Any,
         topic: str,
         callback: Callable[[Any], None],
-        quality: QoSProfile = FOREIGN,
+        quality: QoSProfile | None = None,
     ) -> None:
         """Subscribe as drivers may publish, best effort; all that come count as received."""
 
@@ -89,12 +91,35 @@ class ProbeTracker(SceneNode):
             self.health.received += 1
             callback(message)
 
-        self.listen(message_type, topic, count, EVERY if self.lockstep else quality)
+        self.listen(message_type, topic, count, EVERY if self.lockstep else quality or FOREIGN)
 
-    @property
-    def of_device(self) -> QoSProfile:
-        """The quality of service of a subscription to a device."""
-        return EVERY if self.lockstep else FOREIGN
+    def listen_to_newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
+        """Likewise, but ``work`` gets the newest alone where it is slower than messages come."""
+        newest = Newest(self, self.health, work, lockstep=self.lockstep)
+        self.listen(message_type, topic, newest, EVERY if self.lockstep else FOREIGN)
+
+    def in_tracker(self, work: Callable[[], None]) -> Callable[[], None]:
+        """What another thread calls to have ``work`` done in this node's own."""
+        trigger: Callable[[], None] = self.create_guard_condition(work).trigger
+        return trigger
+
+    def is_awaited(self) -> bool:
+        """Whether the simulation's other nodes are there and listen to the probe."""
+        return bool(self.count_subscribers("probe/pose")) and all(
+            self.count_publishers(topic) for topic in self.scene.ready_topics
+        )
+
+    def every(self, seconds: float, work: Callable[[], None]) -> Any:
+        """A timer, which has ``cancel``."""
+        return self.create_timer(seconds, work)
+
+    def say(self, sentence: str) -> None:
+        """Tell a person."""
+        self.get_logger().info(sentence)
+
+    def warn(self, sentence: str) -> None:
+        """Tell a person that something is amiss."""
+        self.get_logger().warning(sentence)
 
     def is_in_frame(self, header: Header, topic: str) -> bool:
         """Whether a device's message is in the frame that the scene says; said when it is not."""
@@ -114,7 +139,7 @@ class ProbeTracker(SceneNode):
         if stamp == 0:
             name = self.resolve_topic_name(topic)
             self.health.problem("stamp", f"{name} has no stamp: its time of arrival is used")
-            stamp = self._now()
+            stamp = self.now()
         return stamp
 
     def pose_in(self, message: PoseStamped, topic: str) -> Pose | None:
@@ -150,7 +175,7 @@ class ProbeTracker(SceneNode):
             )
             return
         restarts = self._tracking.restarts.total()
-        probe = self._tracking.take(measurement, self._now())
+        probe = self._tracking.take(measurement, self.now())
         if self._tracking.restarts.total() > restarts:
             self.get_logger().info(
                 "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0
@@ -181,7 +206,7 @@ class ProbeTracker(SceneNode):
 
     def _check(self) -> None:
         """Say so when the state has changed."""
-        state = self._tracking.state(self._now())
+        state = self._tracking.state(self.now())
         if state is self._state:
             return
         if state is TrackingState.LOST:
@@ -204,7 +229,8 @@ class ProbeTracker(SceneNode):
         status.values = [KeyValue(key=f"refused {k}", value=str(n)) for k, n in refused.items()]
         self._status.publish(status)
 
-    def _now(self) -> int:
+    def now(self) -> int:
+        """The present, ns."""
         return int(self.get_clock().now().nanoseconds)
 
 

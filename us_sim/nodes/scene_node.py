@@ -9,11 +9,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from us_sim.errors import SceneError
 from us_sim.nodes.health import Health
 from us_sim.nodes.newest import Newest
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
+from us_sim.nodes.settings import SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -23,26 +23,15 @@ __all__ = ["SceneNode"]
 class SceneNode(Node):
     """A node that works on a scene.
 
-    Parameters: ``scene`` (file, or name of an installed scene), ``volume`` (a file that replaces
-    the scene's), ``lockstep`` (work on every message instead of the newest), ``threads`` (for
-    the numerical work, where it can be shared out).
+    Its parameters are those of `SceneNodeSettings`.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
-        self.scene: Scene = load_scene(
-            fixed_parameter(self, "scene", "upper_arm", "scene file, or name of an installed one"),
-            volume=fixed_parameter(self, "volume", "", "volume file that replaces the scene's"),
-        )
-        self.lockstep: bool = fixed_parameter(
-            self,
-            "lockstep",
-            False,
-            "work on every message, in order, instead of the newest",
-        )
-        self.threads: int = fixed_parameter(self, "threads", 1, "for the numerical work")
-        if not 1 <= self.threads <= 256:
-            raise SceneError(f"threads is {self.threads}; it must be from 1 to 256")
+        settings = declared(self, SceneNodeSettings())
+        self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
+        self.lockstep = settings.lockstep
+        self.threads = settings.threads
         self.health = Health(self, self.scene.name)
 
     def stream(self, message_type: Any, topic: str) -> Publisher:

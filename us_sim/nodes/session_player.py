@@ -14,8 +14,9 @@ from rclpy.task import Future
 
 from us_sim.errors import BagError
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
+from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
 
@@ -28,14 +29,13 @@ START_S = 0.5
 class SessionPlayer(Node):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
 
-    Parameters: ``path`` (bag), ``rate`` (speed factor), ``loop``.
+    Its parameters are those of `SessionPlayerSettings`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_player", **kwargs)
-        path = fixed_parameter(self, "path", "", "bag to play")
-        self._rate = fixed_parameter(self, "rate", 1.0, "speed factor", within=(0.01, 100.0))
-        self._loop = fixed_parameter(self, "loop", False, "start again at the end")
+        settings = declared(self, SessionPlayerSettings())
+        path, self._rate, self._loop = settings.path, settings.rate, settings.loop
         if not path:
             raise BagError("session_player's parameter `path` is missing; name a bag to play")
         self._bag = read_bag(path)

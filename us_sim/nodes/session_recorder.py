@@ -12,8 +12,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from us_sim.errors import BagError
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
+from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.writer import BagWriter
 
 __all__ = ["SessionRecorder", "main"]
@@ -28,17 +29,18 @@ QUEUE = 1000
 class SessionRecorder(Node):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
-    Parameters: ``file`` (.mcap), ``compression`` (none or zstd), ``topics`` (full names; empty:
-    all), ``exclude``. ``tissue/structures`` and ``ultrasound/image_annotated`` are recorded only
-    where ``topics`` names them: they are large, and follow from the other topics.
+    Its parameters are those of `SessionRecorderSettings`. ``tissue/structures`` and
+    ``ultrasound/image_annotated`` are recorded only where ``topics`` names them: they are large,
+    and follow from the other topics.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)
-        file = fixed_parameter(self, "file", "session.mcap", "the MCAP file to write")
-        compression = fixed_parameter(self, "compression", "none", "none or zstd")
-        self._topics = {t for t in fixed_parameter(self, "topics", [""], "topics; empty: all") if t}
-        self._excluded = {*fixed_parameter(self, "exclude", [""], "left out"), *NOT_THE_SESSION}
+        settings = declared(self, SessionRecorderSettings())
+        file = settings.file
+        compression: Any = settings.compression
+        self._topics = set(settings.topics)
+        self._excluded = {*settings.exclude, *NOT_THE_SESSION}
         self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._topics
         self._refused: set[str] = set()
         self._subscribed: set[str] = set()

@@ -6,7 +6,6 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
@@ -14,8 +13,10 @@ from visualization_msgs.msg import Marker
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import cloud_message, mesh_message, pose_from, surface_marker
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.settings import SkinDeformerSettings
 from us_sim.scene.building import membrane_of
 
 __all__ = ["SkinDeformer", "main"]
@@ -24,22 +25,15 @@ __all__ = ["SkinDeformer", "main"]
 class SkinDeformer(SceneNode):
     """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.
 
-    The parameter ``marker_rate`` bounds how often a second the marker is sent: it is for the eye.
+    Its own parameters are those of `SkinDeformerSettings`; markers are for the eye.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("skin_deformer", **kwargs)
+        self._settings = LiveSettings(self, {"markers": Group(SkinDeformerSettings())})
         self._membrane = membrane_of(self.scene)
         surface = self._membrane.surface
         self._triangles = surface.triangles
-        self.declare_parameter(
-            "marker_rate",
-            20.0,
-            ParameterDescriptor(
-                description="markers a second at most",
-                floating_point_range=[FloatingPointRange(from_value=0.1, to_value=1000.0)],
-            ),
-        )
         self._marked = 0
         self.get_logger().info(f"preparing a membrane of {len(surface.vertices)} vertices")
         self._membrane.warm_up()
@@ -77,7 +71,7 @@ class SkinDeformer(SceneNode):
     def _is_marker_due(self, message: PoseStamped) -> bool:
         """Whether a marker's time has passed since the last one, or the stamps went back."""
         stamp = Time.from_msg(message.header.stamp).nanoseconds
-        rate = self.get_parameter("marker_rate").value
+        rate = self._settings.values["markers"].marker_rate
         if 0 <= stamp - self._marked < 0.99e9 / rate:
             return False
         self._marked = stamp

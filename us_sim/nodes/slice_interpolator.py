@@ -14,7 +14,6 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.annotated_image import AnnotatedImage
-from us_sim.nodes.console import Console
 from us_sim.nodes.conversions import (
     affine_message,
     image_message,
@@ -22,10 +21,13 @@ from us_sim.nodes.conversions import (
     tetrahedra_from,
     vectors_from,
 )
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.settings import is_live
 from us_sim.scene.building import probe_of, scanner_of, volume_of
+from us_sim.settings.setting import rules_of
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.probe import Probe
 
@@ -41,18 +43,18 @@ class SliceInterpolator(SceneNode):
     With tissue an image is made for every set of nodes, at the pose with the same stamp; without,
     for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
     its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`; what a
-    sonographer sets are parameters, see `Console`.
+    sonographer sets are parameters: the fields of `Imaging`, and the probe's depth and focus.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
         # Before the volume, which may take a minute to make.
-        console = Console(self, probe_of(self.scene), self.scene.imaging, self._prepare, self._use)
+        probe, imaging = self._console()
         volume = volume_of(self.scene)
         self._scanner = scanner_of(self.scene, volume, threads=self.threads)
-        self.get_logger().info(f"preparing {self.scene.slice.method} on {self.scene.volume_name}")
-        self._scanner.prepare(console.probe, console.imaging)
-        self._scanner.use(console.probe, console.imaging)
+        self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
+        self._scanner.prepare(probe, imaging)
+        self._scanner.use(probe, imaging)
         self._rest: Any = None
         self._tetrahedra: Any = None
         self._carried = False
@@ -60,8 +62,8 @@ class SliceInterpolator(SceneNode):
         self._unpaired: PointCloud2 | None = None
         self._images = self.stream(Image, "ultrasound/image")
         self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
-        self._places.publish(affine_message(console.probe.image_to_probe))
-        self._annotated = AnnotatedImage(self, console.probe, volume.label_names)
+        self._places.publish(affine_message(probe.image_to_probe))
+        self._annotated = AnnotatedImage(self, probe, volume.label_names)
         if self.scene.tissue is None:
             self.newest(PoseStamped, "probe/pose", self._image_rigid)
         else:
@@ -72,9 +74,17 @@ class SliceInterpolator(SceneNode):
         self.health.state = "ready"
         self.get_logger().info("ready")
 
-    def _prepare(self, probe: Probe, imaging: Imaging) -> None:
-        """Refuse what cannot be, and load what images with these settings will use."""
-        self._scanner.prepare(probe, imaging)
+    def _console(self) -> tuple[Probe, Imaging]:
+        """What a sonographer sets, as parameters that may change while the node runs."""
+        probe = probe_of(self.scene)
+        live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
+        console = LiveSettings(
+            self,
+            {"probe": Group(probe, names=live), "imaging": Group(self.scene.imaging)},
+            lambda wanted: self._scanner.prepare(**wanted),
+            lambda wanted: self._use(**wanted),
+        )
+        return console.values["probe"], console.values["imaging"]
 
     def _use(self, probe: Probe, imaging: Imaging) -> None:
         """Go on with what was set at the console."""

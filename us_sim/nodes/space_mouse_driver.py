@@ -12,9 +12,10 @@ from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import fixed_parameter
+from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse.space_mouse import SpaceMouse
 
 __all__ = ["SpaceMouseDriver", "main"]
@@ -26,17 +27,15 @@ RETRY_S = 1.0
 class SpaceMouseDriver(Node):
     """``spacenav/joy``: six axes in ±1 and the buttons, at each change and while nothing changes.
 
-    Parameters: ``frame_id``, ``rate`` (messages a second while nothing changes: the device itself
-    is silent then, and so it is when it is unplugged).
+    Its parameters are those of `SpaceMouseDriverSettings`. While nothing changes the device itself
+    is silent, and so it is when it is unplugged.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("space_mouse_driver", **kwargs)
-        self._frame = fixed_parameter(self, "frame_id", "spacenav", "frame of the messages")
-        rate = fixed_parameter(
-            self, "rate", 100.0, "messages a second at rest", within=(1.0, 1000.0)
-        )
-        self._patience = 1.0 / rate
+        settings = declared(self, SpaceMouseDriverSettings())
+        self._frame = settings.frame_id
+        self._patience = 1.0 / settings.rate
         self.health = Health(self, "SpaceMouse")
         self.health.state = "opening"
         self._joys = self.create_publisher(

@@ -8,13 +8,14 @@ import time
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import structure_markers
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.settings import StructureMarkersSettings
 from us_sim.scene.building import volume_of
 from us_sim.scene.structures import Structure, structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -26,9 +27,8 @@ class StructureMarkers:
     """``tissue/structures``: a TRIANGLE_LIST of each structure, where the tissue has carried it.
 
     Their surfaces are made when the first subscriber has come, in a thread, while the tissue goes
-    on being deformed; in lockstep they are made at once, so that no pose is without. The parameter
-    ``structure_triangles`` bounds how fine those around labels are, ``marker_rate`` how often a
-    second they are sent: they are for the eye.
+    on being deformed; in lockstep they are made at once, so that no pose is without. How fine they
+    are and how often they are sent are the parameters of `StructureMarkersSettings`.
 
     Args:
         node: that publishes them, of a scene that has structures.
@@ -38,23 +38,7 @@ class StructureMarkers:
     def __init__(self, node: SceneNode, mesh: TetrahedralMesh) -> None:
         self._node = node
         self._mesh = mesh
-        node.declare_parameter(
-            "marker_rate",
-            20.0,
-            ParameterDescriptor(
-                description="markers of the structures a second at most",
-                floating_point_range=[FloatingPointRange(from_value=0.1, to_value=1000.0)],
-            ),
-        )
-        self._triangles: int = node.declare_parameter(
-            "structure_triangles",
-            40_000,
-            ParameterDescriptor(
-                description="about so many for all structures around labels together",
-                integer_range=[IntegerRange(from_value=100, to_value=10_000_000, step=1)],
-                read_only=True,
-            ),
-        ).value
+        self._settings = LiveSettings(node, {"markers": Group(StructureMarkersSettings())})
         self._publisher = node.stream(MarkerArray, "tissue/structures")
         self._structures: list[Structure] = []
         self._making: threading.Thread | None = None
@@ -76,7 +60,7 @@ class StructureMarkers:
         if self._sent is None:
             return True
         since = Time.from_msg(stamp).nanoseconds - self._sent
-        return not 0 <= since < 0.99e9 / self._node.get_parameter("marker_rate").value
+        return not 0 <= since < 0.99e9 / self._settings.values["markers"].marker_rate
 
     def publish(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
         """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
@@ -91,10 +75,9 @@ class StructureMarkers:
     def _make(self) -> None:
         began = time.monotonic()
         scene = self._node.scene
+        triangles = self._settings.values["markers"].structure_triangles
         try:
-            self._structures = list(
-                structures_of(scene, volume_of(scene), self._mesh, self._triangles)
-            )
+            self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
         except UsSimError as error:
             self.state = str(error)
             self._node.health.problem("structures", f"{error}; no structure is shown")

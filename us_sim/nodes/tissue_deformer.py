@@ -7,23 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.errors import SceneError, SolverError, UsSimError
+from us_sim.errors import SceneError, UsSimError
 from us_sim.nodes.conversions import (
     cloud_message,
     pose_from,
     tetrahedra_message,
     wrench_message,
 )
+from us_sim.nodes.live_tissue import LiveTissue
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.building import tissue_model_of, volume_of
-from us_sim.tissue.solvers.solver import SOLVERS
-from us_sim.tissue.solvers.switching import SwitchableTissue
 
 if TYPE_CHECKING:
     from us_sim.nodes.contact_model_publisher import ContactModelPublisher
@@ -41,32 +37,17 @@ class TissueDeformer(SceneNode):
     ``tissue/contact_model`` too where a haptic arm needs it, see `ContactModelPublisher`, and
     ``tissue/structures`` where the scene has structures, see `StructureMarkers`.
 
-    The parameter ``solver`` switches the method while running; the state is carried over. With
-    ``compare_with`` another method runs on the same poses, and diagnostics say how far its nodes
-    are from those published.
+    The method, the settings of every method and the materials are parameters that may change while
+    running, see `LiveTissue`; the state is carried over. With ``compare_with`` another method runs
+    on the same poses, and diagnostics say how far its nodes are from those published.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tissue_deformer", **kwargs)
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
-        # Before the volume, which may take a minute to make.
-        solver = self._method(
-            "solver", self.scene.tissue.solver, f"one of {', '.join(SOLVERS)}", "deforms the tissue"
-        )
-        compared = self._method(
-            "compare_with", "", "another one, or '' for none", "runs on the same poses beside it"
-        )
-        _require_two(solver, compared)
-        model = tissue_model_of(self.scene, volume_of(self.scene), self.get_logger().info)
-        mesh = model.mesh
-        self.get_logger().info(
-            f"preparing {solver} for {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra"
-        )
-        self._tissue = SwitchableTissue(model, solver, self.scene.tissue.settings)
-        self._tissue.compare_with(compared)
-        self.add_on_set_parameters_callback(self._check)
-        self.add_post_set_parameters_callback(self._switch)
+        self._live = LiveTissue(self)
+        mesh = self._live.tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
         self._contact: ContactModelPublisher | None = None
@@ -84,45 +65,8 @@ class TissueDeformer(SceneNode):
 
             self._structures = StructureMarkers(self, mesh)
         self.newest(PoseStamped, "probe/pose", self._deform)
-        self.health.state = f"ready with {solver}"
+        self.health.state = f"ready with {self._live.tissue.name}"
         self.get_logger().info(self.health.state)
-
-    def _method(self, name: str, value: str, choices: str, purpose: str) -> str:
-        """Declare a parameter that names a solver and may change while running."""
-        descriptor = ParameterDescriptor(
-            description=f"method that {purpose}; may change while running",
-            additional_constraints=choices,
-        )
-        method = str(self.declare_parameter(name, value, descriptor).value)
-        if method not in SOLVERS and (method or name == "solver"):
-            raise SolverError(
-                f"{self.get_name()}.{name}: {method!r} is not one of {', '.join(SOLVERS)}"
-            )
-        return method
-
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Prepare a named solver before the switch, so that one that cannot be made is refused."""
-        wanted = {"solver": self._tissue.name, "compare_with": self._tissue.compared}
-        wanted |= {p.name: p.value for p in parameters if p.name in wanted}
-        try:
-            self._tissue.prepare(wanted["solver"])
-            if wanted["compare_with"]:
-                self._tissue.prepare(wanted["compare_with"])
-                _require_two(wanted["solver"], wanted["compare_with"])
-        except UsSimError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _switch(self, parameters: list[Parameter]) -> None:
-        wanted = {p.name: p.value for p in parameters}
-        if "compare_with" in wanted:
-            self._tissue.compare_with("")
-        if wanted.get("solver", self._tissue.name) != self._tissue.name:
-            self._tissue.use(wanted["solver"])
-            self.get_logger().info(f"switched to {self._tissue.name}")
-        if wanted.get("compare_with"):
-            self._tissue.compare_with(wanted["compare_with"])
-            self.get_logger().info(f"comparing with {self._tissue.compared}")
 
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
@@ -134,7 +78,7 @@ class TissueDeformer(SceneNode):
             return
         try:
             pose = pose_from(message)
-            deformation = self._tissue.deform(pose)
+            deformation = self._live.deform(pose)
         except UsSimError as error:
             self.health.problem("pose", f"{error}; the tissue stays as it was")
             return
@@ -147,10 +91,10 @@ class TissueDeformer(SceneNode):
             )
             self.health.published("probe/wrench")
         if self._contact is not None and touched:
-            self._contact.publish(self._tissue, pose, deformation, stamp)
+            self._contact.publish(self._live.tissue, pose, deformation, stamp)
         if self._structures is not None and shown:
             self._structures.publish(deformation.nodes, stamp)
-        self.health.state = self._tissue.name
+        self.health.state = self._live.state
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
             "contact_nodes": str(len(deformation.contact_nodes)),
@@ -161,11 +105,12 @@ class TissueDeformer(SceneNode):
 
     def _comparison(self) -> dict[str, str]:
         """What diagnostics say of the solver beside the one in use."""
-        apart = self._tissue.difference
+        tissue = self._live.tissue
+        apart = tissue.difference
         if apart is None:
             return {}
         return {
-            "compared_with": self._tissue.compared,
+            "compared_with": tissue.compared,
             "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
             "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
@@ -173,14 +118,6 @@ class TissueDeformer(SceneNode):
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T
         return cloud_message({"x": x, "y": y, "z": z}, stamp, "patient")
-
-
-def _require_two(solver: str, compared: str) -> None:
-    if compared == solver:
-        raise SolverError(
-            f"{solver} cannot be compared with itself: set compare_with to another method, or to "
-            f"'', first"
-        )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -19,13 +19,13 @@ from typing import IO
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.settings import checked_parameters
 from us_sim.scene.scene import Scene
 
 __all__ = [
     "NodeProcess",
     "Parameters",
     "ProcessGroup",
-    "awaited_topics",
     "keep_on_this_host",
     "player_settings",
     "simulation_nodes",
@@ -43,20 +43,23 @@ STOP_S = 0.8
 
 @dataclass(frozen=True)
 class NodeProcess:
-    """One node and its parameters (JSON-like values; a raw text is passed as YAML)."""
+    """One node and its parameters."""
 
     node: str
-    parameters: dict[str, object] = field(default_factory=dict)
-    raw_parameters: dict[str, str] = field(default_factory=dict)
+    parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
+    given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
         command = [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
-        for name, value in self.parameters.items():
+        for name, value in self.all_parameters.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]
-        for name, text in self.raw_parameters.items():
-            command += ["-p", f"{name}:={text}"]
         return command
+
+    @property
+    def all_parameters(self) -> dict[str, object]:
+        """Those that a person gave go before the others."""
+        return self.parameters | self.given
 
 
 def simulation_nodes(
@@ -80,7 +83,7 @@ def simulation_nodes(
         NodeProcess(
             part.node,
             common | ({"source": "pose"} if played and part.node == "probe_tracker" else {}),
-            given.pop(part.node, {}),
+            checked_parameters(part.node, scene, given.pop(part.node, {})),
         )
         for part in scene.parts()
         if part.needed
@@ -93,19 +96,12 @@ def simulation_nodes(
     return nodes
 
 
-def awaited_topics(scene: Scene) -> list[str]:
-    """Topics that are published once all of the scene's nodes are ready."""
-    topics = ["probe/pose", "ultrasound/image"]
-    topics += ["tissue/nodes"] if scene.tissue else []
-    return topics + (["skin/nodes"] if scene.skin else [])
-
-
 def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:
     """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
     return {
         "path": str(path.expanduser().resolve()),
-        "topic": (scene.tracker.body or "") if scene.tracker.source == "path" else "",
-        "await_topics": ["tracker/pose", *awaited_topics(scene)],
+        "topic": (scene.tracker.body or "") if scene.tracker.source.name == "path" else "",
+        "await_topics": ["tracker/pose", *scene.ready_topics],
         "await_subscriber": "session_recorder" if recorded else "",
     }
 
@@ -115,7 +111,7 @@ def video_settings(scene: Scene, video: Path, info: Path, *, recorded: bool) -> 
     return {
         "source": str(video),
         "camera_info": str(info),
-        "await_topics": ["camera/camera_info", *awaited_topics(scene)],
+        "await_topics": ["camera/camera_info", *scene.ready_topics],
         "await_subscriber": "session_recorder" if recorded else "",
     }
 

@@ -32,14 +32,18 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
     rows.append(
         ("runs", "path_player", f"plays {path}")
         if path
-        else ("left out", "path_player", f"no --path: poses come from `{scene.tracker.source}`")
+        else (
+            "left out",
+            "path_player",
+            f"no --path: poses come from `{scene.tracker.source.name}`",
+        )
     )
     rows.append(
         ("runs", "session_recorder", f"records to {record}")
         if record
         else ("left out", "session_recorder", "no --record")
     )
-    lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume_name}"]
+    lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
     lines.append(
         "on demand wrench, tf, markers, annotated image: nothing is computed for a topic nobody "
@@ -101,7 +105,7 @@ def demo(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    source = source or ("camera" if scene.tracker.source == "camera" else "path")
+    source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     video = _prepared_video(scene, Path(scene.path)) if source == "camera" else None
     path = Path(scene.path) if video is None else None
     plan = plan_of(scene, parameters, record=recording, path=path, video=video)
@@ -157,7 +161,7 @@ def prepare_volume(scene: Scene) -> None:
     def show(fraction: float, text: str) -> None:
         if not bar:
             _require_a_cache()
-            bar.append(Progress(f"making {scene.volume_name}", 100, "%"))
+            bar.append(Progress(f"making {scene.volume.name}", 100, "%"))
         bar[0].update(100 * fraction, text)
 
     try:

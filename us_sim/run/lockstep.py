@@ -8,12 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.graph import (
-    NodeProcess,
     Parameters,
     keep_on_this_host,
     player_settings,
@@ -122,7 +119,7 @@ def _nodes(
         ("session_recorder", "SessionRecorder", recorder),
         ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
         *(
-            (process.node, _class_name(process.node), {**common, **_values(process)})
+            (process.node, _class_name(process.node), {**common, **process.all_parameters})
             for process in simulation_nodes(scene, parameters, played=True)
         ),
         ("path_player", "PathPlayer", player),
@@ -131,12 +128,6 @@ def _nodes(
 
 def _class_name(node: str) -> str:
     return "".join(word.capitalize() for word in node.split("_"))
-
-
-def _values(process: NodeProcess) -> dict[str, object]:
-    """All its parameters, those given as YAML texts parsed."""
-    given = {name: yaml.safe_load(text) for name, text in process.raw_parameters.items()}
-    return process.parameters | given
 
 
 def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:

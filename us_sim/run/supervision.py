@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.settings import checked_parameters
 from us_sim.progress import Progress
 from us_sim.run.graph import (
     NodeProcess,
@@ -74,16 +75,18 @@ def plan_of(
         video: to show the scene's camera in place of a path.
     """
     parameters = dict(parameters)
+
+    def taken(node: str) -> dict[str, object]:
+        return checked_parameters(node, scene, parameters.pop(node, {}))
+
     processes = []
     if record is not None:
         settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
         if video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
-        processes.append(
-            NodeProcess("session_recorder", settings, parameters.pop("session_recorder", {}))
-        )
-    player = parameters.pop("path_player", {}) if path is not None else {}
-    driver = parameters.pop("camera_driver", {}) if video is not None else {}
+        processes.append(NodeProcess("session_recorder", settings, taken("session_recorder")))
+    player = taken("path_player") if path is not None else {}
+    driver = taken("camera_driver") if video is not None else {}
     processes += simulation_nodes(scene, parameters, played=path is not None)
     if video is not None:
         settings = video_settings(scene, video.file, video.camera_info, recorded=record is not None)
@@ -92,7 +95,7 @@ def plan_of(
         return Plan(scene, processes, count, duration, "camera_driver", "camera/image_raw")
     poses = None
     if path is not None:
-        poses = len(path_of(scene, path, player.get("topic")))
+        poses = len(path_of(scene, path, str(player.get("topic") or "") or None))
         settings = player_settings(scene, path, recorded=record is not None)
         processes.append(NodeProcess("path_player", settings, player))
     return Plan(scene, processes, poses, duration)
@@ -148,7 +151,7 @@ class Monitored:
         from rclpy.parameter_client import AsyncParameterClient
 
         for process in processes:
-            if not process.raw_parameters:
+            if not process.given:
                 continue
             client = AsyncParameterClient(self.node, process.node)
             client.wait_for_services(timeout_sec=ANSWER_S)
@@ -166,7 +169,7 @@ class Monitored:
 
 def refuse_unknown(process: NodeProcess, known: Collection[str]) -> None:
     """Raise UsSimError when a parameter was given by a name that is not among the ``known``."""
-    for name in process.raw_parameters:
+    for name in process.given:
         if name not in known and not name.startswith("qos_overrides."):
             own = sorted(n for n in known if not n.startswith("qos_overrides."))
             raise UsSimError(

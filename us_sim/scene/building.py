@@ -11,16 +11,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, ProbeError, SceneError
-from us_sim.geometry.pose import Pose
-from us_sim.scene.scene import PoseSection, Scene, TissueSection
+from us_sim.scene.scene import Scene, TissueSettings
+from us_sim.settings.registry import COLLIDERS, PROBES
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
@@ -28,15 +28,17 @@ if TYPE_CHECKING:
     from us_sim.skin.membrane import SkinMembrane
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe.probe import Probe
+    from us_sim.tissue.elasticity.material import Material
+    from us_sim.tissue.elasticity.materials import TissueMaterials
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
     from us_sim.volume.volume import Volume
 
 __all__ = [
     "collider_of",
+    "materials_of",
     "membrane_of",
     "path_of",
-    "pose_of",
     "probe_of",
     "scanner_of",
     "tissue_model_of",
@@ -61,7 +63,7 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
         volume = cached_phantom(
             scene.volume.phantom, scene.volume.seed, scene.volume.voxel_size, progress
         )
-    patient_from_volume = pose_of(scene.volume.pose).matrix
+    patient_from_volume = scene.volume.pose.pose.matrix
     return dataclasses.replace(
         volume, index_to_patient=patient_from_volume @ volume.index_to_patient
     )
@@ -75,7 +77,7 @@ def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
     """
     from us_sim.recording.path import read_path
 
-    if scene.tracker.source == "path":
+    if scene.tracker.source.name == "path":
         topic = topic or scene.tracker.body
     path = read_path(file, topic)
     if path.frame_id != scene.tracker.frame:
@@ -90,28 +92,15 @@ def probe_of(scene: Scene) -> Probe:
     """The transducer that images.
 
     Raises:
-        SceneError: a key of its geometry is missing, one is given that it does not have, or values
-            do not go together.
+        SceneError: its image is too large.
     """
-    from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-    from us_sim.slicing.probe.probe import LinearProbe
-
     section = scene.probe
-    geometries: dict[str, Any] = {
-        "linear": LinearProbe,
-        "convex": ConvexProbe,
-        "sector": SectorProbe,
-    }
-    geometry = geometries[section.geometry]
-    given = {f.name: getattr(section, f.name) for f in dataclasses.fields(section)}
-    image = given.pop("image") or ((512, 512) if section.geometry == "linear" else 512)
-    del given["collider"]
-    kind = f"{given.pop('geometry')} probe"
-    given = _keys_of(geometry, given, f"{scene.origin}: probe", kind, ("columns", "rows"))
+    array: Probe = section.array.settings(PROBES)
+    image = section.image or ((512, 512) if section.geometry == "linear" else 512)
     try:
         if isinstance(image, int):
-            return geometry.with_square_pixels(image, **given)
-        return geometry(columns=image[0], rows=image[1], **given)
+            return array.with_square_pixels(image)
+        return array.with_pixels(*image)
     except ProbeError as error:
         raise SceneError(f"{scene.origin}: {error}") from error
 
@@ -120,60 +109,27 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
     """The scanner that makes the scene's images; its tissue's mesh is for it to be told."""
     from us_sim.slicing.b_mode import BMode
 
-    method = scene.slice.method
-    settings = {"regions": scene.slice.regions} if method == "row_subdivision" else {}
-    return BMode(volume, probe_of(scene), scene.imaging, method=method, threads=threads, **settings)
+    return BMode(
+        volume,
+        probe_of(scene),
+        scene.imaging,
+        method=scene.slice.name,
+        threads=threads,
+        settings=scene.slice.given,
+    )
 
 
 def collider_of(scene: Scene) -> Collider:
     """The probe's shape that presses.
 
     Raises:
-        SceneError: a dimension of that shape is missing, one is given that it does not have, or
-            they do not go together.
+        SceneError: the scene has none.
     """
-    from us_sim.geometry import collider
-
     section = scene.probe.collider
     if section is None:
         raise SceneError(f"{scene.origin}: probe.collider: is missing")
-    shapes: dict[str, Any] = {
-        "sphere": collider.Sphere,
-        "capsule": collider.Capsule,
-        "rounded_box": collider.RoundedBox,
-        "convex": collider.Convex,
-    }
-    given = dataclasses.asdict(section)
-    name = given.pop("shape")
-    given = _keys_of(shapes[name], given, f"{scene.origin}: probe.collider", name)
-    try:
-        return shapes[name](**given)
-    except ProbeError as error:
-        raise SceneError(f"{scene.origin}: probe.collider: {error}") from error
-
-
-def _keys_of(
-    made: Any, values: dict[str, Any], at: str, kind: str, apart: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """The values that are given, which are to be fields of the dataclass ``made``.
-
-    Args:
-        made: whose fields without a default must be given, but for those named in ``apart``.
-        values: by key, None where the scene does not give one.
-        at: the section in the scene.
-        kind: what is made, for a person.
-    """
-    fields = [f for f in dataclasses.fields(made) if f.name not in apart]
-    needed = [f.name for f in fields if f.default is dataclasses.MISSING]
-    known = [f.name for f in fields]
-    given = {name: value for name, value in values.items() if value is not None}
-    for name in needed:
-        if name not in given:
-            raise SceneError(f"{at}.{name}: is missing; a {kind} needs {', '.join(needed)}")
-    for name in given:
-        if name not in known:
-            raise SceneError(f"{at}.{name}: a {kind} has no {name}; it has {', '.join(known)}")
-    return given
+    shape: Collider = section.settings(COLLIDERS)
+    return shape
 
 
 def tissue_model_of(
@@ -209,74 +165,24 @@ def tissue_model_of(
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
-        materials=_materials(scene, section, mesh, volume),
+        materials=materials_of(scene, section.materials, mesh, volume),
         fixed=fixed,
         collider=collider_of(scene),
         contact_nodes=contact,
     )
 
 
-def membrane_of(scene: Scene) -> SkinMembrane:
-    """The scene's skin, pressed by the scene's probe."""
-    from us_sim.skin import surface
-    from us_sim.skin.membrane import SkinMembrane
+def materials_of(
+    scene: Scene, materials: Mapping[str, Material], mesh: TetrahedralMesh, volume: Volume
+) -> TissueMaterials:
+    """The constants of each tetrahedron, from materials by label name.
 
-    section = scene.skin
-    if section is None:
-        raise SceneError(f"{scene.origin}: skin: is missing")
-    if section.file:
-        sheet = surface.read_surface(Path(section.file))
-    elif section.flat_width >= section.size[0]:
-        sheet = surface.plane_surface(section.size, section.spacing)
-    else:
-        sheet = surface.bent_surface(
-            section.size, section.spacing, flat_width=section.flat_width, radius=section.radius
-        )
-    return SkinMembrane(
-        sheet,
-        collider_of(scene),
-        stiffness=section.stiffness,
-        anchor_stiffness=section.anchor_stiffness,
-        density=section.density,
-    )
+    Raises:
+        SceneError: a label of the volume has no material, or a material no label.
+    """
+    from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
 
-
-def _mesh(section: TissueSection) -> tuple[TetrahedralMesh, tuple[str, ...]]:
-    """The mesh, and what there is to say about it."""
-    given = section.mesh
-    if given.file:
-        from us_sim.tissue.mesh.file import read_mesh
-
-        mesh, remarks = read_mesh(Path(given.file), given.unit, pose_of(given.pose))
-        parts = int(mesh.parts.max()) + 1
-        if parts > 1:
-            remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
-        return mesh, remarks
-    from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-
-    assert given.lower is not None
-    assert given.upper is not None
-    planes = [
-        np.array(given.planes[axis])
-        if axis in given.planes
-        else uniform_planes(given.lower[i], given.upper[i], given.nodes[i])
-        for i, axis in enumerate("xyz")
-    ]
-    return box_mesh(*planes), ()
-
-
-def pose_of(section: PoseSection) -> Pose:
-    """The pose that a scene writes down."""
-    return Pose(np.array(section.position), np.array(section.orientation))
-
-
-def _materials(scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volume: Volume) -> Any:
-    from us_sim.tissue.elasticity.materials import Material, average_over_labels, uniform_material
-
-    materials = {
-        name: Material(given.young_modulus, given.poisson_ratio, given.density)
-        for name, given in section.materials.items()
-    }
+    materials = dict(materials)
     if volume.labels is None:
         if list(materials) != ["tissue"]:
             raise SceneError(
@@ -297,8 +203,51 @@ def _materials(scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volu
     return average_over_labels(mesh, volume.labels, volume.patient_to_index, by_label)
 
 
+def membrane_of(scene: Scene) -> SkinMembrane:
+    """The scene's skin, pressed by the scene's probe."""
+    from us_sim.skin import surface
+    from us_sim.skin.membrane import SkinMembrane
+
+    section = scene.skin
+    if section is None:
+        raise SceneError(f"{scene.origin}: skin: is missing")
+    if section.file:
+        sheet = surface.read_surface(Path(section.file))
+    elif section.flat_width >= section.size[0]:
+        sheet = surface.plane_surface(section.size, section.spacing)
+    else:
+        sheet = surface.bent_surface(
+            section.size, section.spacing, flat_width=section.flat_width, radius=section.radius
+        )
+    return SkinMembrane(sheet, collider_of(scene), section)
+
+
+def _mesh(section: TissueSettings) -> tuple[TetrahedralMesh, tuple[str, ...]]:
+    """The mesh, and what there is to say about it."""
+    given = section.mesh
+    if given.file:
+        from us_sim.tissue.mesh.file import read_mesh
+
+        mesh, remarks = read_mesh(Path(given.file), given.unit, given.pose.pose)
+        parts = int(mesh.parts.max()) + 1
+        if parts > 1:
+            remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
+        return mesh, remarks
+    from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+
+    assert given.lower is not None
+    assert given.upper is not None
+    planes = [
+        np.array(given.planes[axis])
+        if axis in given.planes
+        else uniform_planes(given.lower[i], given.upper[i], given.nodes[i])
+        for i, axis in enumerate("xyz")
+    ]
+    return box_mesh(*planes), ()
+
+
 def _fixed_nodes(
-    scene: Scene, section: TissueSection, mesh: TetrahedralMesh, volume: Volume
+    scene: Scene, section: TissueSettings, mesh: TetrahedralMesh, volume: Volume
 ) -> NDArray[np.bool_]:
     """Nodes on the named faces, and nodes inside the named labels (the skeleton is rigid)."""
     from us_sim.tissue.mesh.node_selection import FACES, face_nodes, nodes_in_label

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 import yaml
 
 from us_sim.errors import SceneError
+from us_sim.scene.scene import Scene
+from us_sim.settings.choice import Choice
+from us_sim.settings.setting import Settings, kinds_of, rules_of
 
 __all__ = ["merged", "read_document"]
 
-DIMENSIONS = {
-    "geometry": ("aperture", "radius", "opening_angle"),
-    "shape": ("radius", "length", "width", "height", "rounding"),
-}
-"""Keys that say of which kind a probe or a collider is, and those that depend on it."""
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
 
@@ -63,27 +62,88 @@ def read_document(
 def merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
     """``below`` with what ``above`` says: mappings key by key, anything else replaced.
 
-    Where ``above`` names another geometry or shape, the dimensions of the one below go with it.
+    Where ``above`` chooses another kind of probe, collider, filter, ..., what only some kinds have
+    goes with the one below.
     """
-    result = dict(below)
-    for kind, dimensions in DIMENSIONS.items():
-        if kind in above and above[kind] != below.get(kind):
-            result = {key: value for key, value in result.items() if key not in dimensions}
+    return _merged(below, above, Scene, None)
+
+
+def _merged(
+    below: dict[Any, Any],
+    above: dict[Any, Any],
+    settings: type[Settings] | None,
+    choice: Choice | None,
+) -> dict[Any, Any]:
+    """Two mappings merged, of the settings or the choice whose keys they hold."""
+    gone = _no_longer(below, above, choice) if choice else set()
+    rules = rules_of(settings) if settings else {}
+    for rule in rules.values():
+        if rule.choice and rule.place == "beside":
+            gone |= _no_longer(below, above, rule.choice)
+        elif rule.choice and rule.place == "named" and _changes(below, above, rule.choice):
+            gone |= set(rule.choice.names)
+        elif rule.applies and above.get(rule.applies[0]) not in (None, *rule.applies[1]):
+            gone |= {name for name, other in rules.items() if other is rule}
+    result = {key: value for key, value in below.items() if key not in gone}
     for key, value in above.items():
         under = result.get(key)
         if isinstance(under, dict) and isinstance(value, dict):
-            value = merged(under, value)
+            kind = _settings_in(kinds_of(settings).get(key)) if settings else None
+            rule_of_key = rules.get(key)
+            chosen = rule_of_key.choice if rule_of_key and rule_of_key.place == "within" else None
+            value = _merged(under, value, kind, chosen)
         result[key] = value
     return result
 
 
+def _changes(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> bool:
+    return choice.key in above and above[choice.key] != below.get(choice.key)
+
+
+def _no_longer(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> set[str]:
+    """The keys that not all options have, if another option is chosen."""
+    if not _changes(below, above, choice):
+        return set()
+    keys = [set(rules_of(choice.settings(name))) for name in choice.names]
+    return set().union(*keys) - keys[0].intersection(*keys)
+
+
+def _settings_in(kind: Any) -> type[Settings] | None:
+    """The settings class that a type is, or may be."""
+    options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    for option in options:
+        if isinstance(option, type) and issubclass(option, Settings):
+            return option
+    return None
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses what YAML forbids and PyYAML lets pass: a key that is there twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        lines: dict[Any, int] = {}
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag.endswith(":merge"):
+                continue
+            line = key_node.start_mark.line + 1
+            key = self.construct_object(key_node)  # type: ignore[no-untyped-call]
+            if key in lines:
+                problem = f"key `{key}` is there twice, first in line {lines[key]}"
+                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
+            lines[key] = line
+        made: dict[Any, Any] = super().construct_mapping(node, deep)
+        return made
+
+
 def _yaml(path: Path) -> Any:
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}:" if mark else ""
         problem = getattr(error, "problem", None) or "unreadable"
+        if "is there twice" in problem:
+            raise SceneError(f"{path}:{where} {problem}: keep one") from error
         raise SceneError(f"{path}:{where} is not YAML: {problem}") from error

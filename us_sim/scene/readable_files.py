@@ -14,7 +14,7 @@ from pathlib import Path
 
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.tracker_building import camera_body_of, tracking_of
+from us_sim.scene.tracker_building import camera_body_of, source_settings, tracking_of
 
 __all__ = ["check_files"]
 
@@ -52,10 +52,10 @@ def check_files(scene: Scene) -> list[str]:
         for key in ("registration", "calibration")
         if isinstance(getattr(tracker, key), str)
     ]
-    if tracker.camera is not None and tracker.camera.body:
+    if tracker.source.name == "camera" and source_settings(scene, "camera").body:
         camera_body_of(scene)
         checked.append("tracker.camera.body")
-    if tracker.source == "path" and tracker.file:
+    if tracker.source.name == "path" and tracker.file:
         path_of(scene, Path(tracker.file))
         checked.append("tracker.file")
     if scene.path:

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import SceneError, UsSimError
-from us_sim.geometry.pose import Pose
 from us_sim.scene.scene import Scene
 from us_sim.volume.volume import Volume
 
@@ -125,5 +124,4 @@ def _surface_of(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[n
     given = scene.structures[name]
     assert given.file is not None
     surface = read_surface(Path(given.file), given.unit)
-    pose = Pose(np.array(given.pose.position), np.array(given.pose.orientation))
-    return pose.apply(surface.vertices), surface.triangles
+    return given.pose.pose.apply(surface.vertices), surface.triangles

@@ -8,18 +8,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from us_sim.geometry.placement import Placement
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import pose_of
-from us_sim.scene.scene import PoseSection, Scene
+from us_sim.scene.scene import Scene
+from us_sim.settings.registry import TRACKERS
 
 if TYPE_CHECKING:
     from us_sim.tracking.camera.rigid_body import RigidBody
     from us_sim.tracking.haptic.rendering import HapticRendering
     from us_sim.tracking.probe_tracking import ProbeTracking
 
-__all__ = ["camera_body_of", "haptic_rendering_of", "tracker_poses_of", "tracking_of"]
+__all__ = [
+    "camera_body_of",
+    "haptic_rendering_of",
+    "source_settings",
+    "tracker_poses_of",
+    "tracking_of",
+]
 
 
 def tracking_of(scene: Scene) -> ProbeTracking:
@@ -29,7 +36,7 @@ def tracking_of(scene: Scene) -> ProbeTracking:
         CalibrationError: a file of a registration or calibration cannot be used.
         TrackingError: the times make no sense.
     """
-    from us_sim.tracking.filter.pose_filter import make_filter
+    from us_sim.tracking.filter.pose_filter import create_filter
     from us_sim.tracking.probe_tracking import ProbeTracking
 
     tracker = scene.tracker
@@ -40,12 +47,24 @@ def tracking_of(scene: Scene) -> ProbeTracking:
         gate = OutlierGate(tracker.gate)
     return ProbeTracking(
         *tracker_poses_of(scene),
-        make_filter(tracker.filter),
+        create_filter(tracker.filter.name, tracker.filter.given),
         gate,
         time_offset=tracker.time_offset,
         coast_for=tracker.coast_for,
         lost_after=tracker.lost_after,
     )
+
+
+def source_settings(scene: Scene, source: str) -> Any:
+    """The settings of a source of poses: the scene's where it names that source, else the defaults.
+
+    Raises:
+        TrackingError: there is no such source.
+    """
+    chosen = scene.tracker.source
+    if chosen.name == source and chosen.given is not None:
+        return chosen.given
+    return TRACKERS.settings(source)()
 
 
 def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
@@ -66,20 +85,19 @@ def haptic_rendering_of(scene: Scene) -> HapticRendering:
     """
     from us_sim.tracking.haptic.device import HapticDevice
     from us_sim.tracking.haptic.rendering import HapticRendering
-    from us_sim.tracking.haptic.settings import HapticSettings
 
     tracker = scene.tracker
-    settings = tracker.haptic or HapticSettings()
+    settings = source_settings(scene, "haptic")
     device = HapticDevice(settings, *tracker_poses_of(scene))
     return HapticRendering(settings, device, time_offset=tracker.time_offset)
 
 
-def _pose_or_file(given: PoseSection | str | None) -> Pose:
+def _pose_or_file(given: Placement | str | None) -> Pose:
     if isinstance(given, str):
         from us_sim.tracking.calibration.transform_file import read_transform
 
         return read_transform(given)
-    return pose_of(given) if given is not None else Pose()
+    return given.pose if given is not None else Pose()
 
 
 def camera_body_of(scene: Scene) -> RigidBody:
@@ -89,9 +107,8 @@ def camera_body_of(scene: Scene) -> RigidBody:
         TrackingError: their file cannot be used.
     """
     from us_sim.tracking.camera.rigid_body import RigidBody
-    from us_sim.tracking.camera.settings import CameraSettings
 
-    settings = scene.tracker.camera or CameraSettings()
+    settings = source_settings(scene, "camera")
     if settings.body:
         from us_sim.tracking.camera.rigid_body_file import read_rigid_body
 

@@ -7,14 +7,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-__all__ = ["Quantity", "given", "require_given"]
+__all__ = ["Quantity"]
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -28,6 +25,13 @@ _UNITS: dict[str, dict[str, float]] = {
     "frequency": {"Hz": 1.0, "kHz": 1e3},
     "speed": {"m/s": 1.0, "mm/s": 1e-3},
     "angular speed": {"rad/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180},
+    "force": {"N": 1.0, "mN": 1e-3},
+    "torque": {"N m": 1.0, "mN m": 1e-3},
+    "image distance": {"px": 1.0},
+    "cutoff per speed": {"Hz/(m/s)": 1.0},
+    "cutoff per angular speed": {"Hz/(rad/s)": 1.0},
+    "acceleration noise": {"m/s/√s": 1.0},
+    "angular acceleration noise": {"rad/s/√s": 1.0},
     "number": {},
 }
 _NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
@@ -87,72 +91,3 @@ class Quantity:
             if factor != 1.0 and self.minimum <= number * factor <= self.maximum:
                 return f"; did you mean '{number:g} {unit}'?"
         return ""
-
-
-def given(
-    quantity: Quantity | None = None,
-    *,
-    choices: Sequence[str] = (),
-    description: str = "",
-    file: bool = False,
-    **kwargs: Any,
-) -> Any:
-    """A dataclass field that a scene may set: the check its value must pass, and what it is.
-
-    A text that is a ``file`` is looked up beside the scene, and must be there.
-    """
-    metadata = {
-        "quantity": quantity,
-        "choices": tuple(choices),
-        "description": description,
-        "file": file,
-    }
-    return field(metadata=metadata, **kwargs)
-
-
-def require_given(settings: Any, section: str, error: type[Exception]) -> None:
-    """Make every `given` field of a frozen dataclass what its type says, or refuse it.
-
-    A field with a quantity becomes a float, an int or, by its type, a tuple of floats; one without
-    a quantity or choices is a text or a boolean.
-
-    Args:
-        settings: the dataclass instance, in its ``__post_init__``.
-        section: the scene's section, for the sentence.
-        error: what to raise.
-
-    Raises:
-        error: with the section, the field, the value and what would do.
-    """
-    for item in dataclasses.fields(settings):
-        try:
-            value = _checked(item, getattr(settings, item.name))
-        except ValueError as problem:
-            raise error(f"{section}.{item.name}: {problem}") from problem
-        object.__setattr__(settings, item.name, value)
-
-
-def _checked(item: dataclasses.Field[Any], value: Any) -> Any:
-    quantity, choices = item.metadata["quantity"], item.metadata["choices"]
-    type_name = str(item.type)
-    if value is None and "None" in type_name:
-        return None
-    if choices:
-        if value not in choices:
-            raise ValueError(f"{value!r} is not one of {', '.join(choices)}")
-        return value
-    if quantity is None:
-        wanted, name = (str, "a text") if type_name.startswith("str") else (bool, "true or false")
-        if not isinstance(value, wanted):
-            raise ValueError(f"{value!r} is not {name}")
-        return value
-    if type_name.startswith("tuple"):
-        if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{value!r} is not a list of numbers")
-        return tuple(quantity.parse(each) for each in value)
-    number = quantity.parse(value)
-    if type_name.startswith("int"):
-        if number != int(number):
-            raise ValueError(f"{value!r} is not a whole number")
-        return int(number)
-    return number

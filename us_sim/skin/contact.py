@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from us_sim.geometry.collider import offset_box_distance
+from us_sim.geometry.collider_distance import offset_box_distance
 
 __all__ = ["push_out"]
 

@@ -30,10 +30,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from us_sim.errors import SolverError
-from us_sim.geometry.collider import Collider, signed_distance
+from us_sim.geometry.collider import Collider
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.skin.contact import push_out
+from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces
 from us_sim.skin.surface import TriangleSurface, vertex_normals
 
@@ -70,63 +71,40 @@ class SkinMembrane:
     Args:
         surface: at rest.
         collider: the probe's shape.
-        stiffness: N/m, of an edge's spring.
-        anchor_stiffness: N/m, of the zero-length spring of a vertex.
-        damping: of the anchors' dampers, 1 where an anchored particle alone is critically damped;
-            not less, since skin is overdamped.
-        density: kg/m², of the skin. Where a vertex would be too light for a stable step its mass
-            is raised, as every deformation's ``action`` then says.
-        prestrain: of the springs at rest, 0 to below 1.
-        time_step: s.
-        steps: in a frame. A probe that moves far takes more, as ``action`` then says.
-
-    Raises:
-        SolverError: a setting is not finite or out of its range.
+        settings: see `MembraneSettings`. Where the mass of a vertex is raised, or a far movement
+            of the probe takes more steps, every deformation's ``action`` says so.
     """
 
     def __init__(
         self,
         surface: TriangleSurface,
         collider: Collider,
-        *,
-        stiffness: float = 40.0,
-        anchor_stiffness: float = 4.0,
-        damping: float = 1.0,
-        density: float = 2.0,
-        prestrain: float = 0.2,
-        time_step: float = 0.01,
-        steps: int = 10,
+        settings: MembraneSettings | None = None,
     ) -> None:
-        _require("stiffness", stiffness, stiffness >= 0, "0 or more, in N/m")
-        _require("anchor_stiffness", anchor_stiffness, anchor_stiffness > 0, "more than 0, in N/m")
-        _require("damping", damping, damping >= 1, "1 or more, as skin is overdamped")
-        _require("density", density, density > 0, "more than 0, in kg/m²")
-        _require("prestrain", prestrain, 0 <= prestrain < 1, "0 to below 1")
-        _require("time_step", time_step, time_step > 0, "more than 0, in s")
-        _require("steps", steps, 1 <= steps <= _MOST_STEPS, f"1 to {_MOST_STEPS}")
+        settings = settings or MembraneSettings()
         self.surface = surface
         self._collider = collider
-        self._stiffness = float(stiffness)
-        self._anchor = float(anchor_stiffness)
-        self._time_step = float(time_step)
-        self._steps = int(steps)
+        self._stiffness = settings.stiffness
+        self._anchor = settings.anchor_stiffness
+        self._time_step = settings.time_step
+        self._steps = settings.steps
 
         # Unsigned, since numba tests a signed index for counting from the end.
         self._edges = edges = surface.edges.astype(np.uint32)
         at_rest = surface.vertices[edges[:, 1]] - surface.vertices[edges[:, 0]]
         length = np.sqrt((at_rest**2).sum(axis=1))
-        self._natural_length = (1.0 - prestrain) * length
-        self._rest_tension = np.ascontiguousarray(at_rest * prestrain)
+        self._natural_length = (1.0 - settings.prestrain) * length
+        self._rest_tension = np.ascontiguousarray(at_rest * settings.prestrain)
 
         valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
         # Gershgorin: no mode is stiffer than twice a particle's springs and its anchor.
         stiffest = 2.0 * self._stiffness * valence + self._anchor
-        density_mass = density * surface.vertex_areas
+        density_mass = settings.density * surface.vertex_areas
         lightest = stiffest * (self._time_step / (2.0 * _SAFETY)) ** 2
         self.mass: NDArray[np.float64] = np.maximum(density_mass, lightest)  # (N,), kg
         self.step_limit = float(2.0 * np.sqrt(np.min(density_mass / stiffest)))
         """s, the greatest stable step with the masses that ``density`` gives."""
-        self._decay = 2.0 * damping * np.sqrt(self._anchor / self.mass)
+        self._decay = 2.0 * settings.damping * np.sqrt(self._anchor / self.mass)
         self._scaling = ""
         if (self.mass > density_mass).any():
             with np.errstate(divide="ignore"):
@@ -262,11 +240,6 @@ class SkinMembrane:
             if distance.min() >= 0.0:
                 break
         return lifted
-
-
-def _require(name: str, value: float, good: bool, wanted: str) -> None:
-    if not (isinstance(value, int | float | np.number) and math.isfinite(value) and good):
-        raise SolverError(f"the skin's {name} is {value!r}: give {wanted}")
 
 
 def _same(a: Pose | None, b: Pose | None) -> bool:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.mesh_faces import boundary_triangles
 from us_sim.geometry.pose import Pose
+from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
@@ -44,9 +45,9 @@ class BMode:
         volume: in frame ``patient``.
         probe: its geometry; may be set to another one later.
         imaging: the console's settings.
-        method: how slices through deformed tissue are cut, see `slicer.METHODS`.
+        method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
         threads: among which a slice is shared.
-        settings: of the method, as `RowSubdivision`'s ``regions``.
+        settings: of the method's own class, or None for those by default.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class BMode:
         *,
         method: str = "scan_conversion",
         threads: int = 1,
-        **settings: int,
+        settings: Settings | None = None,
     ) -> None:
         self._volume = volume
         self._method = method
@@ -110,7 +111,7 @@ class BMode:
             rest_nodes,
             tetrahedra,
             threads=self._threads,
-            **self._settings,
+            settings=self._settings,
         )
         self._slicer = slicer
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)

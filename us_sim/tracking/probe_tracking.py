@@ -2,17 +2,17 @@
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.filter.settings import FilterSettings, GateSettings
+>>> from us_sim.tracking.filter.settings import GateSettings
 >>> from us_sim.tracking.measurement import Measurement
 >>> from us_sim.tracking.filter.outlier_gate import OutlierGate
->>> from us_sim.tracking.filter.pose_filter import make_filter
+>>> from us_sim.tracking.filter.pose_filter import create_filter
 >>> from us_sim.tracking.probe_tracking import ProbeTracking
 >>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
 >>> tracking = ProbeTracking(
 ...     camera_above,
 ...     marker_on_grip,
-...     make_filter(FilterSettings()),
+...     create_filter("none"),
 ...     OutlierGate(GateSettings()),
 ...     time_offset=-0.02,
 ... )

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import VolumeError
+from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.phantom_cache import kept_volume
+from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
 from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
 from us_sim.volume.volume import Volume
 
-__all__ = ["PHANTOMS", "cached_phantom", "upper_arm"]
+__all__ = ["cached_phantom", "upper_arm"]
 
 Progress = Callable[[float, str], None]
 
@@ -49,12 +51,11 @@ def upper_arm(
     Raises:
         VolumeError: the seed or the voxel size is out of range.
     """
-    if seed < 0:
-        raise VolumeError(f"the seed of a phantom must not be negative, not {seed}")
-    if not 0.2e-3 <= voxel_size <= 5e-3:
-        raise VolumeError(
-            f"the voxel size of a phantom must be 0.2 mm to 5 mm, not {voxel_size * 1e3:g} mm"
-        )
+    for name, quantity, value in (("seed", SEED, seed), ("voxel size", VOXEL_SIZE, voxel_size)):
+        try:
+            quantity.parse(value)
+        except ValueError as error:
+            raise VolumeError(f"the {name} of a phantom: {error}") from error
     report = progress or _silent
     shape = np.ceil(np.diff(UPPER_ARM_BLOCK, axis=0)[0] / voxel_size - 1e-6).astype(int)
     lower = UPPER_ARM_BLOCK.mean(axis=0) - shape / 2 * voxel_size
@@ -97,9 +98,6 @@ def upper_arm(
     return volume
 
 
-PHANTOMS: dict[str, Callable[[int, float, Progress | None], Volume]] = {"upper_arm": upper_arm}
-
-
 def cached_phantom(
     name: str, seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
 ) -> Volume:
@@ -118,8 +116,7 @@ def cached_phantom(
     Raises:
         VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
     """
-    if name not in PHANTOMS:
-        raise VolumeError(f"there is no phantom named {name}; there is {', '.join(PHANTOMS)}")
+    make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
     decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
     key = f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
 
@@ -127,7 +124,7 @@ def cached_phantom(
         if progress is not None:
             progress(0.0, "waiting for another process that makes it")
 
-    return kept_volume(key, lambda: PHANTOMS[name](seed, voxel_size, progress), waiting)
+    return kept_volume(key, lambda: make(seed, voxel_size, progress), waiting)
 
 
 def _silent(fraction: float, text: str) -> None:

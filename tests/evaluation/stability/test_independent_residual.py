@@ -20,7 +20,8 @@ from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 
 RANDOM = np.random.default_rng(2)
 

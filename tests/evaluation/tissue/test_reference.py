@@ -10,10 +10,11 @@ from us_sim.evaluation.tissue.cases import MESHES, SCENES
 from us_sim.evaluation.tissue.linear_equations import LinearEquations
 from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import graded_planes, solve_contact
-from us_sim.geometry.collider import Capsule, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
-from us_sim.tissue.elasticity.materials import Material
+from us_sim.tissue.elasticity.material import Material
 
 SOFT = Material(10e3, 0.45, 1000.0)
 PLANES = ([-0.03, 0.0, 0.01], [0.0, 0.02, 0.05], [0.0, 0.015, 0.04])

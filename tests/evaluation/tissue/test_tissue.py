@@ -16,7 +16,8 @@ from us_sim.evaluation.tissue.measure import Trial, evaluate_tissue, plan
 from us_sim.evaluation.tissue.plots import exponent
 from us_sim.evaluation.tissue.points import Outcome, Point, compare, held_memory, volumes
 from us_sim.evaluation.tissue.report import pareto_front
-from us_sim.tissue.solvers.solver import SOLVERS, create_solver
+from us_sim.settings.registry import SOLVERS
+from us_sim.tissue.solvers.solver import create_solver
 
 COLUMNS = (
     "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"

@@ -5,12 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import only_forward, push_out, wrench_on_probe
 from us_sim.tissue.contact.sliding_contact import SlidingContact
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel

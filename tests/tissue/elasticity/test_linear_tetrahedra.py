@@ -12,7 +12,8 @@ from us_sim.tissue.elasticity.linear_tetrahedra import (
     shape_gradients,
     stiffness,
 )
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
 

@@ -5,8 +5,8 @@ import pytest
 from tissue_block import block_mesh
 
 from us_sim.errors import MaterialError
+from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import (
-    Material,
     TissueMaterials,
     average_over_labels,
     label_fractions,

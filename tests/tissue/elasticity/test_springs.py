@@ -7,7 +7,8 @@ import pytest
 from tissue_block import SOFT, block_mesh
 
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 

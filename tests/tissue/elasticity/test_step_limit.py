@@ -11,7 +11,8 @@ from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import SolverError
 from us_sim.tissue.deformation import TissueState
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
 from us_sim.tissue.elasticity.step_limit import (
     highest_frequency,
@@ -20,7 +21,7 @@ from us_sim.tissue.elasticity.step_limit import (
     step_limit,
 )
 from us_sim.tissue.elasticity.volume_term import volume_term
-from us_sim.tissue.solvers.msds import Msds
+from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 MESH = block_mesh((4, 3, 3))
 SPRINGS = springs_of(MESH, uniform_material(MESH, SOFT))
@@ -115,7 +116,10 @@ def observed_limit(model, guess, **chosen):
 
     def grows(step):
         solver = Msds(
-            model, stabilisation="none", time_step=step, steps=2000, rest_tolerance=1e-30, **chosen
+            model,
+            MsdsSettings(
+                stabilisation="none", time_step=step, steps=2000, rest_tolerance=1e-30, **chosen
+            ),
         )
         solver.take_over(disturbed)
         moved = solver.deform(None).nodes - model.mesh.nodes
@@ -135,12 +139,12 @@ def observed_limit(model, guess, **chosen):
 def test_the_observed_limit_of_stability_is_the_predicted_one(damping_factor, chosen):
     model = block((4, 3, 3))
     chosen = {"damping_factor": damping_factor, **chosen}
-    predicted = Msds(model, stabilisation="none", **chosen).step_limit
+    predicted = Msds(model, MsdsSettings(stabilisation="none", **chosen)).step_limit
     assert observed_limit(model, predicted, **chosen) == pytest.approx(predicted, rel=0.02)
 
 
 def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
-    solver = Msds(block((4, 3, 3)), stabilisation="none", time_step=0.01, steps=500)
+    solver = Msds(block((4, 3, 3)), MsdsSettings(stabilisation="none", time_step=0.01, steps=500))
     assert solver.step_limit < 0.01
     thrown = TissueState.at_rest(len(solver.model.mesh.nodes))
     thrown.velocity[~solver.model.fixed] = [0.0, 0.0, 1e-6]

@@ -8,7 +8,8 @@ from tissue_block import block_mesh
 
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs
 from us_sim.tissue.elasticity.tangling import count_inverted
 from us_sim.tissue.elasticity.volume_term import volume_term

@@ -8,7 +8,8 @@ from tissue_block import block, block_mesh
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra.condensation import condense
 from us_sim.tissue.linear_algebra.nested_dissection import nested_dissection
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh

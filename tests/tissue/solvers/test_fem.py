@@ -14,13 +14,14 @@ from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.friction import FrictionalContact
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.linear_algebra import compliance as compliance_module
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.linear_algebra.condensation import condense
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.fem import Fem
+from us_sim.tissue.solvers.fem import Fem, FemSettings
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.012]))
 
@@ -242,7 +243,7 @@ def test_tissue_that_is_all_held_does_not_move():
 )
 def test_settings_out_of_range_are_refused(settings, words):
     with pytest.raises(SolverError, match=words):
-        Fem(block((3, 3, 3)), **settings)
+        Fem(block((3, 3, 3)), FemSettings(**settings))
 
 
 def test_one_node_sticks_and_slips_as_coulomb_says():
@@ -258,7 +259,7 @@ def test_one_node_sticks_and_slips_as_coulomb_says():
 
 def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
     model = block((17, 9, 9))
-    solver = Fem(model, contact="coulomb", friction=0.3)
+    solver = Fem(model, FemSettings(contact="coulomb", friction=0.3))
     slid = 0
     for i in range(16):
         pose = Pose(np.array([0.002 * max(i - 5, 0), 0.0, 0.002 * min(i, 5)]))
@@ -281,7 +282,7 @@ def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
 
 def test_without_friction_and_with_hardly_any_are_the_same():
     model = block((13, 9, 7))
-    smooth, rough = Fem(model), Fem(model, contact="coulomb", friction=1e-9)
+    smooth, rough = Fem(model), Fem(model, FemSettings(contact="coulomb", friction=1e-9))
     for x in (0.0, 0.01):
         pose = Pose(np.array([x, 0.0, 0.01]))
         np.testing.assert_allclose(smooth.deform(pose).nodes, rough.deform(pose).nodes, atol=2e-8)
@@ -289,7 +290,7 @@ def test_without_friction_and_with_hardly_any_are_the_same():
 
 def test_sticking_nodes_go_where_the_probe_goes():
     model = block((13, 9, 7))
-    solver = Fem(model, contact="sticking")
+    solver = Fem(model, FemSettings(contact="sticking"))
     first = solver.deform(Pose(np.array([0.0, 0.0, 0.01])))
     second = solver.deform(Pose(np.array([0.002, 0.0, 0.01])))
     both = np.intersect1d(first.contact_nodes, second.contact_nodes)

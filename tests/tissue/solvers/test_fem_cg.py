@@ -7,12 +7,14 @@ from scipy.sparse.linalg import spsolve
 from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
-from us_sim.tissue.solvers.fem_cg import FemCg
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
 
 PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
 
@@ -32,7 +34,7 @@ def settle(solver, pose, frames=120):
 def test_uniaxial_compression_has_hookes_force_and_a_linear_field():
     spongy = Material(young_modulus=10e3, poisson_ratio=0.0, density=1000.0)
     model = block((9, 5, 5), PLATE, materials=uniform_material(block_mesh((9, 5, 5)), spongy))
-    deformation = settle(FemCg(model, tolerance=1e-10), at(x=0.01, z=0.005))
+    deformation = settle(FemCg(model, FemCgSettings(tolerance=1e-10)), at(x=0.01, z=0.005))
     # E A d / L = 10 kPa * 0.02 m2 * 5 mm / 100 mm
     np.testing.assert_allclose(deformation.force, [0, 0, -10], atol=1e-6)
     # The block's centre is 10 mm behind the probe's origin along x.
@@ -48,7 +50,7 @@ def test_uniaxial_compression_has_hookes_force_and_a_linear_field():
 def test_converges_to_the_direct_solution_of_its_contact_set(collider, tilt):
     model = block((13, 7, 6), collider)
     pose = at(x=0.013, y=0.004, z=0.012, orientation=(tilt / 2, tilt / 3, 0.0, 1.0))
-    deformation = settle(FemCg(model, tolerance=1e-10), pose)
+    deformation = settle(FemCg(model, FemCgSettings(tolerance=1e-10)), pose)
     assert len(deformation.contact_nodes) > 3
     assert deformation.residual <= 1e-10
 
@@ -80,7 +82,7 @@ def test_converges_to_the_direct_solution_of_its_contact_set(collider, tilt):
 
 def test_with_flat_contact_the_direct_solution_is_met_to_the_tolerance():
     model = block((9, 5, 5), PLATE)
-    deformation = settle(FemCg(model, tolerance=1e-11), at(z=0.006))
+    deformation = settle(FemCg(model, FemCgSettings(tolerance=1e-11)), at(z=0.006))
     displacement = deformation.nodes - model.mesh.nodes
     known = np.zeros(displacement.shape, dtype=bool)
     known[model.fixed] = True
@@ -187,7 +189,8 @@ def test_a_collapsing_vein_beside_bone_converges():
 
 def test_more_iterations_leave_a_smaller_residual():
     few, many = (
-        FemCg(block((13, 7, 6)), iterations=n).deform(at(z=0.01)).residual for n in (5, 60)
+        FemCg(block((13, 7, 6)), FemCgSettings(iterations=n)).deform(at(z=0.01)).residual
+        for n in (5, 60)
     )
     assert many < 0.1 * few
 
@@ -221,7 +224,7 @@ def test_a_held_node_is_passed_by():
 )
 def test_settings_out_of_range_are_refused(setting, value):
     with pytest.raises(SolverError, match=f"fem_cg.{setting} is "):
-        FemCg(block((3, 3, 3)), **{setting: value})
+        FemCg(block((3, 3, 3)), FemCgSettings(**{setting: value}))
 
 
 def test_a_free_tissue_is_refused():

@@ -9,16 +9,18 @@ from tissue_block import block, block_mesh
 
 from us_sim.errors import SolverError
 from us_sim.evaluation.stability.independent_residual import IndependentResidual, neo_hookean_forces
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.materials import Material, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem import Fem
-from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 
 PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
 FINE = (13, 7, 6)
@@ -72,7 +74,7 @@ def checker(model):
 def test_a_press_by_a_plate_is_what_another_minimiser_finds(ratio):
     model = block((5, 4, 4), PLATE, materials=made_of(ratio, (5, 4, 4)))
     depth = 0.02
-    found = settle(FemNonlinear(model, tolerance=1e-9), at(z=depth))
+    found = settle(FemNonlinear(model, FemNonlinearSettings(tolerance=1e-9)), at(z=depth))
     rest = model.mesh.nodes
     low = np.full(rest.shape, -np.inf)
     low[model.contact_nodes, 2] = depth
@@ -140,7 +142,7 @@ def test_a_settled_press_is_balanced_and_keeps_the_law_of_contact(collider, rati
 def test_action_is_reaction():
     model = block(FINE)
     pose = at(x=0.01, z=0.02, orientation=(0.1, 0.05, 0.0, 1.0))
-    deformation = settle(FemNonlinear(model, tolerance=1e-8), pose)
+    deformation = settle(FemNonlinear(model, FemNonlinearSettings(tolerance=1e-8)), pose)
     holding = neo_hookean_forces(model.mesh, model.materials, deformation.nodes - model.mesh.nodes)
     np.testing.assert_allclose(
         pose.rotation @ deformation.force, holding[model.fixed].sum(axis=0), atol=1e-6
@@ -156,7 +158,10 @@ def test_action_is_reaction():
 @pytest.mark.parametrize("ratio", [0.45, 0.49])
 def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(ratio):
     model = block((20, 10, 10), materials=made_of(ratio, (20, 10, 10)))
-    solver, exact = FemNonlinear(model), FemNonlinear(model, iterations=200, most_iterations=400)
+    solver, exact = (
+        FemNonlinear(model),
+        FemNonlinear(model, FemNonlinearSettings(iterations=200, most_iterations=400)),
+    )
     for frame in range(1, 11):
         solver.deform(at(z=0.0025 * frame))
     errors = []
@@ -360,7 +365,7 @@ def test_everything_fixed_stays():
 )
 def test_settings_out_of_range_are_refused(setting, value):
     with pytest.raises(SolverError, match=f"fem_nonlinear.{setting} is "):
-        FemNonlinear(block((3, 3, 3)), **{setting: value})
+        FemNonlinear(block((3, 3, 3)), FemNonlinearSettings(**{setting: value}))
 
 
 def test_a_free_tissue_is_refused():

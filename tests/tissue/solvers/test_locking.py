@@ -5,7 +5,8 @@ import pytest
 from tissue_block import block, block_mesh
 
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.solvers.solver import create_solver
 
 YOUNG = 10e3  # Pa

@@ -5,11 +5,12 @@ import pytest
 from tissue_block import block
 
 from us_sim.errors import SolverError
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.tangling import count_inverted
-from us_sim.tissue.solvers.msds import Msds
+from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 FRAME = 20 * 0.01  # s
 
@@ -110,8 +111,8 @@ def test_a_violent_start_calms_down_at_the_scaled_masses():
 
 def test_substeps_reach_the_same_rest_as_scaled_masses():
     settings = {"damping_factor": 2e-3}
-    scaled = Msds(block((6, 4, 4)), **settings)
-    divided = Msds(block((6, 4, 4)), stabilisation="substeps", **settings)
+    scaled = Msds(block((6, 4, 4)), MsdsSettings(**settings))
+    divided = Msds(block((6, 4, 4)), MsdsSettings(stabilisation="substeps", **settings))
     for frame in range(300):
         pose = at(z=min(2e-4 * frame, 0.006))
         ours, theirs = scaled.deform(pose), divided.deform(pose)
@@ -171,17 +172,17 @@ def test_a_turning_probe_is_followed():
 )
 def test_settings_out_of_range_are_refused(setting, value):
     with pytest.raises(SolverError, match=f"msds.{setting} is "):
-        Msds(block((3, 3, 3)), **{setting: value})
+        Msds(block((3, 3, 3)), MsdsSettings(**{setting: value}))
 
 
 def test_too_many_substeps_are_refused():
     with pytest.raises(SolverError, match="use stabilisation mass_scaling"):
-        Msds(block((6, 4, 4)), stabilisation="substeps", maximum_substeps=20)
+        Msds(block((6, 4, 4)), MsdsSettings(stabilisation="substeps", maximum_substeps=20))
 
 
 def test_a_short_frame_in_which_little_moves_is_not_taken_for_rest():
     # Creeping back takes some times of the damping factor, here thousands of frames.
-    solver = Msds(block((6, 4, 4)), time_step=1e-5, damping_factor=0.1)
+    solver = Msds(block((6, 4, 4)), MsdsSettings(time_step=1e-5, damping_factor=0.1))
     bent = TissueState.at_rest(len(solver.model.mesh.nodes))
     bent.displacement[~solver.model.fixed, 2] = 1e-3
     solver.take_over(bent)
@@ -193,7 +194,7 @@ def test_a_short_frame_in_which_little_moves_is_not_taken_for_rest():
 def test_fitted_springs_that_keep_volume_tangle_less():
     tangled = {}
     for chosen in ({}, {"stiffness": "fitted", "volume": True}):
-        solver = Msds(block((13, 7, 6), RoundedBox(0.05, 0.02, 0.1, 0.003)), **chosen)
+        solver = Msds(block((13, 7, 6), RoundedBox(0.05, 0.02, 0.1, 0.003)), MsdsSettings(**chosen))
         for frame in range(40):
             solver.deform(at(z=min(0.001 * frame, 0.02)))
         nodes = solver.model.mesh.nodes + solver.state.displacement

@@ -7,16 +7,18 @@ from hypothesis import strategies as st
 from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere, signed_distance
+from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.elasticity.springs import fitted_springs
 from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
-from us_sim.tissue.solvers.fem_cg import FemCg
-from us_sim.tissue.solvers.msds import Msds
-from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
+from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
+from us_sim.tissue.solvers.msds import Msds, MsdsSettings
+from us_sim.tissue.solvers.msds_implicit import MsdsImplicit, MsdsImplicitSettings
 
 
 def at(x=0.0, z=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
@@ -77,7 +79,10 @@ def test_at_rest_there_is_no_force_at_all():
     [{"stiffness": "algorithm_1", "volume": False}, {"stiffness": "fitted", "volume": True}],
 )
 def test_explicit_and_implicit_steps_end_at_the_same_rest(chosen):
-    explicit, implicit = Msds(block(), **chosen), MsdsImplicit(block(), **chosen)
+    explicit, implicit = (
+        Msds(block(), MsdsSettings(**chosen)),
+        MsdsImplicit(block(), MsdsImplicitSettings(**chosen)),
+    )
     for frame in range(40):
         pose = at(z=min(2e-4 * frame, 0.006))
         explicit.deform(pose)
@@ -91,12 +96,12 @@ def test_explicit_and_implicit_steps_end_at_the_same_rest(chosen):
 def test_fitted_springs_that_keep_volume_come_near_the_finite_elements():
     model = block((20, 10, 10))
     pose = at(z=0.012)
-    exact = settled(FemCg(model, iterations=200), pose, 10)
+    exact = settled(FemCg(model, FemCgSettings(iterations=200)), pose, 10)
     moved = exact.nodes - model.mesh.nodes
     errors = {}
     for stiffness in ("algorithm_1", "fitted"):
         for volume in (False, True):
-            solver = MsdsImplicit(model, stiffness=stiffness, volume=volume)
+            solver = MsdsImplicit(model, MsdsImplicitSettings(stiffness=stiffness, volume=volume))
             ours = settled(solver, pose, 60)
             errors[stiffness, volume] = (
                 np.linalg.norm(ours.nodes - exact.nodes) / np.linalg.norm(moved),
@@ -121,7 +126,9 @@ def test_no_step_is_too_long(time_step, damping_factor, modulus, ratio, depths):
     mesh = block_mesh((5, 4, 4))
     materials = uniform_material(mesh, Material(modulus, ratio, 1000.0))
     model = block((5, 4, 4), materials=materials)
-    solver = MsdsImplicit(model, time_step=time_step, damping_factor=damping_factor)
+    solver = MsdsImplicit(
+        model, MsdsImplicitSettings(time_step=time_step, damping_factor=damping_factor)
+    )
     for depth in depths:
         deformation = solver.deform(at(x=0.01, z=depth))
         assert "last good state" not in deformation.action
@@ -141,7 +148,10 @@ def test_no_step_is_too_long(time_step, damping_factor, modulus, ratio, depths):
 def test_energy_never_grows_in_free_relaxation(seed, speed, time_step, damping_factor, iterations):
     model = block((5, 4, 4))
     solver = MsdsImplicit(
-        model, time_step=time_step, damping_factor=damping_factor, iterations=iterations
+        model,
+        MsdsImplicitSettings(
+            time_step=time_step, damping_factor=damping_factor, iterations=iterations
+        ),
     )
     shaken = TissueState.at_rest(len(model.mesh.nodes))
     random = np.random.default_rng(seed)
@@ -158,7 +168,7 @@ def test_energy_never_grows_in_free_relaxation(seed, speed, time_step, damping_f
 
 def test_a_free_body_drifts_on():
     model = block((5, 4, 4), held=())
-    solver = MsdsImplicit(model, iterations=20, tolerance=1e-9)
+    solver = MsdsImplicit(model, MsdsImplicitSettings(iterations=20, tolerance=1e-9))
     thrown = TissueState.at_rest(len(model.mesh.nodes))
     thrown.velocity[:] = [0.01, 0.0, -0.02]
     solver.take_over(thrown)
@@ -257,4 +267,4 @@ def test_everything_fixed_and_no_contact_nodes():
 )
 def test_settings_out_of_range_are_refused(setting, value):
     with pytest.raises(SolverError, match=f"msds_implicit.{setting} is "):
-        MsdsImplicit(block((3, 3, 3)), **{setting: value})
+        MsdsImplicit(block((3, 3, 3)), MsdsImplicitSettings(**{setting: value}))

@@ -8,8 +8,9 @@ from tissue_block import block
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.elasticity.materials import Material, uniform_material
-from us_sim.tissue.solvers.solver import SOLVERS
+from us_sim.settings.registry import SOLVERS
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.solvers.switching import SwitchableTissue, difference
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from us_sim.evaluation.slice.cases import Case, Frame
 from us_sim.evaluation.slice.vtk_images import VtkSlicer, is_installed
-from us_sim.slicing.cutting.slicer import METHODS, create_slicer
+from us_sim.settings.registry import SLICERS
+from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.volume.volume import Volume
 
 __all__ = ["Contender", "contender", "methods"]
@@ -29,7 +30,7 @@ class Contender:
 
 def methods() -> list[str]:
     """Every method there is, VTK where it is installed."""
-    return [*METHODS, *(["vtk"] if is_installed() else [])]
+    return [*SLICERS, *(["vtk"] if is_installed() else [])]
 
 
 def contender(volume: Volume, case: Case, method: str, threads: int) -> Contender:

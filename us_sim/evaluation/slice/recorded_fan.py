@@ -53,12 +53,8 @@ class RecordedFan:
         depth = (self.end - self.radius) * spacing
         radius = self.radius * spacing
         height = depth + radius * (1.0 - math.cos(self.half_angle))
-        return ConvexProbe.with_square_pixels(
-            rows=round(height / spacing),
-            radius=radius,
-            opening_angle=2.0 * self.half_angle,
-            depth=depth,
-        )
+        probe = ConvexProbe(radius=radius, opening_angle=2.0 * self.half_angle, depth=depth)
+        return probe.with_square_pixels(round(height / spacing))
 
     def pose(self, image_to_reference: NDArray[np.float64]) -> Pose:
         """Of the probe in the sweep's frame, from a frame's (4, 4) matrix in metres."""

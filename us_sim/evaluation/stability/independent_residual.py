@@ -6,7 +6,8 @@ the returned nodes, so that what a solver rounds, or leaves out, shows.
 
 >>> import numpy as np
 >>> from us_sim.evaluation.stability.independent_residual import hooke_forces
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
 >>> materials = uniform_material(mesh, Material(10e3, 0.25))

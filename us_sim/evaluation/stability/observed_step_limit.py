@@ -16,7 +16,7 @@ import numpy as np
 from us_sim.evaluation.stability.cases import StabilityCase, model_of
 from us_sim.evaluation.stability.points import damping_factor, spring_settings
 from us_sim.tissue.deformation import TissueState
-from us_sim.tissue.solvers.msds import Msds
+from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 __all__ = ["observed_step_limit"]
 
@@ -50,14 +50,10 @@ def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
     start = TissueState(shape, np.zeros_like(nodes))
 
     def grows(step: float) -> bool:
-        solver = Msds(
-            model,
-            steps=_STEPS,
-            time_step=step,
-            stabilisation="none",
-            rest_tolerance=1e-300,
-            **settings,
+        tried = MsdsSettings(
+            steps=_STEPS, time_step=step, stabilisation="none", rest_tolerance=0.0, **settings
         )
+        solver = Msds(model, tried)
         solver.take_over(start)
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)
@@ -66,7 +62,8 @@ def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
 
     if model.fixed.all():
         return math.inf, math.inf
-    predicted = Msds(model, stabilisation="none", time_step=1e-9, **settings).step_limit
+    unlimited = MsdsSettings(stabilisation="none", time_step=1e-9, **settings)
+    predicted = Msds(model, unlimited).step_limit
     low, high = 0.98 * predicted, 1.02 * predicted
     while grows(low):
         low /= 2

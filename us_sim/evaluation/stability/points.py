@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import time
 from collections.abc import Callable
@@ -33,11 +32,13 @@ from us_sim.evaluation.stability.independent_residual import (
 from us_sim.evaluation.stability.meshes import parts
 from us_sim.evaluation.stability.motions import LIFTED, poses_of
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import SOLVERS
+from us_sim.settings.setting import rules_of
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.springs import fitted_springs, springs_of
 from us_sim.tissue.elasticity.volume_term import volume_term
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import SOLVERS, TissueSolver, create_solver
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 __all__ = [
     "KEPT",
@@ -247,7 +248,7 @@ def spring_settings(case: StabilityCase) -> dict[str, Any]:
 
 
 def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
-    known = inspect.signature(_solver_class(method)).parameters
+    known = rules_of(SOLVERS.settings(method))
     asked: dict[str, Any] = {
         "time_step": case.time_step,
         "damping_factor": damping_factor(case, model),
@@ -255,12 +256,6 @@ def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str,
         **spring_settings(case),
     }
     return {name: value for name, value in asked.items() if name in known}
-
-
-def _solver_class(method: str) -> type[TissueSolver]:
-    module, name = SOLVERS[method]
-    solver: type[TissueSolver] = getattr(__import__(module, fromlist=[name]), name)
-    return solver
 
 
 def _finite(deformation: Deformation) -> bool:

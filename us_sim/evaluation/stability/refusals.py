@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def _constant(method: str, **constants: float) -> None:
     create_solver(method, model_of(StabilityCase("unused", **constants)))  # type: ignore[arg-type]
 
 
-def _setting(method: str, **settings: object) -> None:
+def _setting(method: str, **settings: Any) -> None:
     create_solver(method, model_of(StabilityCase("unused")), **settings)
 
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.elasticity.materials import Material, uniform_material
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel

@@ -7,11 +7,9 @@ fine quadratic elements (`us_sim.evaluation.tissue.reference`).
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -80,17 +78,13 @@ class Trial:
 
 
 def settings_of(method: str) -> list[dict[str, Any]]:
-    """The settings that are tried: the default, others, and those on two threads if it has any.
+    """The settings that are tried: the default and others.
 
     Raises:
         ImportError: the method's module cannot be imported.
     """
-    module, name = SOLVERS[method]
-    known = inspect.signature(getattr(import_module(module), name)).parameters
-    settings: list[dict[str, Any]] = [{}, *_SETTINGS.get(method, ())]
-    if "threads" in known:
-        settings = [{**setting, "threads": n} for setting in settings for n in (1, 2)]
-    return settings
+    SOLVERS.load(method)
+    return [{}, *_SETTINGS.get(method, ())]
 
 
 def plan(quick: bool) -> list[Trial]:

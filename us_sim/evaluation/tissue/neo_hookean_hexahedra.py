@@ -8,7 +8,7 @@ mu/2 (|F|^2 - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2.
 
 >>> import numpy as np
 >>> from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
->>> from us_sim.tissue.elasticity.materials import Material
+>>> from us_sim.tissue.elasticity.material import Material
 >>> planes = [0.0, 0.05, 0.1]
 >>> block = NeoHookeanHexahedra((planes, planes, planes), Material(10e3, 0.45, 1000.0))
 >>> block.nodes.shape
@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from us_sim.errors import UsSimError
-from us_sim.tissue.elasticity.materials import Material
+from us_sim.tissue.elasticity.material import Material
 
 try:
     from skfem import Basis, ElementHex1, ElementHex2, FacetBasis, MeshHex

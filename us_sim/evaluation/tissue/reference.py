@@ -11,7 +11,7 @@ The block lies between its mirror plane y = 0 and its side; the probe must be as
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.evaluation.tissue.reference import solve_contact
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.materials import Material
+>>> from us_sim.tissue.elasticity.material import Material
 >>> planes = [-0.05, -0.02, 0.02, 0.05], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]
 >>> soft = Material(10e3, 0.45, 1000.0)
 >>> solution = solve_contact(planes, soft, Sphere(0.03), [Pose(position=[0.0, 0.0, 0.002])])
@@ -34,7 +34,7 @@ from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.two_level import TwoLevel
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.elasticity.materials import Material
+from us_sim.tissue.elasticity.material import Material
 
 __all__ = ["Solution", "graded_planes", "solve_contact"]
 

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
-from us_sim.tracking.filter.pose_filter import make_filter
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.settings.registry import FILTERS
+from us_sim.settings.setting import Settings
+from us_sim.tracking.filter.pose_filter import create_filter
+from us_sim.tracking.filter.settings import KalmanSettings, OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["COLUMNS", "FilterPoint", "delay", "filter_points"]
@@ -80,24 +82,21 @@ def filter_points(quick: bool) -> list[FilterPoint]:
     cutoffs = (0.5, 1.5, 6.0) if quick else (0.25, 0.5, 1.0, 1.5, 3.0, 6.0, 12.0)
     slopes = (180.0,) if quick else (0.0, 60.0, 180.0, 600.0)
     accelerations = (0.01, 0.05, 0.25) if quick else (0.003, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0)
-    tried = [(FilterSettings("none"), "")]
+    tried: list[tuple[str, Settings | None, str]] = [("none", None, "")]
     for slope in slopes:
         for cutoff in cutoffs:
-            turning = slope * FilterSettings().rotation_speed_coefficient / 180.0
-            settings = FilterSettings(
-                "one_euro",
+            turning = slope * OneEuroSettings().rotation_speed_coefficient / 180.0
+            one_euro = OneEuroSettings(
                 minimum_cutoff=cutoff,
                 speed_coefficient=slope,
                 rotation_minimum_cutoff=cutoff,
                 rotation_speed_coefficient=turning,
             )
-            tried.append((settings, f"{cutoff:g} Hz + {slope:g} Hz per m/s"))
+            tried.append(("one_euro", one_euro, f"{cutoff:g} Hz + {slope:g} Hz per m/s"))
     for acceleration in accelerations:
-        settings = FilterSettings(
-            "kalman", acceleration=acceleration, angular_acceleration=10 * acceleration
-        )
-        tried.append((settings, f"{acceleration:g} m/s per root second"))
-    return [_point(settings, words) for settings, words in tried]
+        kalman = KalmanSettings(acceleration=acceleration, angular_acceleration=10 * acceleration)
+        tried.append(("kalman", kalman, f"{acceleration:g} m/s per root second"))
+    return [_point(method, settings, words) for method, settings, words in tried]
 
 
 def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) -> float:
@@ -120,7 +119,7 @@ def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) 
     return best
 
 
-def _point(settings: FilterSettings, words: str) -> FilterPoint:
+def _point(method: str, settings: Settings | None, words: str) -> FilterPoint:
     times = np.arange(round((_MOVING + _REST) * _RATE)) / _RATE
     random = np.random.default_rng(7)
     noise = random.normal(0.0, _NOISE, (len(times), 3))
@@ -143,7 +142,7 @@ def _point(settings: FilterSettings, words: str) -> FilterPoint:
             times, positions, turns, noise, turn_noise, strict=True
         )
     ]
-    filter = make_filter(settings)
+    filter = create_filter(method, settings)
     filtered, stated = [], []
     began = time.thread_time()
     for measurement in measured:
@@ -157,9 +156,9 @@ def _point(settings: FilterSettings, words: str) -> FilterPoint:
     lag = delay(times[moving], found[moving], _position)
     left = found[moving] - _position(times[moving] - lag)
     return FilterPoint(
-        settings.method,
+        method,
         words,
-        settings in (FilterSettings(settings.method), FilterSettings("none")),
+        settings in (None, FILTERS.settings(method)()),
         lag,
         delay(times[moving], found_turns[moving], _rotation),
         _root_mean_square(found[rest] - positions[rest]),

@@ -3,43 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
-from us_sim.nodes.newest import Newest
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.tracker_building import camera_body_of
 from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.camera.warm_up import practice
 
-if TYPE_CHECKING:
-    from us_sim.nodes.probe_tracker import ProbeTracker
-
 __all__ = ["CameraInput"]
 
 
-class CameraInput:
+class CameraInput(TrackerInput):
     """``camera/image_raw``, or ``camera/image_raw/compressed``, with ``camera/camera_info``."""
 
-    def __init__(self, node: ProbeTracker) -> None:
-        self._node = node
-        self._settings = node.scene.tracker.camera or CameraSettings()
-        self._body = camera_body_of(node.scene)
+    def __init__(self, device: Device, settings: CameraSettings) -> None:
+        super().__init__(device, settings)
+        self._body = camera_body_of(device.scene)
         practice(self._body)
         self._source: CameraSource | None = None
         self._described: CameraInfo | None = None
-        node.listen(CameraInfo, "camera/camera_info", self._describe, node.of_device)
+        device.listen_to_newest(CameraInfo, "camera/camera_info", self._describe)
         for message_type, topic, decode in (
             (Image, "camera/image_raw", grey_from),
             (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
         ):
-            work = self._looking(topic, decode)
-            newest = Newest(node, node.health, work, lockstep=node.lockstep)
-            node.listen(message_type, topic, newest, node.of_device)
+            device.listen_to_newest(message_type, topic, self._looking(topic, decode))
 
     def _describe(self, message: CameraInfo) -> None:
         """Look through this camera from now on; drivers repeat it with every image."""
@@ -50,7 +44,7 @@ class CameraInput:
             self._source = CameraSource(camera_from(message), self._body, self._settings)
         except TrackingError as error:
             self._source = None
-            self._node.refuse("camera", f"camera/camera_info: {error}")
+            self._device.refuse("camera", f"camera/camera_info: {error}")
 
     def _looking(
         self, topic: str, decode: Callable[[Any], NDArray[Any]]
@@ -58,24 +52,24 @@ class CameraInput:
         def look(message: Image | CompressedImage) -> None:
             if self._source is None:
                 if self._described is None:
-                    self._node.refuse(
+                    self._device.refuse(
                         "camera",
                         "no camera/camera_info has come, so no pose can be measured: calibrate the "
                         "camera (us-sim calibrate camera) and give its driver the file",
                     )
                 return
-            stamp = self._node.stamp_of(message.header, topic)
+            stamp = self._device.stamp_of(message.header, topic)
             try:
                 measurement = self._source.measure(decode(message), stamp)
             except TrackingError as error:
-                self._node.refuse("image", f"{topic}: {error}; it is not used")
+                self._device.refuse("image", f"{topic}: {error}; it is not used")
                 return
             if measurement is None:
-                self._node.refuse("markers", f"{topic}: {self._source.last_problem}")
+                self._device.refuse("markers", f"{topic}: {self._source.last_problem}")
             else:
                 left_out = self._source.last_problem
-                self._node.health.values["markers"] = left_out or "all that are seen are used"
-                self._node.take(measurement)
+                self._device.health.values["markers"] = left_out or "all that are seen are used"
+                self._device.take(measurement)
 
         return look
 

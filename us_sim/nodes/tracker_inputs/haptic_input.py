@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Bool
 
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.haptic.device import HapticDevice
 from us_sim.tracking.haptic.settings import HapticSettings
-
-if TYPE_CHECKING:
-    from us_sim.nodes.probe_tracker import ProbeTracker
 
 __all__ = ["HapticInput"]
 
 
-class HapticInput:
+class HapticInput(TrackerInput):
     """``haptic/pose`` in the frame that the scene names; ``haptic/clutch`` holds the probe."""
 
-    def __init__(self, node: ProbeTracker) -> None:
-        self._node = node
-        self._device = HapticDevice(node.scene.tracker.haptic or HapticSettings())
-        node.listen_to_device(PoseStamped, "haptic/pose", self._take)
-        node.listen_to_device(Bool, "haptic/clutch", self._clutch)
+    def __init__(self, device: Device, settings: HapticSettings) -> None:
+        super().__init__(device, settings)
+        self._handle = HapticDevice(settings)
+        device.listen_to_device(PoseStamped, "haptic/pose", self._take)
+        device.listen_to_device(Bool, "haptic/clutch", self._clutch)
 
     def _take(self, message: PoseStamped) -> None:
-        pose = self._node.pose_in(message, "haptic/pose")
+        pose = self._device.pose_in(message, "haptic/pose")
         if pose is None:
             return
-        stamp = self._node.stamp_of(message.header, "haptic/pose")
-        self._node.take(self._device.take(pose, stamp))
+        stamp = self._device.stamp_of(message.header, "haptic/pose")
+        self._device.take(self._handle.take(pose, stamp))
 
     def _clutch(self, message: Bool) -> None:
-        self._device.clutch(message.data)
+        self._handle.clutch(message.data)

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from typing import TYPE_CHECKING
 
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
 from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 
-if TYPE_CHECKING:
-    from us_sim.nodes.probe_tracker import ProbeTracker
-
 __all__ = ["OpenIGTLinkInput"]
 
 
-class OpenIGTLinkInput:
+class OpenIGTLinkInput(TrackerInput):
     """The device ``tracker.body`` of the server ``tracker.openigtlink``; the newest pose wins."""
 
-    def __init__(self, node: ProbeTracker) -> None:
-        self._node = node
-        tracker = node.scene.tracker
-        settings = tracker.openigtlink or OpenIGTLinkSettings()
+    def __init__(self, device: Device, settings: OpenIGTLinkSettings) -> None:
+        super().__init__(device, settings)
+        tracker = device.scene.tracker
         self._by_arrival = settings.clock == "arrival"
         self._lock = threading.Lock()
         self._newest: Measurement | None = None
         self._problems: dict[str, str] = {}
-        self._guard = node.create_guard_condition(self._work)
+        self._work_soon = device.in_tracker(self._work)
         self._client = OpenIGTLinkClient(settings, tracker.body, self._came, self._went_wrong)
 
     def close(self) -> None:
@@ -37,24 +33,23 @@ class OpenIGTLinkInput:
     def _came(self, measurement: Measurement) -> None:
         """In the client's thread: keep the newest, and let the node's thread do the rest."""
         if self._by_arrival or measurement.stamp == 0:
-            now = self._node.get_clock().now().nanoseconds
-            measurement = dataclasses.replace(measurement, stamp=now)
+            measurement = dataclasses.replace(measurement, stamp=self._device.now())
         with self._lock:
-            self._node.health.received += 1
-            self._node.health.dropped += self._newest is not None
+            self._device.health.received += 1
+            self._device.health.dropped += self._newest is not None
             self._newest = measurement
-        self._guard.trigger()
+        self._work_soon()
 
     def _went_wrong(self, kind: str, sentence: str) -> None:
         with self._lock:
             self._problems[kind] = sentence
-        self._guard.trigger()
+        self._work_soon()
 
     def _work(self) -> None:
         with self._lock:
             measurement, self._newest = self._newest, None
             problems, self._problems = self._problems, {}
         for kind, sentence in problems.items():
-            self._node.refuse(kind, sentence)
+            self._device.refuse(kind, sentence)
         if measurement is not None:
-            self._node.take(measurement)
+            self._device.take(measurement)

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseStamped
 
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
-
-if TYPE_CHECKING:
-    from us_sim.nodes.probe_tracker import ProbeTracker
 
 __all__ = ["PoseArrayInput"]
 
 
-class PoseArrayInput:
+class PoseArrayInput(TrackerInput):
     """The pose ``tracker.entry`` of ``tracker/poses``, in the frame that the scene names."""
 
-    def __init__(self, node: ProbeTracker) -> None:
-        self._node = node
-        self._entry = node.scene.tracker.entry
-        node.listen_to_device(PoseArray, "tracker/poses", self._take)
+    def __init__(self, device: Device, settings: Any) -> None:
+        super().__init__(device, settings)
+        self._entry = device.scene.tracker.entry
+        device.listen_to_device(PoseArray, "tracker/poses", self._take)
 
     def _take(self, message: PoseArray) -> None:
         if self._entry >= len(message.poses):
-            self._node.refuse(
+            self._device.refuse(
                 "entry",
                 f"tracker/poses holds {len(message.poses)} poses, so none is number {self._entry} "
                 f"(from 0): set tracker.entry in the scene",
             )
             return
         entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
-        pose = self._node.pose_in(entry, "tracker/poses")
+        pose = self._device.pose_in(entry, "tracker/poses")
         if pose is not None:
-            self._node.take(Measurement(self._node.stamp_of(message.header, "tracker/poses"), pose))
+            stamp = self._device.stamp_of(message.header, "tracker/poses")
+            self._device.take(Measurement(stamp, pose))

@@ -29,6 +29,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import label_voxels
 from us_sim.slicing.cutting.row_bands import share_rows
 from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
@@ -50,8 +51,15 @@ class PerPixel(Slicer):
     """Locates every pixel by brute force."""
 
     def __init__(
-        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+        self,
+        volume: Volume,
+        rest_nodes: ArrayLike,
+        tetrahedra: ArrayLike,
+        *,
+        threads: int = 1,
+        settings: Settings | None = None,
     ) -> None:
+        del settings  # there is nothing to set
         if threads < 1:
             raise ValueError(f"give at least one thread, not {threads}")
         self._volume = volume

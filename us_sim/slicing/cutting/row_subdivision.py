@@ -29,11 +29,14 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.cutting.location import BLACK, cells, leave_black, subdivide_rows
 from us_sim.slicing.cutting.resampling import (
     label_voxels,
@@ -52,19 +55,31 @@ if TYPE_CHECKING:
 
     from us_sim.volume.volume import Volume
 
-__all__ = ["RowSubdivision"]
+__all__ = ["RowSubdivision", "RowSubdivisionSettings"]
+
+
+@dataclass(frozen=True)
+class RowSubdivisionSettings(Settings):
+    """The settings of the method ``row_subdivision``."""
+
+    section = "slice"
+
+    regions: int = setting(
+        Quantity("number", 1, 4096),
+        "bands of rows into which an image is split, and cells into which each band is; the paper "
+        "found 32 best",
+        default=32,
+    )
 
 
 class RowSubdivision(Slicer):
-    """The paper's method, for comparison.
-
-    Args:
-        regions: into how many bands of rows an image is split, and each band into as many cells;
-            every cell has a list of the tetrahedra that cross it. The paper found 32 best.
+    """The paper's method, for comparison. Every cell has a list of the tetrahedra that cross it.
 
     Raises:
-        ValueError: regions or threads below 1.
+        ValueError: fewer than one thread.
     """
+
+    Settings = RowSubdivisionSettings
 
     def __init__(
         self,
@@ -73,15 +88,15 @@ class RowSubdivision(Slicer):
         tetrahedra: ArrayLike,
         *,
         threads: int = 1,
-        regions: int = 32,
+        settings: RowSubdivisionSettings | None = None,
     ) -> None:
-        if regions < 1 or threads < 1:
-            raise ValueError(f"give at least one region and one thread, not {regions}, {threads}")
+        if threads < 1:
+            raise ValueError(f"give at least one thread, not {threads}")
         self._volume = volume
         self._mesh = RestMesh(
             np.asarray(rest_nodes), np.asarray(tetrahedra), volume.patient_to_index
         )
-        self._regions = regions
+        self._regions = (settings or RowSubdivisionSettings()).regions
         self._threads = threads
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.mesh_faces import face_order
+from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.clusters import Clusters
 from us_sim.slicing.cutting.cut_polygons import cut_tetrahedra, room_for_cuts
 from us_sim.slicing.cutting.location import BLACK
@@ -61,8 +62,15 @@ class ScanConversion(Slicer):
     """Cuts exact images, and fast."""
 
     def __init__(
-        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+        self,
+        volume: Volume,
+        rest_nodes: ArrayLike,
+        tetrahedra: ArrayLike,
+        *,
+        threads: int = 1,
+        settings: Settings | None = None,
     ) -> None:
+        del settings  # there is nothing to set
         if threads < 1:
             raise ValueError(f"give at least one thread, not {threads}")
         self._threads = threads

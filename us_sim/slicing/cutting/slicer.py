@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import SLICERS
+from us_sim.settings.setting import Settings
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["METHODS", "Slicer", "create_slicer", "warm_up"]
-
-METHODS = {
-    "scan_conversion": "us_sim.slicing.cutting.scan_conversion:ScanConversion",
-    "row_subdivision": "us_sim.slicing.cutting.row_subdivision:RowSubdivision",
-    "per_pixel": "us_sim.slicing.cutting.per_pixel:PerPixel",
-}
-"""Where each method is; its module is imported only when it is used."""
+__all__ = ["Slicer", "create_slicer", "warm_up"]
 
 
 class Slicer(ABC):
@@ -41,13 +35,23 @@ class Slicer(ABC):
     skipped: int = 0
     """Inverted or flat tetrahedra on the latest image, which were left out."""
 
+    Settings: ClassVar[type[Settings]] = Settings
+    """What can be set of this method."""
+
     @abstractmethod
     def __init__(
-        self, volume: Volume, rest_nodes: ArrayLike, tetrahedra: ArrayLike, *, threads: int = 1
+        self,
+        volume: Volume,
+        rest_nodes: ArrayLike,
+        tetrahedra: ArrayLike,
+        *,
+        threads: int = 1,
+        settings: Any = None,
     ) -> None:
         """``rest_nodes`` (N, 3) m lie in the undeformed volume; ``tetrahedra`` (M, 4) index them.
 
-        The image does not depend on the number of threads.
+        The image does not depend on the number of threads. ``settings`` are of the class's own
+        kind, or None for those by default.
         """
 
     @abstractmethod
@@ -87,17 +91,23 @@ def create_slicer(
     tetrahedra: ArrayLike,
     *,
     threads: int = 1,
-    **settings: int,
+    settings: Settings | None = None,
 ) -> Slicer:
     """The slicer of that name.
 
+    Args:
+        name: one of `SLICERS`.
+        volume, rest_nodes, tetrahedra, threads: as for every `Slicer`.
+        settings: of the method's own class.
+
     Raises:
-        KeyError: there is no method of that name.
+        SettingsError: there is no method of that name; the sentence says which there are.
         MeshError: the mesh cannot be used.
     """
-    module, _, cls = METHODS[name].partition(":")
-    method: type[Slicer] = getattr(importlib.import_module(module), cls)
-    return method(volume, rest_nodes, tetrahedra, threads=threads, **settings)
+    slicer: Slicer = SLICERS.load(name)(
+        volume, rest_nodes, tetrahedra, threads=threads, settings=settings
+    )
+    return slicer
 
 
 def warm_up(name: str, threads: int = 1) -> None:

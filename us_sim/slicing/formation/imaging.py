@@ -14,7 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from us_sim.errors import ProbeError
-from us_sim.settings.quantity import Quantity, given, require_given
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 
 __all__ = ["ECHO_RANGE", "GREY_MAPS", "Imaging"]
 
@@ -28,7 +29,7 @@ _RESOLUTION = Quantity("length", 0.0, 0.01)
 
 
 @dataclass(frozen=True)
-class Imaging:
+class Imaging(Settings):
     """The settings of image formation; with the defaults the volume's grey values are shown.
 
     Each is a key of a scene's ``imaging:`` and a parameter of the node that makes the images.
@@ -37,57 +38,57 @@ class Imaging:
         ProbeError: a value is out of range, with its name and the range.
     """
 
-    gain: float = given(_GAIN, default=0.0, description="dB added to every echo")
-    time_gain: tuple[float, ...] = given(
+    section = "imaging"
+    error = ProbeError
+    live = True
+
+    gain: float = setting(_GAIN, default=0.0, description="added to every echo")
+    time_gain: tuple[float, ...] = setting(
         _GAIN,
         default=(),
-        description="dB added at evenly spaced depths from the face to the end of the beams, "
+        description="added at evenly spaced depths from the face to the end of the beams, "
         "linear in between",
     )
-    dynamic_range: float = given(
+    dynamic_range: float = setting(
         Quantity("level", 10.0, 120.0),
         default=ECHO_RANGE,
-        description="dB from black to white",
+        description="level shown from black to white",
     )
-    grey_map: str = given(
+    grey_map: str = setting(
         default="linear",
         choices=GREY_MAPS,
         description="curve from dB to grey: soft lifts faint echoes, contrast parts middle ones",
     )
-    elevation_planes: int = given(
+    elevation_planes: int = setting(
         Quantity("number", 1, 15),
         default=1,
         description="slices averaged across the thickness of the beam; 1 is ideally thin",
     )
-    elevation_width: float = given(
+    elevation_width: float = setting(
         Quantity("length", 1e-4, 0.02),
         default=2e-3,
-        description="m, thickness of the beam at its focus, full width at half maximum",
+        description="thickness of the beam at its focus, full width at half maximum",
     )
-    lateral_resolution: float = given(
+    lateral_resolution: float = setting(
         _RESOLUTION,
         default=0.0,
-        description="m, width of a point along the array at the focus, 6 dB below its peak; "
+        description="width of a point along the array at the focus, 6 dB below its peak; "
         "0 is ideal",
     )
-    axial_resolution: float = given(
+    axial_resolution: float = setting(
         _RESOLUTION,
         default=0.0,
-        description="m, length of a point along the beam at the face, 6 dB below its peak; "
-        "0 is ideal",
+        description="length of a point along the beam at the face, 6 dB below its peak; 0 is ideal",
     )
-    contact: bool = given(
+    contact: bool = setting(
         default=False,
         description="whether beams whose part of the face touches no skin see only air",
     )
-    reverberation: float = given(
+    reverberation: float = setting(
         Quantity("level", -ECHO_RANGE, 0.0),
         default=-10.0,
-        description="dB, the face's first echo in air, where the strongest echo is 0",
+        description="the face's first echo in air, where the strongest echo is 0",
     )
-
-    def __post_init__(self) -> None:
-        require_given(self, "imaging", ProbeError)
 
     @property
     def changes_grey_levels(self) -> bool:

@@ -20,11 +20,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import ProbeError
-from us_sim.settings.quantity import Quantity, given
-from us_sim.slicing.probe.probe import BEAM_LINES, BEAM_SAMPLES, FOCUS, IMAGE_DEPTH, Probe
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
+from us_sim.slicing.probe.probe import (
+    Probe,
+    beam_focus,
+    beam_lines,
+    beam_samples,
+    image_depth,
+)
 
 __all__ = ["ConvexProbe", "SectorProbe"]
+
+_ANGLE = Quantity("angle", math.radians(1), math.radians(150))
 
 
 @dataclass(frozen=True)
@@ -38,17 +46,14 @@ class ConvexProbe(Probe):
         ProbeError: a value is out of its range.
     """
 
-    radius: float = given(Quantity("length", 3e-3, 0.3))  # m, of the face's curvature
-    opening_angle: float = given(Quantity("angle", math.radians(1), math.pi))  # rad, all of it
-    depth: float = given(IMAGE_DEPTH)
+    radius: float = setting(Quantity("length", 3e-3, 0.3), "of the face's curvature")
+    opening_angle: float = setting(_ANGLE, "between the outermost beams")
+    depth: float = image_depth()
     columns: int = 512
     rows: int = 512
-    lines: int = given(BEAM_LINES, default=192, kw_only=True)
-    samples: int = given(BEAM_SAMPLES, default=512, kw_only=True)
-    focus: float | None = given(FOCUS, default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._require_possible()
+    lines: int = beam_lines(192)
+    samples: int = beam_samples()
+    focus: float | None = beam_focus()
 
     @property
     def _outline(self) -> tuple[float, float, float]:
@@ -85,27 +90,31 @@ class SectorProbe(Probe):
             spreads over it.
     """
 
-    aperture: float = given(Quantity("length", 3e-3, 0.05))  # m, of the face along the array
-    opening_angle: float = given(
-        Quantity("angle", math.radians(1), math.radians(150))
-    )  # rad, all of it
-    depth: float = given(IMAGE_DEPTH)
+    aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
+    opening_angle: float = setting(_ANGLE, "between the outermost beams")
+    depth: float = image_depth()
     columns: int = 512
     rows: int = 512
-    radius: float = given(Quantity("length", 0.0, 0.05), default=0.0, kw_only=True)  # m, of the
-    # virtual apex behind the face
-    lines: int = given(BEAM_LINES, default=128, kw_only=True)
-    samples: int = given(BEAM_SAMPLES, default=512, kw_only=True)
-    focus: float | None = given(FOCUS, default=None, kw_only=True)
+    lines: int = beam_lines(128)
+    samples: int = beam_samples()
+    focus: float | None = beam_focus()
+    radius: float = setting(
+        Quantity("length", 0.0, 0.05),
+        "how far behind the face is the apex from which beams radiate",
+        default=0.0,
+        kw_only=True,
+    )
 
-    def __post_init__(self) -> None:
-        self._require_possible()
+    def check(self) -> None:
+        """Refuse a face too small for its beams."""
+        super().check()
         used = 2 * self.radius * math.tan(0.5 * self.opening_angle)
         if used > self.aperture * (1 + 1e-9):
-            raise ProbeError(
-                f"probe.aperture: {1e3 * self.aperture:g} mm is less than the {1e3 * used:.4g} mm "
+            raise self.refused(
+                "aperture",
+                f"{1e3 * self.aperture:g} mm is less than the {1e3 * used:.4g} mm "
                 f"of the face that beams over {math.degrees(self.opening_angle):g} degrees from an "
-                f"apex {1e3 * self.radius:g} mm behind it (probe.radius) pass through"
+                f"apex {1e3 * self.radius:g} mm behind it (probe.radius) pass through",
             )
 
     @property

@@ -26,23 +26,48 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
-from us_sim.settings.quantity import Quantity, given
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
 
-__all__ = ["BEAM_LINES", "BEAM_SAMPLES", "FOCUS", "IMAGE_DEPTH", "LinearProbe", "Probe"]
+__all__ = ["LinearProbe", "Probe", "beam_focus", "beam_lines", "beam_samples", "image_depth"]
 
-IMAGE_DEPTH = Quantity("length", 5e-3, 0.4)
-FOCUS = Quantity("length", 1e-3, 0.4)
-BEAM_LINES = Quantity("number", 1, 4096)
-BEAM_SAMPLES = Quantity("number", 1, 16384)
 
-# A pixel centre that lies on the outline, up to rounding, is in it: part of a beam or of the lines.
+def image_depth() -> Any:
+    """The setting of how deep an image is."""
+    return setting(
+        Quantity("length", 5e-3, 0.4), "of the image along the beams from the face", live=True
+    )
+
+
+def beam_lines(default: int) -> Any:
+    """The setting of how many beams there are."""
+    return setting(Quantity("number", 1, 4096), "beams", default=default, kw_only=True)
+
+
+def beam_samples() -> Any:
+    """The setting of how many samples a beam has."""
+    return setting(Quantity("number", 1, 16384), "of each beam", default=512, kw_only=True)
+
+
+def beam_focus() -> Any:
+    """The setting of where beams are focused."""
+    return setting(
+        Quantity("length", 1e-3, 0.4),
+        "along the beams from the face; not given: the middle of the depth",
+        default=None,
+        live=True,
+        kw_only=True,
+    )
+
+
 _ROUNDING = 1e-9
+"""A pixel centre that lies on the outline, up to this part of a beam or of the lines, is in it."""
 
 _BAND = 64  # rows
 
 
-class Probe(ABC):
+class Probe(Settings, ABC):
     """A transducer with straight beams in the plane y = 0 of frame ``probe``.
 
     The middle of its face is the origin and +z the middle beam's direction. Each beam starts on
@@ -55,6 +80,9 @@ class Probe(ABC):
     are black.
     """
 
+    section = "probe"
+    error = ProbeError
+
     depth: float  # m, along the beams from the face
     columns: int  # pixels along the array
     rows: int  # pixels along the depth
@@ -62,17 +90,24 @@ class Probe(ABC):
     samples: int  # of each beam
     focus: float | None  # m, along the beams from the face
 
-    @classmethod
-    def with_square_pixels(cls, rows: int, **geometry: Any) -> Self:
-        """The probe with as many columns as make pixels square, to half a column.
+    def with_square_pixels(self, rows: int) -> Self:
+        """The probe with so many rows, and as many columns as make pixels square, to half a column.
 
         Raises:
-            ProbeError: see the geometry.
+            ProbeError: the image is too large.
         """
-        make: Any = cls
-        draft: Self = make(columns=1, rows=rows, **geometry)
-        columns = max(1, round(rows * draft.width / draft.height))
-        return dataclasses.replace(draft, columns=columns)  # type: ignore[type-var]
+        draft = self.with_pixels(1, rows)
+        return self.with_pixels(max(1, round(rows * draft.width / draft.height)), rows)
+
+    def with_pixels(self, columns: int, rows: int) -> Self:
+        """The probe with an image of so many pixels.
+
+        Raises:
+            ProbeError: the image is too large.
+        """
+        made: Any = self
+        probe: Self = dataclasses.replace(made, columns=columns, rows=rows)
+        return probe
 
     @property
     @abstractmethod
@@ -197,27 +232,16 @@ class Probe(ABC):
     def _line_parts(self) -> NDArray[np.float64]:
         return (np.arange(self.lines) + 0.5) / self.lines
 
-    def _require_possible(self) -> None:
-        """Refuse a value out of its range.
+    def check(self) -> None:
+        """Refuse an image that is too large.
 
         Raises:
             ProbeError: with the key, the value and the range.
         """
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if field.name in ("columns", "rows") or (field.name == "focus" and value is None):
-                continue
-            try:
-                number = field.metadata["quantity"].parse(value)
-                if field.type == "int" and number != int(number):
-                    raise ValueError(f"{value!r} is not a whole number")
-            except ValueError as error:
-                raise ProbeError(f"probe.{field.name}: {error}") from error
-            object.__setattr__(self, field.name, int(number) if field.type == "int" else number)
         try:
             require_pixel_counts(self.columns, self.rows)
         except ProbeError as error:
-            raise ProbeError(f"probe.image: {error}") from error
+            raise self.refused("image", str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -232,16 +256,13 @@ class LinearProbe(Probe):
         ProbeError: a value is out of its range.
     """
 
-    aperture: float = given(Quantity("length", 5e-3, 0.2))  # m, of the face along the array
-    depth: float = given(IMAGE_DEPTH)
+    aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
+    depth: float = image_depth()
     columns: int = 512
     rows: int = 512
-    lines: int = given(BEAM_LINES, default=192, kw_only=True)
-    samples: int = given(BEAM_SAMPLES, default=512, kw_only=True)
-    focus: float | None = given(FOCUS, default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._require_possible()
+    lines: int = beam_lines(192)
+    samples: int = beam_samples()
+    focus: float | None = beam_focus()
 
     @property
     def _outline(self) -> tuple[float, float, float]:

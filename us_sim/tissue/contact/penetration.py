@@ -18,7 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider import Collider, curved_box_distance
+from us_sim.geometry.collider import Collider
+from us_sim.geometry.collider_distance import curved_box_distance
 from us_sim.geometry.pose import Pose
 
 __all__ = [

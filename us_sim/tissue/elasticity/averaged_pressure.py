@@ -7,7 +7,8 @@ leave the stiffness K + B' C^-1 B, which couples neighbours of neighbours.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.1, 0.2], [0.0, 0.1], [0.0, 0.1])
 >>> system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))

@@ -9,7 +9,8 @@ incompressible and nearly incompressible dynamic explicit applications, Commun. 
 67, 2006).
 
 >>> from us_sim.tissue.elasticity.bulk_shares import bulk_shares
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
 >>> shares = bulk_shares(uniform_material(mesh, Material(10e3, 0.45, 1000.0)))

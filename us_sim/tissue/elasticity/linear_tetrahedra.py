@@ -2,7 +2,8 @@
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.1, 0.2], [0.0, 0.1], [0.0, 0.1])
 >>> matrix = stiffness(mesh, uniform_material(mesh, Material(10e3, 0.45, 1000.0)))

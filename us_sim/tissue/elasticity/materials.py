@@ -1,7 +1,8 @@
 """Elastic constants of tetrahedra, averaged over the labelled voxels that they contain.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.materials import Material, average_over_labels
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import average_over_labels
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
 >>> labels = np.ones((10, 10, 10), dtype=np.uint8)
@@ -13,7 +14,6 @@ array([12000., 12000., 12000., 12000., 12000.])
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -22,10 +22,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import MaterialError
+from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = [
-    "Material",
     "TissueMaterials",
     "average_over_labels",
     "label_fractions",
@@ -34,29 +34,6 @@ __all__ = [
 
 # Samples of each tetrahedron: a fraction of its volume is known to about one percent.
 _SAMPLES = 1024
-
-
-@dataclass(frozen=True)
-class Material:
-    """Isotropic linear elastic constants.
-
-    Raises:
-        MaterialError: a constant is not physical.
-    """
-
-    young_modulus: float  # Pa, above 0
-    poisson_ratio: float  # above -1, below 0.5 (at 0.5 linear tetrahedra have no stiffness)
-    density: float = 1000.0  # kg/m3, above 0
-
-    def __post_init__(self) -> None:
-        for name in ("young_modulus", "density"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise MaterialError(f"{name} is {value!r}: give a number above zero")
-        if not -1 < self.poisson_ratio < 0.5:
-            raise MaterialError(
-                f"poisson_ratio is {self.poisson_ratio!r}: give a number above -1 and below 0.5"
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,8 @@ with c = V nodal / 4, and what `neo_hookean_point` adds against being crushed. L
 is the linear elasticity of the same shares.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 >>> mesh = box_mesh(*[uniform_planes(0.0, 0.1, 4)] * 3)

@@ -4,7 +4,8 @@ The copying, and what makes a cell of five tetrahedra, is in `cell_lanes`; a loo
 runs over the lanes, which LLVM turns into vector instructions. The same input gives the same bytes.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 >>> mesh = box_mesh([0.0, 0.1, 0.3], [0.0, 0.1], [0.0, 0.1])

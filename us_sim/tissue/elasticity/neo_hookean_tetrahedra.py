@@ -4,7 +4,8 @@ The gathering is in `tetrahedron_lanes`; a loop without branches runs over the l
 turns into vector instructions. The same input gives the same bytes.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
 >>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])

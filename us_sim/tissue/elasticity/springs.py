@@ -1,6 +1,7 @@
 """Springs and dampers along the edges of a tetrahedral mesh.
 
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.elasticity.springs import springs_of
 >>> planes = uniform_planes(0.0, 0.1, 5)

@@ -8,7 +8,8 @@ Solids, CGI 2004, do, here with the coefficients of elasticity and shared betwee
 nodes as `us_sim.tissue.elasticity.bulk_shares` says.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> from us_sim.tissue.elasticity.springs import fitted_springs
 >>> from us_sim.tissue.elasticity.volume_term import volume_term

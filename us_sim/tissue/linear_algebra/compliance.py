@@ -4,7 +4,8 @@
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.linear_algebra.compliance import surface_compliance
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> across, deep = uniform_planes(-0.05, 0.05, 5), uniform_planes(0.0, 0.1, 5)

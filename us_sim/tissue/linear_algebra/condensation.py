@@ -13,7 +13,8 @@ factor, then the pressures by one of the negative.
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 >>> from us_sim.tissue.linear_algebra.condensation import condense
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> mesh = box_mesh(*(uniform_planes(0.0, 0.1, 4) for axis in range(3)))
 >>> system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))

@@ -10,7 +10,8 @@ is their sum.
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem import Fem
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
@@ -26,13 +27,15 @@ is their sum.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
 from us_sim.tissue.contact.compliant_contact import CompliantContact
 from us_sim.tissue.contact.friction import FrictionalContact
 from us_sim.tissue.contact.penetration import wrench_on_probe
@@ -41,9 +44,9 @@ from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import TissueSolver, require_number
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["CONTACTS", "Fem"]
+__all__ = ["CONTACTS", "Fem", "FemSettings"]
 
 #: What holds between the probe and the surface.
 CONTACTS = ("frictionless", "coulomb", "sticking")
@@ -53,6 +56,25 @@ _ROUNDING = 1e-5
 
 # How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
+
+
+@dataclass(frozen=True)
+class FemSettings(SolverSettings):
+    """The settings of the solver ``fem``."""
+
+    section = "fem"
+
+    contact: str = setting(
+        choices=CONTACTS,
+        default="frictionless",
+        description="what holds between probe and tissue; sticking: a touched node keeps its place "
+        "on the probe until it is pulled",
+    )
+    friction: float = setting(
+        Quantity("number", 1e-9, 10.0),
+        "Coulomb's coefficient, where contact is coulomb",
+        default=0.3,
+    )
 
 
 class Fem(TissueSolver):
@@ -65,9 +87,7 @@ class Fem(TissueSolver):
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
-        contact: ``frictionless``, ``coulomb``, or ``sticking``: a touched node keeps its place on
-            the probe until it is pulled.
-        friction: Coulomb's coefficient.
+        settings: see `FemSettings`.
 
     Raises:
         SolverError: a setting is out of range, or the tissue is not held.
@@ -76,12 +96,10 @@ class Fem(TissueSolver):
     name: ClassVar[str] = "fem"
     farthest: ClassVar[float] = 3.0  # held as it is
 
-    def __init__(
-        self, model: TissueModel, *, contact: str = "frictionless", friction: float = 0.3
-    ) -> None:
-        if contact not in CONTACTS:
-            raise SolverError(f"fem.contact is {contact!r}: name one of {', '.join(CONTACTS)}")
-        require_number("fem.friction", friction, 0.0)
+    Settings = FemSettings
+
+    def __init__(self, model: TissueModel, settings: FemSettings | None = None) -> None:
+        settings = settings or FemSettings()
         self._compliance = surface_compliance(model)
         self._reached = self._compliance.nodes
         surface = (
@@ -90,15 +108,15 @@ class Fem(TissueSolver):
             model.contact_spacing,
             self._compliance.matrix,
         )
-        if contact == "frictionless":
+        if settings.contact == "frictionless":
             self._contact = CompliantContact(*surface)
         else:
-            coefficient = friction if contact == "coulomb" else math.inf
+            coefficient = settings.friction if settings.contact == "coulomb" else math.inf
             self._contact = FrictionalContact(*surface, coefficient)
         imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._displacement = np.zeros_like(model.mesh.nodes)
-        super().__init__(model)
+        super().__init__(model, settings)
 
     @property
     def state(self) -> TissueState:

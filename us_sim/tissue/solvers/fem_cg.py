@@ -10,7 +10,8 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem_cg import FemCg
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
@@ -27,23 +28,46 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import free_stiffness, require_held, stiffness
 from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+from us_sim.tissue.solvers.solver import (
+    COUNT,
+    TOLERANCE,
+    SolverSettings,
+    TissueSolver,
+    same_pose,
+)
 
-__all__ = ["FemCg"]
+__all__ = ["FemCg", "FemCgSettings"]
 
 # How far the residual must fall before touched nodes that slid a little are corrected again.
 _REFINEMENT = 1e-2
+
+
+@dataclass(frozen=True)
+class FemCgSettings(SolverSettings):
+    """The settings of the solver ``fem_cg``."""
+
+    section = "fem_cg"
+
+    iterations: int = setting(
+        COUNT, "conjugate-gradient iterations in a frame; the paper has 20", default=20
+    )
+    tolerance: float = setting(TOLERANCE, "residual at which a frame stops early", default=1e-6)
+    contact_updates: int = setting(
+        COUNT, "how often in a frame the set of touched nodes is revised", default=3
+    )
 
 
 class FemCg(TissueSolver):
@@ -55,9 +79,7 @@ class FemCg(TissueSolver):
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
-        iterations: of the conjugate gradients in a frame (the paper's 20).
-        tolerance: residual at which a frame stops early.
-        contact_updates: how often in a frame the set of touched nodes is revised.
+        settings: see `FemCgSettings`.
 
     Raises:
         SolverError: a setting is out of range, or the tissue is not held.
@@ -66,22 +88,15 @@ class FemCg(TissueSolver):
     name: ClassVar[str] = "fem_cg"
     farthest: ClassVar[float] = 3.0  # held as it is
 
-    def __init__(
-        self,
-        model: TissueModel,
-        *,
-        iterations: int = 20,
-        tolerance: float = 1e-6,
-        contact_updates: int = 3,
-    ) -> None:
-        require_count("fem_cg.iterations", iterations)
-        require_count("fem_cg.contact_updates", contact_updates)
-        require_number("fem_cg.tolerance", tolerance, 0.0, 1.0)
+    Settings = FemCgSettings
+
+    def __init__(self, model: TissueModel, settings: FemCgSettings | None = None) -> None:
         require_held(model.mesh, model.fixed)
-        super().__init__(model)
-        self._tolerance = tolerance
-        updates = min(contact_updates, iterations)
-        self._rounds = np.diff(np.linspace(0, iterations, updates + 1).round().astype(int))
+        settings = settings or FemCgSettings()
+        super().__init__(model, settings)
+        self._tolerance = settings.tolerance
+        updates = min(settings.contact_updates, settings.iterations)
+        self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
 
         free = ~model.fixed
         matrix = free_stiffness(stiffness(model.mesh, model.materials), model.fixed)

@@ -13,7 +13,8 @@ the energy.
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
@@ -38,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.setting import setting
 from us_sim.tissue.contact.carried_correction import CarriedCorrection
 from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out, wrench_on_probe
 from us_sim.tissue.contact.prediction import predict_forces
@@ -47,10 +49,16 @@ from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+from us_sim.tissue.solvers.solver import (
+    COUNT,
+    TOLERANCE,
+    SolverSettings,
+    TissueSolver,
+    same_pose,
+)
 from us_sim.tissue.solvers.sub_steps import between, motion
 
-__all__ = ["FemNonlinear"]
+__all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
 # One prediction carries the tissue this part of its smallest extent: 5 mm of 0.1 m.
 _STRIDE = 0.05
@@ -85,6 +93,29 @@ class _Effort:
     newton: int = _NEWTON  # iterations of one Newton step
 
 
+@dataclass(frozen=True)
+class FemNonlinearSettings(SolverSettings):
+    """The settings of the solver ``fem_nonlinear``."""
+
+    section = "fem_nonlinear"
+
+    iterations: int = setting(
+        COUNT, "conjugate-gradient iterations in an ordinary frame", default=6
+    )
+    frame_tolerance: float = setting(
+        TOLERANCE, "residual down to which a frame goes on after those", default=0.03
+    )
+    most_iterations: int | None = setting(
+        COUNT,
+        "iterations in any frame at most; what is then left to do waits for the next; not given: "
+        "30, fewer on meshes of more than 10,000 nodes",
+        default=None,
+    )
+    tolerance: float = setting(
+        TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
+    )
+
+
 class FemNonlinear(TissueSolver):
     """Stable neo-Hookean finite elements with frictionless contact, by Newton's method.
 
@@ -95,11 +126,7 @@ class FemNonlinear(TissueSolver):
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
-        iterations: of the conjugate gradients in an ordinary frame.
-        frame_tolerance: residual down to which a frame goes on after those.
-        most_iterations: in any frame; what is then left to do waits for the next. By default 30,
-            less on meshes of more than 10,000 nodes.
-        tolerance: residual at which the tissue under an unmoved probe has settled.
+        settings: see `FemNonlinearSettings`.
 
     Raises:
         SolverError: a setting is out of range, or the tissue is not held.
@@ -108,29 +135,19 @@ class FemNonlinear(TissueSolver):
     name: ClassVar[str] = "fem_nonlinear"
     farthest: ClassVar[float] = 3.0  # held as it is
 
-    def __init__(
-        self,
-        model: TissueModel,
-        *,
-        iterations: int = 6,
-        frame_tolerance: float = 0.03,
-        most_iterations: int | None = None,
-        tolerance: float = 1e-5,
-    ) -> None:
-        require_count("fem_nonlinear.iterations", iterations)
-        if most_iterations is None:
-            most_iterations = max(
-                _LEAST_BUDGET, round(_BUDGET / max(1.0, len(model.mesh.nodes) / 1e4))
-            )
-        require_count("fem_nonlinear.most_iterations", most_iterations)
-        require_number("fem_nonlinear.frame_tolerance", frame_tolerance, 0.0, 1.0)
-        require_number("fem_nonlinear.tolerance", tolerance, 0.0, 1.0)
+    Settings = FemNonlinearSettings
+
+    def __init__(self, model: TissueModel, settings: FemNonlinearSettings | None = None) -> None:
         require_held(model.mesh, model.fixed)
-        super().__init__(model)
-        self._iterations = iterations
-        self._most_iterations = max(most_iterations, iterations)
-        self._frame_tolerance = frame_tolerance
-        self._tolerance = tolerance
+        settings = settings or FemNonlinearSettings()
+        super().__init__(model, settings)
+        self._iterations = settings.iterations
+        most = settings.most_iterations
+        if most is None:
+            most = max(_LEAST_BUDGET, round(_BUDGET / max(1.0, len(model.mesh.nodes) / 1e4)))
+        self._most_iterations = max(most, settings.iterations)
+        self._frame_tolerance = settings.frame_tolerance
+        self._tolerance = settings.tolerance
         self._surface = model.movable_contact_nodes
         box = model.collider.offset_box
         self._lever = float(np.linalg.norm(box[:3]) + box[3])

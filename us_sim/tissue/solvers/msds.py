@@ -4,7 +4,8 @@
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.msds import Msds
@@ -20,31 +21,49 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
 from us_sim.tissue.contact.penetration import only_forward, push_out
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
-from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
 from us_sim.tissue.elasticity.step_limit import highest_frequency, stabilised, step_limit
 from us_sim.tissue.elasticity.tangling import Tangling
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number
+from us_sim.tissue.solvers.solver import COUNT, TissueSolver
+from us_sim.tissue.solvers.spring_tissue import SpringSettings, spring_tissue
 from us_sim.tissue.solvers.symplectic_euler import advance_frame
 
-__all__ = ["Msds"]
+__all__ = ["Msds", "MsdsSettings"]
 
 # s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
 
 # m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
+
+
+@dataclass(frozen=True)
+class MsdsSettings(SpringSettings):
+    """The settings of the solver ``msds``."""
+
+    section = "msds"
+
+    steps: int = setting(COUNT, "time steps in a frame", default=20)
+    time_step: float = setting(Quantity("time", 1e-12, 10.0), "of one step", default=0.01)
+    stabilisation: str = setting(
+        choices=("mass_scaling", "substeps", "none"),
+        default="mass_scaling",
+        description="what makes a step beyond the limit stable; with none it ends in frames of "
+        "which only the last good state is kept",
+    )
+    maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
 
 
 class Msds(TissueSolver):
@@ -64,19 +83,7 @@ class Msds(TissueSolver):
 
     Args:
         model: may be free; then the whole tissue moves away when pushed.
-        steps: in a frame.
-        time_step: s.
-        stiffness_factor: m, spring constant over Young's modulus.
-        damping_factor: s, damping constant over spring constant.
-        stiffness: of the springs: ``algorithm_1``, the paper's, or ``fitted`` to the elasticity of
-            the same mesh, which needs no stiffness_factor.
-        volume: whether tetrahedra resist changes of volume as the material does, and not only as
-            springs do, which have Poisson's ratio 1/4.
-        stabilisation: ``mass_scaling``, ``substeps``, or ``none``: a step beyond the limit then
-            ends in frames of which only the last good state is kept.
-        maximum_substeps: of one step; more are refused.
-        rest_tolerance: m, motion in a frame (in 0.2 s, or in damping_factor, if these are longer)
-            below which the tissue counts as settled.
+        settings: see `MsdsSettings`.
 
     Raises:
         SolverError: a setting is out of range, or too many sub-steps would be needed.
@@ -84,44 +91,15 @@ class Msds(TissueSolver):
 
     name: ClassVar[str] = "msds"
 
-    def __init__(
-        self,
-        model: TissueModel,
-        *,
-        steps: int = 20,
-        time_step: float = 0.01,
-        stiffness: str = "algorithm_1",
-        volume: bool = False,
-        stiffness_factor: float = 0.002,
-        damping_factor: float = 0.1,
-        stabilisation: str = "mass_scaling",
-        maximum_substeps: int = 100,
-        rest_tolerance: float = 1e-6,
-    ) -> None:
-        require_count("msds.steps", steps)
-        require_count("msds.maximum_substeps", maximum_substeps)
-        require_number("msds.time_step", time_step, 0.0)
-        require_number("msds.stiffness_factor", stiffness_factor, 0.0)
-        require_number("msds.rest_tolerance", rest_tolerance, 0.0)
-        if damping_factor != 0:
-            require_number("msds.damping_factor", damping_factor, 0.0)
-        if stabilisation not in ("mass_scaling", "substeps", "none"):
-            raise SolverError(
-                f"msds.stabilisation is {stabilisation!r}: choose mass_scaling, substeps or none"
-            )
-        super().__init__(model)
-        self._steps = steps
-        self._rest_tolerance = rest_tolerance
-        self._damping_factor = damping_factor
-        self._springs, self._volume = spring_tissue(
-            self.name,
-            model,
-            stiffness,
-            volume,
-            stiffness_factor,
-            damping_factor,
-            yielding=True,
-        )
+    Settings = MsdsSettings
+
+    def __init__(self, model: TissueModel, settings: MsdsSettings | None = None) -> None:
+        settings = settings or MsdsSettings()
+        super().__init__(model, settings)
+        self._steps = settings.steps
+        self._rest_tolerance = settings.rest_tolerance
+        self._damping_factor = settings.damping_factor
+        self._springs, self._volume = spring_tissue(model, settings, yielding=True)
         self._volume_arrays = (
             *self._volume.arrays,
             np.empty_like(self._volume.rest_volume),
@@ -129,9 +107,14 @@ class Msds(TissueSolver):
         )
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
         self.mass, self._substeps, self._action = stabilised(
-            model, self._factors, time_step, damping_factor, stabilisation, maximum_substeps
+            model,
+            self._factors,
+            settings.time_step,
+            settings.damping_factor,
+            settings.stabilisation,
+            settings.maximum_substeps,
         )  # mass: (N,) kg, as simulated
-        self._time_step = time_step / self._substeps
+        self._time_step = settings.time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
         self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
         self._tangling = Tangling(model)
@@ -273,38 +256,3 @@ class Msds(TissueSolver):
             self._velocity[:] = 0.0
             self._balance.forget()
         return "; ".join(filter(None, [self._action, words]))
-
-
-def spring_tissue(
-    solver: str,
-    model: TissueModel,
-    stiffness: str,
-    volume: bool,
-    stiffness_factor: float,
-    damping_factor: float,
-    *,
-    yielding: bool = False,
-) -> tuple[SpringNetwork, VolumeTerm]:
-    """The springs, without those between fixed nodes, and the volume term that settings ask for.
-
-    Args:
-        solver: its name.
-        model, stiffness, volume, stiffness_factor, damping_factor: as in `Msds`.
-        yielding: as in `us_sim.tissue.elasticity.volume_term.volume_term`.
-
-    Raises:
-        SolverError: a setting is out of range.
-    """
-    if stiffness not in ("algorithm_1", "fitted"):
-        raise SolverError(f"{solver}.stiffness is {stiffness!r}: choose algorithm_1 or fitted")
-    if not isinstance(volume, bool):
-        raise SolverError(f"{solver}.volume is {volume!r}: give true or false")
-    mesh, materials = model.mesh, model.materials
-    if stiffness == "fitted":
-        springs = fitted_springs(mesh, materials, damping_factor, with_volume=volume)
-    else:
-        springs = springs_of(mesh, materials, stiffness_factor, damping_factor)
-    term = VolumeTerm.nothing(len(mesh.nodes))
-    if volume:
-        term = volume_term(mesh, materials, springs, damping_factor, yielding=yielding)
-    return springs.without(model.fixed), term

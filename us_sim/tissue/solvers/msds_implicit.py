@@ -9,7 +9,8 @@ that no energy comes from nowhere and no time step is too long.
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
@@ -27,12 +28,15 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import push_out, wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
@@ -44,10 +48,20 @@ from us_sim.tissue.elasticity.tangling import Tangling
 from us_sim.tissue.elasticity.volume_term import VolumeTerm
 from us_sim.tissue.linear_algebra.scalar_preconditioner import ScalarPreconditioner
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.msds import spring_tissue
-from us_sim.tissue.solvers.solver import TissueSolver, require_count, require_number, same_pose
+from us_sim.tissue.solvers.solver import (
+    COUNT,
+    TOLERANCE,
+    TissueSolver,
+    same_pose,
+)
+from us_sim.tissue.solvers.spring_tissue import (
+    SpringSettings,
+    spring_stiffness,
+    spring_tissue,
+    spring_volume,
+)
 
-__all__ = ["MsdsImplicit"]
+__all__ = ["MsdsImplicit", "MsdsImplicitSettings"]
 
 # s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
@@ -69,6 +83,24 @@ _HALVINGS = 20
 _ROUNDING = 1e-13
 
 
+@dataclass(frozen=True)
+class MsdsImplicitSettings(SpringSettings):
+    """The settings of the solver ``msds_implicit``."""
+
+    section = "msds_implicit"
+
+    iterations: int = setting(COUNT, "conjugate-gradient iterations in a frame", default=2)
+    contact_updates: int = setting(
+        COUNT, "how often in a frame the set of touched nodes is revised", default=1
+    )
+    tolerance: float = setting(
+        TOLERANCE, "unbalanced force over contact force at which a frame stops early", default=1e-4
+    )
+    time_step: float = setting(Quantity("time", 1e-9, 1e3), "of a frame", default=0.2)
+    stiffness: str = spring_stiffness("fitted")
+    volume: bool = spring_volume(True)
+
+
 class MsdsImplicit(TissueSolver):
     """Point masses joined by springs and dampers, and tetrahedra that keep their volume.
 
@@ -80,18 +112,7 @@ class MsdsImplicit(TissueSolver):
 
     Args:
         model: may be free; then the whole tissue moves away when pushed.
-        iterations: of the conjugate gradients in a frame.
-        contact_updates: how often in a frame the set of touched nodes is revised.
-        tolerance: unbalanced force over contact force at which a frame stops early.
-        time_step: s, of a frame.
-        stiffness: of the springs: ``fitted`` to the elasticity of the same mesh, or
-            ``algorithm_1``, the paper's.
-        volume: whether tetrahedra resist changes of volume as the material does, and not only as
-            springs do, which have Poisson's ratio 1/4.
-        stiffness_factor: m, spring constant over Young's modulus, for ``algorithm_1``.
-        damping_factor: s, damping constant over spring constant.
-        rest_tolerance: m, motion in a frame (in 0.2 s, or in damping_factor, if these are longer)
-            below which the tissue counts as settled.
+        settings: see `MsdsImplicitSettings`.
 
     Raises:
         SolverError: a setting is out of range.
@@ -99,45 +120,28 @@ class MsdsImplicit(TissueSolver):
 
     name: ClassVar[str] = "msds_implicit"
 
-    def __init__(
-        self,
-        model: TissueModel,
-        *,
-        iterations: int = 2,
-        contact_updates: int = 1,
-        tolerance: float = 1e-4,
-        time_step: float = 0.2,
-        stiffness: str = "fitted",
-        volume: bool = True,
-        stiffness_factor: float = 0.002,
-        damping_factor: float = 0.1,
-        rest_tolerance: float = 1e-6,
-    ) -> None:
-        require_count("msds_implicit.iterations", iterations)
-        require_count("msds_implicit.contact_updates", contact_updates)
-        require_number("msds_implicit.tolerance", tolerance, 0.0, 1.0)
-        require_number("msds_implicit.time_step", time_step, 0.0)
-        require_number("msds_implicit.stiffness_factor", stiffness_factor, 0.0)
-        require_number("msds_implicit.rest_tolerance", rest_tolerance, 0.0)
-        if damping_factor != 0:
-            require_number("msds_implicit.damping_factor", damping_factor, 0.0)
-        super().__init__(model)
-        updates = min(contact_updates, iterations)
-        self._rounds = np.diff(np.linspace(0, iterations, updates + 1).round().astype(int))
-        self._tolerance = tolerance
-        self._time_step = time_step
-        self._rest_tolerance = rest_tolerance
-        self._rest_time = max(time_step, damping_factor, _REST_TIME)
-        springs, term = spring_tissue(
-            "msds_implicit", model, stiffness, volume, stiffness_factor, damping_factor
-        )
+    Settings = MsdsImplicitSettings
+
+    def __init__(self, model: TissueModel, settings: MsdsImplicitSettings | None = None) -> None:
+        settings = settings or MsdsImplicitSettings()
+        super().__init__(model, settings)
+        updates = min(settings.contact_updates, settings.iterations)
+        self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
+        self._tolerance = settings.tolerance
+        self._time_step = settings.time_step
+        self._rest_tolerance = settings.rest_tolerance
+        damping = settings.damping_factor
+        self._rest_time = max(settings.time_step, damping, _REST_TIME)
+        springs, term = spring_tissue(model, settings)
         self.mass = model.lumped_mass
-        self._potential = IncrementalPotential(springs, term, self.mass, time_step, damping_factor)
+        self._potential = IncrementalPotential(
+            springs, term, self.mass, settings.time_step, damping
+        )
         self._touchable = model.movable_contact_nodes
         self._contact = ActiveSet(
             model.collider, model.mesh.nodes[self._touchable], model.contact_spacing
         )
-        self._preconditioner = self._factored(springs, term, 1.0 + damping_factor / time_step)
+        self._preconditioner = self._factored(springs, term, 1.0 + damping / settings.time_step)
         self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
         self._tangling = Tangling(model)
         self._positions = model.mesh.nodes.copy()

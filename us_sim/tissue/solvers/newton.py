@@ -3,7 +3,8 @@
 >>> import numpy as np
 >>> from us_sim.geometry.collider import RoundedBox
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.newton import Newton

@@ -4,7 +4,8 @@
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.solver import create_solver
@@ -21,11 +22,8 @@ True
 
 from __future__ import annotations
 
-import inspect
-import math
 from abc import ABC, abstractmethod
-from dataclasses import replace
-from importlib import import_module
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,31 +31,36 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import Reader
+from us_sim.settings.registry import SOLVERS
+from us_sim.settings.setting import Settings
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
 
-__all__ = [
-    "SOLVERS",
-    "TissueSolver",
-    "create_solver",
-    "require_count",
-    "require_number",
-    "same_pose",
-]
+__all__ = ["COUNT", "TOLERANCE", "SolverSettings", "TissueSolver", "create_solver", "same_pose"]
 
-#: Where each solver is found; a solver that is not asked for is not imported.
-SOLVERS = {
-    "fem": ("us_sim.tissue.solvers.fem", "Fem"),
-    "fem_nonlinear": ("us_sim.tissue.solvers.fem_nonlinear", "FemNonlinear"),
-    "fem_cg": ("us_sim.tissue.solvers.fem_cg", "FemCg"),
-    "msds": ("us_sim.tissue.solvers.msds", "Msds"),
-    "msds_implicit": ("us_sim.tissue.solvers.msds_implicit", "MsdsImplicit"),
-}
+COUNT = Quantity("number", 1, 10_000)
+"""Iterations, updates or steps in a frame."""
+TOLERANCE = Quantity("number", 1e-15, 1.0)
+"""A residual that is small enough."""
 
-# Frames in a row that may come to nothing before the tissue is put to rest.
 _PATIENCE = 5
+"""Frames in a row that may come to nothing before the tissue is put to rest."""
+
+
+@dataclass(frozen=True)
+class SolverSettings(Settings):
+    """Base of the settings of a solver, all of which may change while the tissue is deformed.
+
+    Raises:
+        SolverError: a value is out of range, with its name and the range.
+    """
+
+    error = SolverError
+    live = True
 
 
 class TissueSolver(ABC):
@@ -69,12 +72,14 @@ class TissueSolver(ABC):
     """
 
     name: ClassVar[str]
-
-    #: A node that moved by this many times the mesh's longest side has left the tissue.
+    Settings: ClassVar[type[SolverSettings]] = SolverSettings
+    """What can be set of this method; an instance of it is made with the model and one of these."""
     farthest: ClassVar[float] = 10.0
+    """A node that moved by this many times the mesh's longest side has left the tissue."""
 
-    def __init__(self, model: TissueModel) -> None:
+    def __init__(self, model: TissueModel, settings: SolverSettings | None = None) -> None:
         self.model = model
+        self.settings = settings if settings is not None else self.Settings()
         self._pose: Pose | None = None
         self._settled = True
         self._failures = 0  # frames in a row that came to nothing
@@ -211,44 +216,25 @@ class TissueSolver(ABC):
         )
 
 
-def create_solver(name: str, model: TissueModel, **settings: Any) -> TissueSolver:
+def create_solver(
+    name: str, model: TissueModel, settings: SolverSettings | None = None, **values: Any
+) -> TissueSolver:
     """A solver by the name that scenes and reports use.
+
+    Args:
+        name: one of `SOLVERS`.
+        model: the tissue.
+        settings: of the solver's own class.
+        values: or some of those settings by name.
 
     Raises:
         SolverError: no such solver or setting, a setting out of range, or a model it cannot solve.
     """
-    if name not in SOLVERS:
-        raise SolverError(f"there is no tissue solver {name!r}: name one of {', '.join(SOLVERS)}")
-    module, class_name = SOLVERS[name]
-    solver = getattr(import_module(module), class_name)
-    known = [p for p in inspect.signature(solver).parameters if p != "model"]
-    for setting in settings:
-        if setting not in known:
-            raise SolverError(
-                f"solver {name} has no setting {setting!r}: its settings are {', '.join(known)}"
-            )
-    return solver(model, **settings)
-
-
-def require_count(setting: str, value: object) -> None:
-    """Check a number of iterations or steps.
-
-    Raises:
-        SolverError: it is not an integer from 1 to 10000.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 10_000:
-        raise SolverError(f"{setting} is {value!r}: give an integer from 1 to 10000")
-
-
-def require_number(setting: str, value: object, low: float, high: float = math.inf) -> None:
-    """Check a setting's range.
-
-    Raises:
-        SolverError: it is not a number above ``low`` and below ``high``.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        below = f" and below {high:g}" if math.isfinite(high) else ""
-        raise SolverError(f"{setting} is {value!r}: give a number above {low:g}{below}")
+    solver = SOLVERS.load(name)
+    if settings is None:
+        settings = Reader(f"solver {name}", error=SolverError).read(solver.Settings, values)
+    made: TissueSolver = solver(model, settings)
+    return made
 
 
 def same_pose(a: Pose | None, b: Pose | None) -> bool:

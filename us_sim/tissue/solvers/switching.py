@@ -4,7 +4,8 @@
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.materials import Material, uniform_material
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.switching import SwitchableTissue
@@ -23,9 +24,8 @@ True
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,9 @@ from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import TissueSolver, create_solver
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, create_solver
 
-__all__ = ["Difference", "SwitchableTissue", "difference"]
+__all__ = ["Difference", "Plan", "Prepared", "SwitchableTissue", "difference"]
 
 
 @dataclass(frozen=True)
@@ -53,29 +53,55 @@ def difference(first: NDArray[np.float64], second: NDArray[np.float64]) -> Diffe
     return Difference(float(np.sqrt(square.max())), float(np.sqrt(square.mean())))
 
 
+@dataclass(frozen=True)
+class Plan:
+    """How a tissue is to be deformed."""
+
+    solver: str  # name of the method
+    compared: str = ""  # of one that runs beside it, '' for none
+    settings: Mapping[str, SolverSettings] = field(default_factory=dict)  # of methods by name
+    model: Callable[[], TissueModel] | None = None  # makes one in place of that there is
+    reason: str = ""  # what was changed, for a person
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A plan with its solvers made and compiled."""
+
+    plan: Plan
+    model: TissueModel
+    solvers: dict[str, TissueSolver]
+
+
 class SwitchableTissue:
     """Deforms a tissue with one solver by name, and with another on the same poses if asked.
 
-    Each solver is made once, when it is first named.
+    Each solver is made once for a model and its settings, when it is first named.
 
     Args:
         model: shared by all solvers.
         name: of the solver in use.
-        settings: of each solver by its name.
+        settings: of solvers by their names; of those that are not there, the defaults.
 
     Raises:
         SolverError: as `create_solver`.
     """
 
     def __init__(
-        self, model: TissueModel, name: str, settings: Mapping[str, Mapping[str, Any]] | None = None
+        self, model: TissueModel, name: str, settings: Mapping[str, SolverSettings] | None = None
     ) -> None:
         self._model = model
-        self._settings = settings or {}
         self._solvers: dict[str, TissueSolver] = {}
-        self._solver = self.prepare(name)
+        self._plan = Plan(name, settings=dict(settings or {}))
+        self._solvers = self.make(self._plan).solvers
+        self._solver = self._solvers[name]
         self._beside: TissueSolver | None = None
         self.difference: Difference | None = None
+
+    @property
+    def model(self) -> TissueModel:
+        """The tissue as it is now."""
+        return self._model
 
     @property
     def name(self) -> str:
@@ -91,27 +117,53 @@ class SwitchableTissue:
         """Of the solver in use, see `TissueSolver.contact_stiffness`."""
         return self._solver.contact_stiffness()
 
-    def prepare(self, name: str) -> TissueSolver:
-        """Make and compile a solver, so that a later switch to it takes no time.
+    def make(self, plan: Plan) -> Prepared:
+        """Make and compile what a plan needs and is not there yet; nothing changes by that.
+
+        It may be called in a thread of its own while another deforms the tissue.
+
+        Raises:
+            SolverError: no such solver, one compared with itself, or a model it cannot solve.
+        """
+        if plan.compared == plan.solver:
+            raise SolverError(f"{plan.solver} is in use already: compare with another solver")
+        model = plan.model() if plan.model else self._model
+        solvers: dict[str, TissueSolver] = {}
+        for name in filter(None, (plan.solver, plan.compared)):
+            made = self._solvers.get(name)
+            settings = plan.settings.get(name)
+            if made is None or made.model is not model or settings not in (None, made.settings):
+                made = create_solver(name, model, settings)
+                made.warm_up()
+            solvers[name] = made
+        return Prepared(plan, model, solvers)
+
+    def adopt(self, prepared: Prepared) -> None:
+        """Go on with what was made, from where the tissue is."""
+        plan, state = prepared.plan, self._solver.state
+        if prepared.model is not self._model:
+            self._model, self._solvers = prepared.model, {}
+        self._solvers |= prepared.solvers
+        self._plan = replace(plan, model=None)
+        solver = prepared.solvers[plan.solver]
+        if solver is not self._solver:
+            solver.take_over(state)
+            self._solver = solver
+        beside = prepared.solvers.get(plan.compared)
+        if beside is not self._beside:
+            self.difference = None
+            if beside is not None:
+                beside.take_over(state)
+        self._beside = beside
+
+    def use(self, name: str) -> None:
+        """Switch to another solver; it goes on from where the tissue is.
 
         Raises:
             SolverError: no such solver, or it cannot solve this model.
         """
-        if name not in self._solvers:
-            solver = create_solver(name, self._model, **self._settings.get(name, {}))
-            solver.warm_up()
-            self._solvers[name] = solver
-        return self._solvers[name]
-
-    def use(self, name: str) -> None:
-        """Switch to another solver; it goes on from where the tissue is."""
-        if name == self.name:
-            return
-        solver = self.prepare(name)
-        if solver is self._beside:
-            self.compare_with("")
-        solver.take_over(self._solver.state)
-        self._solver = solver
+        compared = "" if name == self.compared else self.compared
+        self.adopt(self.make(replace(self._plan, solver=name, compared=compared)))
 
     def compare_with(self, name: str) -> None:
         """Run a second solver on the same poses from here on; '' ends it.
@@ -119,14 +171,7 @@ class SwitchableTissue:
         Raises:
             SolverError: it is the one in use.
         """
-        self.difference = None
-        if not name:
-            self._beside = None
-            return
-        if name == self.name:
-            raise SolverError(f"{name} is in use already: compare with another solver")
-        self._beside = self.prepare(name)
-        self._beside.take_over(self._solver.state)
+        self.adopt(self.make(replace(self._plan, compared=name)))
 
     def deform(self, pose: Pose | None) -> Deformation:
         """One frame of the solver in use, and of the one beside it."""

@@ -17,7 +17,8 @@ import math
 from dataclasses import dataclass
 
 from us_sim.errors import TrackingError
-from us_sim.settings.quantity import Quantity, given, require_given
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 
 __all__ = ["DICTIONARIES", "MARKER_SIZE", "CameraSettings"]
 
@@ -33,56 +34,56 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 
 @dataclass(frozen=True)
-class CameraSettings:
+class CameraSettings(Settings):
     """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``.
 
     Raises:
         TrackingError: a value is out of range, with its name and the range.
     """
 
-    body: str = given(
+    section = "camera"
+    error = TrackingError
+
+    body: str = setting(
         default="",
         file=True,
         description="file of the rigid body of markers; empty for one marker",
     )
-    marker: int = given(
+    marker: int = setting(
         Quantity("number", 0, 65535), default=0, description="number of the one marker"
     )
-    size: float = given(
-        MARKER_SIZE, default=0.04, description="m, edge of the one marker's black square"
+    size: float = setting(
+        MARKER_SIZE, default=0.04, description="edge of the one marker's black square"
     )
-    dictionary: str = given(
+    dictionary: str = setting(
         default="4X4_50",
         choices=DICTIONARIES,
         description="dictionary of the marker, or of a body's file that names none",
     )
-    minimum_markers: int = given(
+    minimum_markers: int = setting(
         Quantity("number", 1, 1000),
         default=1,
         description="markers that must be seen for a pose to be taken",
     )
-    reprojection_limit: float = given(
-        Quantity("number", 0.1, 50.0),
+    reprojection_limit: float = setting(
+        Quantity("image distance", 0.1, 50.0),
         default=2.0,
-        description="pixels, root mean square between the corners seen and those of the pose",
+        description="root mean square between the corners seen and those of the pose",
     )
-    view_angle_limit: float = given(
+    view_angle_limit: float = setting(
         Quantity("angle", 0.1, 1.5),
         default=math.radians(75.0),
-        description="rad, between a marker's normal and the line of sight, beyond which it is "
+        description="angle between a marker's normal and the line of sight, beyond which it is "
         "not used",
     )
-    corner_deviation: float = given(
-        Quantity("number", 0.01, 10.0),
+    corner_deviation: float = setting(
+        Quantity("image distance", 0.01, 10.0),
         default=0.1,
-        description="pixels, standard deviation of a corner, the least that the covariance of "
+        description="standard deviation of a corner, the least that the covariance of "
         "the pose is made with",
     )
-    latency: float = given(
+    latency: float = setting(
         Quantity("time", -1.0, 1.0),
         default=0.0,
-        description="s, from the middle of the exposure to the image's stamp",
+        description="time from the middle of the exposure to the image's stamp",
     )
-
-    def __post_init__(self) -> None:
-        require_given(self, "camera", TrackingError)

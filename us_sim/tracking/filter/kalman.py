@@ -1,10 +1,10 @@
 """A constant-velocity Kalman filter on SE(3): no lag behind a uniform motion.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.filter.settings import FilterSettings
+>>> from us_sim.tracking.filter.settings import KalmanSettings
 >>> from us_sim.tracking.filter.kalman import ConstantVelocityKalman
 >>> from us_sim.tracking.measurement import Measurement
->>> kalman = ConstantVelocityKalman(FilterSettings("kalman"))
+>>> kalman = ConstantVelocityKalman(KalmanSettings())
 >>> for k in range(100):  # 0.1 m/s
 ...     filtered = kalman.update(Measurement(k * 10_000_000, Pose([0.001 * k, 0.0, 0.0])))
 >>> round(1e6 * (filtered.pose.position[0] - 0.099).item())  # µm behind
@@ -29,7 +29,7 @@ from us_sim.geometry.se3 import (
     rotation_exp,
 )
 from us_sim.tracking.filter.pose_filter import PoseFilter
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.tracking.filter.settings import KalmanSettings
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["ConstantVelocityKalman"]
@@ -56,7 +56,9 @@ class ConstantVelocityKalman(PoseFilter):
     A filtered measurement carries the estimate's covariance.
     """
 
-    def __init__(self, settings: FilterSettings) -> None:
+    Settings = KalmanSettings
+
+    def __init__(self, settings: KalmanSettings) -> None:
         self._settings = settings
         variances = [settings.position_deviation**2] * 3 + [settings.rotation_deviation**2] * 3
         self._usual_noise = np.diag(variances)

@@ -1,10 +1,10 @@
 """The One-Euro filter on SE(3): steady where the probe rests, quick where it moves.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.filter.settings import FilterSettings
+>>> from us_sim.tracking.filter.settings import OneEuroSettings
 >>> from us_sim.tracking.measurement import Measurement
 >>> from us_sim.tracking.filter.one_euro import OneEuro
->>> still = OneEuro(FilterSettings("one_euro", minimum_cutoff=1.0, speed_coefficient=0.0))
+>>> still = OneEuro(OneEuroSettings(minimum_cutoff=1.0, speed_coefficient=0.0))
 >>> for k in range(3):
 ...     filtered = still.update(Measurement(k * 10_000_000, Pose([0.001 * (k == 1), 0.0, 0.0])))
 >>> round(1e6 * filtered.pose.position[0].item())  # µm, of a spike of 1 mm a moment ago
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import product, rotation_between, rotation_exp
 from us_sim.tracking.filter.pose_filter import PoseFilter
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.tracking.filter.settings import OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["OneEuro"]
@@ -42,7 +42,9 @@ class OneEuro(PoseFilter):
     know how far it is behind: it stays the measurement's.
     """
 
-    def __init__(self, settings: FilterSettings) -> None:
+    Settings = OneEuroSettings
+
+    def __init__(self, settings: OneEuroSettings) -> None:
         self._settings = settings
         self.reset()
 

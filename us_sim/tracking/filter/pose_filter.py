@@ -1,10 +1,7 @@
-"""Filters of poses: what each of them does, and the one that a scene asks for.
+"""Filters of poses: what each of them does.
 
->>> from us_sim.tracking.filter.settings import FilterSettings
->>> from us_sim.tracking.filter.pose_filter import make_filter
->>> round(1e3 * make_filter(FilterSettings("one_euro", minimum_cutoff=2.0)).lag)  # ms, at rest
-80
->>> make_filter(FilterSettings("kalman")).lag
+>>> from us_sim.tracking.filter.pose_filter import Unfiltered
+>>> Unfiltered().lag
 0.0
 """
 
@@ -12,10 +9,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.settings.registry import FILTERS
+from us_sim.settings.setting import Settings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["PoseFilter", "Unfiltered", "make_filter"]
+__all__ = ["PoseFilter", "Unfiltered", "create_filter"]
 
 
 class PoseFilter(ABC):
@@ -53,6 +51,9 @@ class Unfiltered(PoseFilter):
     lag = 0.0
     rotation_lag = 0.0
 
+    def __init__(self, settings: Settings | None = None) -> None:
+        """There is nothing to set."""
+
     def update(self, measurement: Measurement) -> Measurement:
         """The measurement itself."""
         return measurement
@@ -65,14 +66,12 @@ class Unfiltered(PoseFilter):
         return 0.0
 
 
-def make_filter(settings: FilterSettings) -> PoseFilter:
-    """The filter that the settings name; what is not named is not imported."""
-    if settings.method == "one_euro":
-        from us_sim.tracking.filter.one_euro import OneEuro
+def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
+    """The filter of that name, with its settings; what is not named is not imported.
 
-        return OneEuro(settings)
-    if settings.method == "kalman":
-        from us_sim.tracking.filter.kalman import ConstantVelocityKalman
-
-        return ConstantVelocityKalman(settings)
-    return Unfiltered()
+    Raises:
+        TrackingError: there is no filter of that name.
+    """
+    filter_class = FILTERS.load(name)
+    made: PoseFilter = filter_class(settings or FILTERS.settings(name)())
+    return made

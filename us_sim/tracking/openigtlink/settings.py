@@ -14,7 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from us_sim.errors import TrackingError
-from us_sim.settings.quantity import Quantity, given, require_given
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 
 __all__ = ["CLOCKS", "WORLDS", "OpenIGTLinkSettings"]
 
@@ -23,7 +24,7 @@ CLOCKS = ("server", "arrival")
 
 
 @dataclass(frozen=True)
-class OpenIGTLinkSettings:
+class OpenIGTLinkSettings(Settings):
     """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
 
     Which of the server's devices is the probe is the scene's ``tracker.body``.
@@ -32,29 +33,34 @@ class OpenIGTLinkSettings:
         TrackingError: a value is out of range.
     """
 
-    host: str = given(default="localhost", description="name or address of the server")
-    port: int = given(Quantity("number", 1, 65535), default=18944, description="TCP port")
-    world: str = given(
+    section = "openigtlink"
+    error = TrackingError
+
+    host: str = setting(default="localhost", description="name or address of the server")
+    port: int = setting(Quantity("number", 1, 65535), default=18944, description="TCP port")
+    world: str = setting(
         default="tracker",
         choices=WORLDS,
         description="what the poses are in: the tracker's own frame, or an image's LPS or RAS; "
         "RAS, which 3D Slicer sends, is turned into LPS, in which volumes are read",
     )
-    clock: str = given(
+    clock: str = setting(
         default="server",
         choices=CLOCKS,
         description="server: the messages' own stamps; arrival: when they come, for a server "
         "whose clock is not this computer's",
     )
-    tracking_data: bool = given(
+    tracking_data: bool = setting(
         default=False,
         description="ask for TDATA, for servers that send nothing unasked",
     )
-    interval: float = given(
-        Quantity("time", 1e-3, 10.0), default=0.01, description="s between two TDATA, if asked for"
+    interval: float = setting(
+        Quantity("time", 1e-3, 10.0),
+        default=0.01,
+        description="time between two TDATA, if asked for",
     )
 
-    def __post_init__(self) -> None:
-        require_given(self, "openigtlink", TrackingError)
+    def check(self) -> None:
+        """A server has a name."""
         if not self.host.strip():
-            raise TrackingError("openigtlink.host: is empty: name the server, or localhost")
+            raise self.refused("host", "is empty: name the server, or localhost")

@@ -1,0 +1,337 @@
+"""What can be set of each node: its parameters, with unit, range and meaning, without any ROS.
+
+A node declares them with `us_sim.nodes.parameters`; `us-sim` checks ``--param`` with them before
+anything is started; the tables of `docs/reference.md` are made from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import yaml
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.scene.building import probe_of
+from us_sim.scene.scene import Scene
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.registry import SOLVERS, TRACKERS
+from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
+from us_sim.settings.spelling import unknown
+from us_sim.slicing.formation.imaging import Imaging
+
+__all__ = [
+    "NODES",
+    "AwaitedSettings",
+    "CameraDriverSettings",
+    "ImageWriterSettings",
+    "OpenIGTLinkBridgeSettings",
+    "PathPlayerSettings",
+    "PoseAgeSettings",
+    "ProbeTrackerSettings",
+    "SceneNodeSettings",
+    "SessionPlayerSettings",
+    "SessionRecorderSettings",
+    "SkinDeformerSettings",
+    "SpaceMouseDriverSettings",
+    "StructureMarkersSettings",
+    "TissueDeformerSettings",
+    "checked_parameters",
+    "is_live",
+    "parameters_of",
+]
+
+_SPEED = Quantity("number", 0.01, 100.0)
+_MARKERS = Quantity("frequency", 0.1, 1000.0)
+_AGE = Quantity("time", 0.01, 3600.0)
+
+
+@dataclass(frozen=True)
+class SceneNodeSettings(Settings):
+    """Of every node that works on a scene."""
+
+    scene: str = setting(description="scene file, or name of an installed one", default="upper_arm")
+    volume: str | None = setting(
+        description="volume file in place of the scene's", default=None, file=True
+    )
+    lockstep: bool = setting(
+        description="work on every message, in order, instead of the newest", default=False
+    )
+    threads: int = setting(Quantity("number", 1, 256), "for the numerical work", default=1)
+
+
+@dataclass(frozen=True)
+class ProbeTrackerSettings(Settings):
+    """Of ``probe_tracker``."""
+
+    source: str | None = setting(
+        description="replaces tracker.source of the scene", choice=TRACKERS, default=None
+    )
+
+
+@dataclass(frozen=True)
+class TissueDeformerSettings(Settings):
+    """Of ``tissue_deformer``, beside those of the solvers and of the materials."""
+
+    live = True
+
+    solver: str = setting(
+        description="method that deforms the tissue", choice=SOLVERS, default="fem"
+    )
+    compare_with: str | None = setting(
+        description="another method, which runs on the same poses beside it",
+        choice=SOLVERS,
+        default=None,
+    )
+
+    def check(self) -> None:
+        """Two different methods."""
+        if self.compare_with == self.solver:
+            raise self.refused(
+                "compare_with", f"{self.solver} is in use already: compare with another solver"
+            )
+
+
+@dataclass(frozen=True)
+class StructureMarkersSettings(Settings):
+    """Of ``tissue_deformer`` where the scene has structures."""
+
+    marker_rate: float = setting(
+        _MARKERS, "markers of the structures are sent at most", default=20.0, live=True
+    )
+    structure_triangles: int = setting(
+        Quantity("number", 100, 10_000_000),
+        "about so many for all structures around labels together",
+        default=40_000,
+    )
+
+
+@dataclass(frozen=True)
+class SkinDeformerSettings(Settings):
+    """Of ``skin_deformer``."""
+
+    marker_rate: float = setting(_MARKERS, "markers are sent at most", default=20.0, live=True)
+
+
+@dataclass(frozen=True)
+class PoseAgeSettings(Settings):
+    """Of ``slice_interpolator``: when an image's pose is old."""
+
+    live = True
+
+    stale_after: float = setting(
+        _AGE, "without a new pose before the image is marked stale", default=0.5
+    )
+    lost_after: float = setting(
+        _AGE, "without a new pose before the probe counts as lost", default=2.0
+    )
+
+
+@dataclass(frozen=True)
+class AwaitedSettings(Settings):
+    """Of nodes that play: when they begin."""
+
+    await_topics: tuple[str, ...] = setting(
+        description="begin when each of these has a publisher", default=()
+    )
+    await_subscriber: str | None = setting(
+        description="and this node subscribes to each", default=None
+    )
+
+
+@dataclass(frozen=True)
+class PathPlayerSettings(Settings):
+    """Of ``path_player``."""
+
+    path: str | None = setting(
+        description="bag or tracker recording to play", default=None, file=True
+    )
+    topic: str | None = setting(
+        description="in the bag; not given: the only one of PoseStamped", default=None
+    )
+    rate: float = setting(_SPEED, "speed factor", default=1.0)
+    loop: bool = setting(description="start again at the end", default=False)
+    restamp: bool = setting(
+        description="stamp poses when they are sent, else as recorded", default=True
+    )
+    lockstep: bool = setting(
+        description="send the next pose when the image of the last has come", default=False
+    )
+
+
+@dataclass(frozen=True)
+class SessionPlayerSettings(Settings):
+    """Of ``session_player``."""
+
+    path: str | None = setting(description="bag to play", default=None, file=True)
+    rate: float = setting(_SPEED, "speed factor", default=1.0)
+    loop: bool = setting(description="start again at the end", default=False)
+
+
+@dataclass(frozen=True)
+class SessionRecorderSettings(Settings):
+    """Of ``session_recorder``."""
+
+    file: str = setting(description="MCAP file to write", default="session.mcap")
+    compression: str = setting(
+        description="of the file's chunks", choices=("none", "zstd"), default="none"
+    )
+    topics: tuple[str, ...] = setting(description="full names; none: all", default=())
+    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+
+
+@dataclass(frozen=True)
+class ImageWriterSettings(Settings):
+    """Of ``image_writer``."""
+
+    folder: str = setting(description="where the PNG files go", default="images")
+
+
+@dataclass(frozen=True)
+class CameraDriverSettings(Settings):
+    """Of ``camera_driver``."""
+
+    source: str = setting(
+        description="camera's number, a stream's address or a video file", default="0"
+    )
+    camera_info: str | None = setting(
+        description="file of `us-sim calibrate camera`", default=None, file=True
+    )
+    frame_id: str = setting(description="frame of the images", default="camera_optical")
+    encoding: str = setting(description="of the images", choices=("mono8", "bgr8"), default="mono8")
+    rate: float = setting(
+        Quantity("frequency", 0.0, 1e3),
+        "images, asked of a camera, or in place of a file's own; 0: as it is",
+        default=0.0,
+    )
+    loop: bool = setting(description="start a file again at its end", default=False)
+    latency: float = setting(
+        Quantity("time", -1.0, 10.0),
+        "from the middle of the exposure to the image's arrival",
+        default=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class SpaceMouseDriverSettings(Settings):
+    """Of ``space_mouse_driver``."""
+
+    frame_id: str = setting(description="frame of the messages", default="spacenav")
+    rate: float = setting(
+        Quantity("frequency", 1.0, 1000.0), "messages while nothing changes", default=100.0
+    )
+
+
+@dataclass(frozen=True)
+class OpenIGTLinkBridgeSettings(Settings):
+    """Of ``openigtlink_bridge``."""
+
+    host: str | None = setting(
+        description="address to listen at; none: all of this computer", default="localhost"
+    )
+    port: int = setting(
+        Quantity("number", 0, 65535), "TCP port; 0 is any that is free", default=18944
+    )
+    reference: str = setting(
+        description="frame that images lie in: the volume file's own, or patient",
+        choices=("volume", "patient"),
+        default="volume",
+    )
+    world: str = setting(
+        description="axes: ras as 3D Slicer has them, or lps", choices=("ras", "lps"), default="ras"
+    )
+
+
+NODES: dict[str, tuple[type[Settings], ...]] = {
+    "probe_tracker": (SceneNodeSettings, ProbeTrackerSettings),
+    "tissue_deformer": (SceneNodeSettings, TissueDeformerSettings, StructureMarkersSettings),
+    "skin_deformer": (SceneNodeSettings, SkinDeformerSettings),
+    "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, Imaging),
+    "haptic_renderer": (SceneNodeSettings,),
+    "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
+    "path_player": (PathPlayerSettings, AwaitedSettings),
+    "session_player": (SessionPlayerSettings,),
+    "session_recorder": (SessionRecorderSettings,),
+    "camera_driver": (CameraDriverSettings, AwaitedSettings),
+    "space_mouse_driver": (SpaceMouseDriverSettings,),
+    "image_writer": (ImageWriterSettings,),
+}
+"""The settings whose fields are a node's parameters; those of parts of a scene come on top."""
+
+_ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")
+"""Parameters that rclpy itself declares, or prefixes of them."""
+
+
+def is_live(settings: type[Settings], name: str) -> bool:
+    """Whether a setting may change while the node runs."""
+    return settings.live or rules_of(settings)[name].live
+
+
+def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, type[Settings]]]:
+    """The settings that are parameters of a node, each with what goes before their names.
+
+    Args:
+        node: its name.
+        scene: it works on; its probe and materials have parameters too.
+    """
+    for settings in NODES[node]:
+        yield "", settings
+    if scene is None:
+        return
+    if node == "slice_interpolator":
+        yield "", type(probe_of(scene))
+    if node == "tissue_deformer" and scene.tissue is not None:
+        for solver in SOLVERS.names:
+            yield f"{solver}.", SOLVERS.settings(solver)
+        for label, material in scene.tissue.materials.items():
+            yield f"materials.{label}.", type(material)
+
+
+def checked_parameters(node: str, scene: Scene, given: Mapping[str, str]) -> dict[str, object]:
+    """Values of a node's parameters from what a person wrote, in SI units.
+
+    Args:
+        node: its name.
+        scene: it works on.
+        given: YAML texts by name.
+
+    Raises:
+        UsSimError: there is no such parameter, or its value will not do.
+    """
+    if not given:
+        return {}
+    known: dict[str, tuple[type[Settings], str]] = {}
+    for prefix, settings in parameters_of(node, scene):
+        of_probe = settings not in NODES[node] and not prefix
+        for name in rules_of(settings):
+            if not of_probe or is_live(settings, name):
+                known.setdefault(prefix + name, (settings, name))
+    return {
+        name: value if known.get(name) is None else _checked(node, name, value, *known[name])
+        for name, value in ((n, _plain(node, n, t, known)) for n, t in given.items())
+    }
+
+
+def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
+    """A YAML text's value, of a parameter that there is."""
+    if name not in known and not name.startswith(_ROS_OWN):
+        raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UsSimError(f"--param {node}.{name}={text}: is not YAML") from error
+
+
+def _checked(node: str, name: str, value: object, settings: type[Settings], field: str) -> object:
+    rule, kind = rules_of(settings)[field], kinds_of(settings)[field]
+    if kind is str and isinstance(value, int | float):
+        value = str(value)  # a camera's number, say
+    nothing = {int: 0, float: 0.0}
+    if type(None) in get_args(kind) and value in (None, 0, ""):
+        return next(nothing.get(each, "") for each in get_args(kind))
+    try:
+        made = convert(kind, value, rule)
+    except (Refusal, SettingsError) as refusal:
+        raise UsSimError(f"--param {node}.{name}: {refusal}") from refusal
+    return list(made) if isinstance(made, tuple) else made

@@ -1,0 +1,164 @@
+"""Choices by name: solvers, slicers, probes, and what else there are several of.
+
+A choice knows each option's class by where it is, so that only what is chosen is imported. An
+installed package adds options of its own under the choice's entry point group.
+
+>>> from us_sim.settings.choice import Choice
+>>> fractions = Choice("number", key="kind", fraction="fractions:Fraction")
+>>> fractions.load("fraction")(1, 2)
+Fraction(1, 2)
+>>> fractions.load("fractoin")
+Traceback (most recent call last):
+...
+us_sim.errors.SettingsError: number 'fractoin' is not one of fraction; did you mean 'fraction'?
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.settings.spelling import unknown
+
+if TYPE_CHECKING:
+    from us_sim.settings.setting import Settings
+
+__all__ = ["Choice", "Chosen", "Option"]
+
+
+@dataclass(frozen=True)
+class Option:
+    """Where one option is, as ``module:name``."""
+
+    target: str  # its class
+    settings: str | None = None  # its settings; not given, its class's attribute ``Settings``
+    package: str | None = None  # the installed package that adds it; None for this one
+
+    def load(self) -> Any:
+        """Import the class.
+
+        Raises:
+            SettingsError: a package that adds it cannot be imported.
+        """
+        return self._imported(self.target)
+
+    def load_settings(self) -> type[Settings]:
+        """Import the settings."""
+        from us_sim.settings.setting import Settings
+
+        if self.settings is not None:
+            found: type[Settings] = self._imported(self.settings)
+            return found
+        target = self.load()
+        if isinstance(target, type) and issubclass(target, Settings):
+            return target
+        own = getattr(target, "Settings", Settings)
+        if not (isinstance(own, type) and issubclass(own, Settings)):
+            raise SettingsError(f"{self.target}: its `Settings` is no us_sim settings class")
+        return own
+
+    def _imported(self, target: str) -> Any:
+        module, _, name = target.partition(":")
+        if self.package is None:
+            return getattr(importlib.import_module(module), name)
+        try:
+            return getattr(importlib.import_module(module), name)
+        except Exception as error:  # whatever another's package raises while it is imported
+            raise SettingsError(
+                f"{target}, which the package {self.package} adds, cannot be imported: {error}"
+            ) from error
+
+
+class Choice:
+    """The options of one kind.
+
+    Args:
+        what: they are, for a person: ``tissue solver``.
+        key: under which a file names the one it wants.
+        group: entry points under which other packages add theirs; they may not replace ours.
+        error: raised for a name that there is not.
+        needs: whether options have settings without which they cannot be.
+        options: by name, where each is.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        key: str,
+        group: str | None = None,
+        error: type[UsSimError] = SettingsError,
+        needs: bool = False,
+        **options: str | Option,
+    ) -> None:
+        self.what, self.key, self.group, self.needs = what, key, group, needs
+        self._error = error
+        self._own = {
+            name: option if isinstance(option, Option) else Option(option)
+            for name, option in options.items()
+        }
+
+    @cached_property
+    def options(self) -> dict[str, Option]:
+        """All options by name: this package's first, then those that others add."""
+        if self.group is None:
+            return self._own
+        added = {
+            point.name: Option(point.value, package=point.dist.name if point.dist else point.value)
+            for point in importlib.metadata.entry_points(group=self.group)
+        }
+        return self._own | {name: o for name, o in added.items() if name not in self._own}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be chosen."""
+        return tuple(self.options)
+
+    def option(self, name: str) -> Option:
+        """Where the option of that name is.
+
+        Raises:
+            SettingsError: or the choice's own error: there is none; the sentence says which are.
+        """
+        if name not in self.options:
+            raise self._error(f"{self.what} {unknown(name, self.names)}")
+        return self.options[name]
+
+    def load(self, name: str) -> Any:
+        """The class of that name, imported now.
+
+        Raises:
+            SettingsError: see `option`.
+        """
+        return self.option(name).load()
+
+    def settings(self, name: str) -> type[Settings]:
+        """The settings class of that name, imported now.
+
+        Raises:
+            SettingsError: see `option`.
+        """
+        return self.option(name).load_settings()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __repr__(self) -> str:
+        return f"Choice({self.what!r}: {', '.join(self.names)})"
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A name that was chosen, with the settings that were given for it, if any were."""
+
+    name: str
+    given: Settings | None = None
+
+    def settings(self, choice: Choice) -> Any:
+        """The settings that were given, or those that it has by default."""
+        return self.given if self.given is not None else choice.settings(self.name)()

@@ -1,0 +1,228 @@
+"""From a mapping of keys, as a file holds it, to settings: every key and value checked.
+
+>>> from us_sim.settings.reading import Reader
+>>> from us_sim.slicing.formation.imaging import Imaging
+>>> Reader("my.yaml").read(Imaging, {"gain": "6 dB"}, "imaging").gain
+6.0
+>>> Reader("my.yaml").read(Imaging, {"gian": 6}, "imaging")
+Traceback (most recent call last):
+...
+us_sim.errors.SettingsError: my.yaml: imaging.gian: unknown key; did you mean `gain`?
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar, get_args, get_origin
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.settings.choice import Choice, Chosen
+from us_sim.settings.setting import Refusal, Rule, Settings, convert, kinds_of, rules_of
+from us_sim.settings.spelling import nearest, unknown
+
+__all__ = ["Reader"]
+
+S = TypeVar("S", bound=Settings)
+
+
+class Reader:
+    """Reads settings from one document.
+
+    Args:
+        origin: the document, for sentences: a file's path.
+        find_file: from the text of a setting that names a file, and that setting's path of keys,
+            to the text to keep; it raises ``error`` where there is no such file.
+        error: what is raised.
+    """
+
+    def __init__(
+        self,
+        origin: str,
+        find_file: Callable[[str, str], str] | None = None,
+        error: type[UsSimError] = SettingsError,
+    ) -> None:
+        self._origin = origin
+        self._find_file = find_file
+        self._error = error
+
+    def read(self, settings: type[S], document: object, path: str = "") -> S:
+        """An instance of ``settings`` from a mapping.
+
+        Args:
+            document: the mapping, as YAML or JSON gives it.
+            path: the keys that lead to it, with dots.
+
+        Raises:
+            SettingsError: or the reader's own error: a key is unknown or missing, or a value will
+                not do; one sentence with the document, the key and what would be right.
+        """
+        mapping = self._mapping(document, path)
+        rules, kinds = rules_of(settings), kinds_of(settings)
+        values: dict[str, Any] = {}
+        known = set(rules)
+        for name, rule in rules.items():
+            if rule.choice and rule.place != "within":
+                known -= {name}
+                taken, values[name] = self._chosen_here(settings, name, rule, mapping, path)
+                known |= taken
+        for key in mapping:
+            if key not in known:
+                raise self._unknown_key(key, known, path)
+        for name, rule in rules.items():
+            at = joined(path, name)
+            if name in mapping and name not in values:
+                values[name] = self._value(kinds[name], mapping[name], rule, at)
+            elif name not in values and _is_required(settings, name):
+                raise self._refused(at, "is missing")
+        return self._made(settings, values, mapping, path)
+
+    def _made(
+        self, settings: type[S], values: dict[str, Any], given: Iterable[str], path: str
+    ) -> S:
+        try:
+            made = settings(**values)
+        except UsSimError as error:
+            if not error.problem:
+                raise self._error(f"{self._origin}: {error}") from error
+            raise self._refused(joined(path, error.key), error.problem) from error
+        for name, rule in rules_of(settings).items():
+            if rule.applies and name in given:  # also where it is the default
+                other, values_of_other = rule.applies
+                chosen = getattr(made, other)
+                chosen = getattr(chosen, "name", chosen)
+                if chosen not in values_of_other:
+                    raise self._refused(
+                        joined(path, name),
+                        f"is for {other} {' or '.join(values_of_other)} only, not {chosen}",
+                    )
+        return made
+
+    def _value(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
+        try:
+            made = convert(kind, value, rule, lambda k, v, r: self._other(k, v, r, path))
+        except Refusal as refusal:
+            raise self._refused(f"{path}{refusal.key}", refusal.problem) from refusal
+        if isinstance(made, str):
+            if not made and kind is str and not rule.choices:
+                raise self._refused(path, "is empty: give a text, or leave the key out")
+            if rule.file and made and self._find_file is not None:
+                return self._find_file(made, path)
+        return made
+
+    def _other(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
+        """A mapping made what its type says: settings, what a choice names, or by any name."""
+        if kind is Chosen:
+            assert rule.choice is not None
+            return self._chosen(rule.choice, value, path)
+        if get_origin(kind) in (dict, Mapping):
+            mapping = self._mapping(value, path)
+            if rule.choice is not None:
+                return self._by_choice(rule.choice, mapping, path)
+            inner = get_args(kind)[1]
+            return {
+                str(key): self._value(inner, item, rule, joined(path, str(key)))
+                for key, item in mapping.items()
+            }
+        if isinstance(kind, type) and issubclass(kind, Settings):
+            return self.read(kind, value, path)
+        return value
+
+    def _chosen(self, choice: Choice, document: object, path: str) -> Chosen:
+        """What a mapping with the choice's key names, with the other keys as its settings."""
+        mapping = self._mapping(document, path)
+        if choice.key not in mapping:
+            raise self._refused(
+                joined(path, choice.key), f"is missing; it is one of {', '.join(choice.names)}"
+            )
+        name = self._name(choice, mapping[choice.key], joined(path, choice.key))
+        rest = {key: value for key, value in mapping.items() if key != choice.key}
+        return Chosen(name, self._settings_of(choice, name, rest, path))
+
+    def _chosen_here(
+        self, settings: type, field: str, rule: Rule, mapping: Mapping[Any, Any], path: str
+    ) -> tuple[set[str], Chosen]:
+        """What is chosen among the keys of other settings; the keys that are about it."""
+        choice = rule.choice
+        assert choice is not None
+        default = settings.__dataclass_fields__[field].default  # type: ignore[attr-defined]
+        name = default.name
+        if choice.key in mapping:
+            name = self._name(choice, mapping[choice.key], joined(path, choice.key))
+        if rule.place == "named":
+            for other in choice.names:
+                if other in mapping and other != name:
+                    raise self._refused(
+                        joined(path, other), f"is for {choice.key} {other} only, not {name}"
+                    )
+            own = mapping.get(name)
+            made = None if name not in mapping else self._settings(choice, name, own, path)
+            return {choice.key, name}, Chosen(name, made)
+        beside = set(rules_of(settings))
+        rest = {k: v for k, v in mapping.items() if k not in beside and k != choice.key}
+        return {choice.key, *rest}, Chosen(name, self._settings_of(choice, name, rest, path))
+
+    def _settings(self, choice: Choice, name: str, document: object, path: str) -> Settings:
+        return self.read(choice.settings(name), document, joined(path, name))
+
+    def _settings_of(
+        self, choice: Choice, name: str, mapping: dict[Any, Any], path: str
+    ) -> Settings | None:
+        """The settings of an option, whose keys say of which option they are."""
+        kind = f"{name} {choice.what}"
+        article = "an" if kind[0] in "aeiou" else "a"
+        if not (mapping or choice.needs):
+            return None  # so that its module need not be imported to say nothing of it
+        own = choice.settings(name)
+        rules = rules_of(own)
+        for key in mapping:
+            if key not in rules:
+                others = {k for other in choice.names for k in rules_of(choice.settings(other))}
+                if key not in others:
+                    raise self._unknown_key(key, {*rules, choice.key}, path)
+                has = f"it has {', '.join(rules)}" if rules else "it has no settings"
+                raise self._refused(joined(path, key), f"{article} {kind} has no {key}; {has}")
+        needed = [key for key in rules if _is_required(own, key)]
+        for key in needed:
+            if key not in mapping:
+                raise self._refused(
+                    joined(path, key), f"is missing; {article} {kind} needs {', '.join(needed)}"
+                )
+        return self.read(own, mapping, path)
+
+    def _by_choice(self, choice: Choice, mapping: Mapping[Any, Any], path: str) -> dict[str, Any]:
+        return {
+            self._name(choice, name, path): self._settings(choice, name, block, path)
+            for name, block in mapping.items()
+        }
+
+    def _name(self, choice: Choice, value: object, path: str) -> str:
+        if not isinstance(value, str) or value not in choice.names:
+            raise self._refused(path, unknown(value, choice.names))
+        return value
+
+    def _mapping(self, document: object, path: str) -> Mapping[Any, Any]:
+        if not isinstance(document, Mapping):
+            raise self._refused(path, f"must be a mapping of keys, not {document!r}")
+        return document
+
+    def _unknown_key(self, key: object, known: set[str], path: str) -> UsSimError:
+        like = nearest(key, known)
+        hint = f"did you mean `{like}`?" if like else f"known keys: {', '.join(sorted(known))}"
+        return self._refused(joined(path, str(key)), f"unknown key; {hint}")
+
+    def _refused(self, path: str, problem: str) -> UsSimError:
+        at = f"{path}: " if path else ""
+        error = self._error(f"{self._origin}: {at}{problem}")
+        error.key, error.problem = path, problem
+        return error
+
+
+def joined(path: str, key: str) -> str:
+    """A path of keys, one key longer."""
+    return f"{path}.{key}" if path and key else path or key
+
+
+def _is_required(settings: type, name: str) -> bool:
+    field = settings.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING

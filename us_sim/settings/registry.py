@@ -1,0 +1,91 @@
+"""What there is to choose from, by the names that scenes, parameters and reports use.
+
+One line an option: its name and where its class is. A class is imported when it is chosen, not
+before. Packages of others add solvers and trackers under the entry point groups named here.
+"""
+
+from us_sim.errors import ProbeError, SolverError, TrackingError, VolumeError
+from us_sim.settings.choice import Choice, Option
+
+__all__ = ["COLLIDERS", "FILTERS", "PHANTOMS", "PROBES", "SLICERS", "SOLVERS", "TRACKERS"]
+
+SOLVERS = Choice(
+    "tissue solver",
+    key="solver",
+    group="us_sim.solvers",
+    error=SolverError,
+    fem="us_sim.tissue.solvers.fem:Fem",
+    fem_nonlinear="us_sim.tissue.solvers.fem_nonlinear:FemNonlinear",
+    fem_cg="us_sim.tissue.solvers.fem_cg:FemCg",
+    msds="us_sim.tissue.solvers.msds:Msds",
+    msds_implicit="us_sim.tissue.solvers.msds_implicit:MsdsImplicit",
+)
+
+SLICERS = Choice(
+    "slicing method",
+    key="method",
+    scan_conversion="us_sim.slicing.cutting.scan_conversion:ScanConversion",
+    row_subdivision="us_sim.slicing.cutting.row_subdivision:RowSubdivision",
+    per_pixel="us_sim.slicing.cutting.per_pixel:PerPixel",
+)
+
+PHANTOMS = Choice(
+    "phantom", key="phantom", error=VolumeError, upper_arm="us_sim.volume.phantom:upper_arm"
+)
+
+PROBES = Choice(
+    "probe",
+    key="geometry",
+    error=ProbeError,
+    needs=True,
+    linear="us_sim.slicing.probe.probe:LinearProbe",
+    convex="us_sim.slicing.probe.fan_probe:ConvexProbe",
+    sector="us_sim.slicing.probe.fan_probe:SectorProbe",
+)
+
+COLLIDERS = Choice(
+    "collider",
+    key="shape",
+    error=ProbeError,
+    needs=True,
+    sphere="us_sim.geometry.collider:Sphere",
+    capsule="us_sim.geometry.collider:Capsule",
+    rounded_box="us_sim.geometry.collider:RoundedBox",
+    convex="us_sim.geometry.collider:Convex",
+)
+
+FILTERS = Choice(
+    "filter",
+    key="method",
+    error=TrackingError,
+    none="us_sim.tracking.filter.pose_filter:Unfiltered",
+    one_euro="us_sim.tracking.filter.one_euro:OneEuro",
+    kalman="us_sim.tracking.filter.kalman:ConstantVelocityKalman",
+)
+
+_NOTHING = "us_sim.settings.setting:Settings"
+_INPUTS = "us_sim.nodes.tracker_inputs"
+TRACKERS = Choice(
+    "tracker source",
+    key="source",
+    group="us_sim.trackers",
+    error=TrackingError,
+    pose=Option(f"{_INPUTS}.pose_input:PoseInput", _NOTHING),
+    pose_array=Option(f"{_INPUTS}.pose_array_input:PoseArrayInput", _NOTHING),
+    tf=Option(f"{_INPUTS}.tf_input:TfInput", _NOTHING),
+    camera=Option(
+        f"{_INPUTS}.camera_input:CameraInput", "us_sim.tracking.camera.settings:CameraSettings"
+    ),
+    six_dof_mouse=Option(
+        f"{_INPUTS}.six_dof_mouse_input:SixDofMouseInput",
+        "us_sim.tracking.mouse.settings:SixDofMouseSettings",
+    ),
+    haptic=Option(
+        f"{_INPUTS}.haptic_input:HapticInput", "us_sim.tracking.haptic.settings:HapticSettings"
+    ),
+    openigtlink=Option(
+        f"{_INPUTS}.openigtlink_input:OpenIGTLinkInput",
+        "us_sim.tracking.openigtlink.settings:OpenIGTLinkSettings",
+    ),
+    path=Option(f"{_INPUTS}.path_input:PathInput", _NOTHING),
+)

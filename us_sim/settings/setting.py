@@ -1,0 +1,252 @@
+"""A setting: a field of a frozen dataclass, with its unit, range and meaning said once.
+
+>>> from dataclasses import dataclass
+>>> from us_sim.settings.quantity import Quantity
+>>> from us_sim.settings.setting import Settings, setting
+>>> @dataclass(frozen=True)
+... class Tank(Settings):
+...     section = "tank"
+...     depth: float = setting(Quantity("length", 0.01, 2.0), "of the water")
+>>> Tank(depth="40 cm").depth
+0.4
+>>> Tank(depth=40)
+Traceback (most recent call last):
+...
+us_sim.errors.SettingsError: tank.depth: 40 m is outside 0.01 to 2 m; did you mean '40 cm'?
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, dataclass, field
+from types import UnionType
+from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.spelling import unknown
+
+if TYPE_CHECKING:
+    from us_sim.settings.choice import Choice
+
+__all__ = ["Rule", "Settings", "convert", "kinds_of", "rules_of", "setting"]
+
+NUMBER = Quantity("number")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What is said of a setting beside its name, type and default."""
+
+    quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
+    description: str = ""  # for a person, without the unit
+    choices: tuple[str, ...] = ()  # the only texts that will do
+    choice: Choice | None = None  # or the names that a registry has
+    place: str = "within"  # where the keys of what is chosen are, see `setting`
+    file: bool = False  # a text that names a file
+    live: bool = False  # may change while what it sets is running
+    applies: tuple[str, tuple[str, ...]] | None = None  # another setting, and its values
+
+
+def setting(
+    quantity: Quantity | None = None,
+    description: str = "",
+    *,
+    default: Any = MISSING,
+    default_factory: Any = MISSING,
+    kw_only: Any = MISSING,
+    choices: Sequence[str] = (),
+    choice: Choice | None = None,
+    place: str = "within",
+    file: bool = False,
+    live: bool = False,
+    applies: tuple[str, tuple[str, ...]] | None = None,
+) -> Any:
+    """A field of a `Settings` class.
+
+    Args:
+        quantity: unit and range of a number, or of each number in a list.
+        description: what it is, without its unit, which `quantity` says.
+        default, default_factory, kw_only: as for `dataclasses.field`.
+        choices: the only texts that will do.
+        choice: the registry that the value is a name in (type ``str``), or that it chooses from
+            (type `Chosen`), or whose names are its keys (type ``dict``).
+        place: where the keys of what is chosen stand. ``within`` the mapping under this field's
+            name, with the registry's key; ``beside`` the other fields; or ``named``: under a key
+            that is the chosen name, beside the other fields.
+        file: the text names a file, which must be there.
+        live: it may change while what it sets is running.
+        applies: the name of another field, and the values of that with which this one means
+            something.
+    """
+    rule = Rule(quantity, description, tuple(choices), choice, place, file, live, applies)
+    return field(
+        default=default, default_factory=default_factory, kw_only=kw_only, metadata={"rule": rule}
+    )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of the frozen dataclasses whose fields are settings.
+
+    Each value is made what its type and its rule say, or refused. A subclass whose settings must
+    go together says so in `check`.
+
+    Raises:
+        SettingsError: or what ``error`` names: a sentence with the section, the field, the value
+            and what would do.
+    """
+
+    section: ClassVar[str] = ""
+    """What these settings are of, for sentences: ``probe.collider``."""
+    error: ClassVar[type[UsSimError]] = SettingsError
+    """What is raised for a value that will not do."""
+    live: ClassVar[bool] = False
+    """Whether all of these settings may change while what they set is running."""
+
+    def __post_init__(self) -> None:
+        kinds = kinds_of(type(self))
+        for name, rule in rules_of(type(self)).items():
+            value = getattr(self, name)
+            if value is not _default(type(self), name):
+                try:
+                    value = convert(kinds[name], value, rule)
+                except Refusal as refusal:
+                    raise self.refused(f"{name}{refusal.key}", refusal.problem) from refusal
+                object.__setattr__(self, name, value)
+        for name, rule in rules_of(type(self)).items():
+            if rule.applies and getattr(self, name) != _default(type(self), name):
+                other, values = rule.applies
+                chosen = getattr(self, other)
+                chosen = getattr(chosen, "name", chosen)
+                if chosen not in values:
+                    raise self.refused(
+                        name, f"is for {other} {' or '.join(values)} only, not {chosen}"
+                    )
+        self.check()
+
+    def check(self) -> None:
+        """Refuse values that do not go together."""
+
+    def refused(self, key: str, problem: str) -> UsSimError:
+        """The error that says what is wrong with a setting of these."""
+        error = self.error(f"{self.section}.{key}: {problem}" if self.section else problem)
+        error.key, error.problem = key, problem
+        return error
+
+
+class Refusal(ValueError):
+    """A value will not do: the rest of the path of keys to it, and what is wrong."""
+
+    def __init__(self, problem: str, key: str = "") -> None:
+        super().__init__(problem)
+        self.key, self.problem = key, problem
+
+
+_rules: dict[type, dict[str, Rule]] = {}
+_kinds: dict[type, dict[str, Any]] = {}
+
+
+def rules_of(settings: type) -> dict[str, Rule]:
+    """The rules of a dataclass's settings by name, in order; other fields are left out."""
+    if settings not in _rules:
+        fields = dataclasses.fields(settings)
+        _rules[settings] = {f.name: f.metadata["rule"] for f in fields if "rule" in f.metadata}
+    return _rules[settings]
+
+
+def kinds_of(settings: type) -> dict[str, Any]:
+    """The types of a dataclass's settings by name."""
+    if settings not in _kinds:
+        hints = typing.get_type_hints(settings)
+        _kinds[settings] = {name: hints[name] for name in rules_of(settings)}
+    return _kinds[settings]
+
+
+def _default(settings: type, name: str) -> Any:
+    return settings.__dataclass_fields__[name].default  # type: ignore[attr-defined]
+
+
+Converter = Callable[[Any, Any, Rule], Any]
+"""Takes the type of a value, the value and the rule of its setting; makes the one of the other."""
+
+
+def convert(kind: Any, value: Any, rule: Rule, other: Converter | None = None) -> Any:
+    """The value as its type and rule say: numbers in SI units, lists as tuples.
+
+    Args:
+        kind: a type that a setting may have.
+        value: as written in a file, given as a parameter, or in Python.
+        rule: of the setting.
+        other: what makes values that are neither number, text, truth nor a list of them; without
+            it they are left as they are.
+
+    Raises:
+        Refusal: with the rest of the path of keys.
+    """
+    if get_origin(kind) in (Union, UnionType):
+        if value is None:
+            return None
+        options = [option for option in get_args(kind) if option is not type(None)]
+        kind = next((option for option in options if _suits(option, value)), options[0])
+    if kind in (int, float):
+        return _number(kind, value, rule)
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise Refusal(f"must be true or false, not {value!r}")
+        return value
+    if kind is str:
+        return _text(value, rule)
+    if get_origin(kind) is tuple:
+        return tuple(_items(get_args(kind), value, rule, other))
+    return value if other is None else other(kind, value, rule)
+
+
+def _number(kind: type, value: Any, rule: Rule) -> float | int:
+    try:
+        number = (rule.quantity or NUMBER).parse(value)
+    except ValueError as error:
+        raise Refusal(str(error)) from error
+    if kind is int and number != int(number):
+        raise Refusal(f"{value!r} is not a whole number")
+    return kind(number)  # type: ignore[no-any-return]
+
+
+def _text(value: Any, rule: Rule) -> str:
+    if not isinstance(value, str):
+        raise Refusal(f"must be a text, not {value!r}")
+    choices = rule.choice.names if rule.choice else rule.choices
+    if choices and value not in choices:
+        raise Refusal(unknown(value, choices))
+    return value
+
+
+def _items(
+    kinds: tuple[Any, ...], value: Any, rule: Rule, other: Converter | None
+) -> Iterator[Any]:
+    """The items of a list, each converted; of a fixed number where the type says so."""
+    if isinstance(value, str | dict) or not hasattr(value, "__iter__"):
+        raise Refusal(f"must be a list, not {value!r}")
+    items = list(value)
+    if kinds[-1] is Ellipsis:
+        kinds = kinds[:1] * len(items)
+    if len(items) != len(kinds):
+        raise Refusal(f"needs {len(kinds)} values, not {len(items)}")
+    for i, (kind, item) in enumerate(zip(kinds, items, strict=True)):
+        try:
+            yield convert(kind, item, rule, other)
+        except Refusal as refusal:
+            raise Refusal(refusal.problem, f"[{i}]{refusal.key}") from refusal
+
+
+def _suits(kind: Any, value: object) -> bool:
+    """Whether a value looks like one of that type, where several are possible."""
+    if isinstance(value, list | tuple):
+        return get_origin(kind) is tuple
+    if isinstance(value, dict):
+        return dataclasses.is_dataclass(kind)
+    if dataclasses.is_dataclass(kind):
+        return isinstance(value, kind)  # type: ignore[arg-type]
+    return kind is str if isinstance(value, str) else kind in (int, float)

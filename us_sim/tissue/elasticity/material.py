@@ -1,0 +1,38 @@
+"""The elastic constants of one kind of tissue.
+
+>>> from us_sim.tissue.elasticity.material import Material
+>>> Material(young_modulus="12 kPa", poisson_ratio=0.45).young_modulus
+12000.0
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from us_sim.errors import MaterialError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+__all__ = ["DENSITY", "POISSON_RATIO", "YOUNG_MODULUS", "Material"]
+
+YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
+POISSON_RATIO = Quantity("number", -0.99, 0.49999)
+"""Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""
+DENSITY = Quantity("density", 1e-3, 1e6)
+
+
+@dataclass(frozen=True)
+class Material(Settings):
+    """Isotropic elastic constants.
+
+    Raises:
+        MaterialError: a constant is out of its range.
+    """
+
+    section = "material"
+    error = MaterialError
+    live = True
+
+    young_modulus: float = setting(YOUNG_MODULUS, "Young's modulus")
+    poisson_ratio: float = setting(POISSON_RATIO, "Poisson's ratio", default=0.45)
+    density: float = setting(DENSITY, "mass per volume", default=1000.0)

@@ -1,0 +1,93 @@
+"""What a scene says of the mesh of its tissue."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+from us_sim.errors import MeshError
+from us_sim.geometry.placement import PLACE, Placement
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+__all__ = ["MeshSettings"]
+
+
+@dataclass(frozen=True)
+class MeshSettings(Settings):
+    """A box of tetrahedra in ``patient``, or a mesh from a file."""
+
+    section = "mesh"
+    error = MeshError
+
+    lower: tuple[float, float, float] | None = setting(
+        PLACE, "corner of the box with the least x, y, z", default=None
+    )
+    upper: tuple[float, float, float] | None = setting(
+        PLACE, "corner of the box with the largest x, y, z", default=None
+    )
+    nodes: tuple[int, int, int] = setting(
+        Quantity("number", 2, 400), "of the box along x, y, z", default=(20, 10, 10)
+    )
+    planes: dict[str, tuple[float, ...]] = setting(
+        PLACE,
+        "coordinates of the box's nodes along x, y or z one by one, to put them where they count",
+        default_factory=dict,
+    )
+    file: str | None = setting(
+        description="mesh in place of the box: Gmsh, VTK, or what else meshio reads",
+        default=None,
+        file=True,
+    )
+    unit: float = setting(
+        Quantity("length", 1e-9, 1e3), "length of a unit of the file", default=1.0
+    )
+    pose: Placement = setting(description="of the file's frame in `patient`", default=Placement())
+    margin: float | None = setting(
+        Quantity("length", 1e-6, 1.0),
+        "how near to a face of the file's bounding box a boundary node belongs to that face; not "
+        "given: a twentieth of the size along that axis",
+        default=None,
+    )
+
+    def check(self) -> None:
+        """A file, or a box whose corners and planes go together."""
+        box = {"lower": self.lower, "upper": self.upper, "planes": self.planes or None}
+        if self.file is not None:
+            for key, value in box.items():
+                if value is not None:
+                    raise self.refused("", f"has both `file` and `{key}`; keep one")
+            return
+        if self.lower is None or self.upper is None:
+            raise self.refused(
+                "lower" if self.lower is None else "upper",
+                "is missing; give the corners of a box, or a `file`",
+            )
+        if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
+            raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
+        for name in self.planes:
+            if name not in ("x", "y", "z"):
+                raise self.refused("planes", f"unknown axis `{name}`; axes are x, y and z")
+        for axis, name in enumerate("xyz"):
+            lower, upper = self.lower[axis], self.upper[axis]
+            if lower >= upper:
+                raise self.refused(
+                    f"upper[{axis}]",
+                    f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
+                )
+            if name in self.planes:
+                self._check_planes(name, self.planes[name], lower, upper, self.nodes[axis])
+
+    def _check_planes(
+        self, axis: str, planes: tuple[float, ...], lower: float, upper: float, count: int
+    ) -> None:
+        if len(planes) < 2 or any(b <= a for a, b in itertools.pairwise(planes)):
+            raise self.refused(f"planes.{axis}", "needs two or more rising coordinates")
+        ends = zip((planes[0], planes[-1]), (lower, upper), strict=True)
+        if len(planes) != count or not all(math.isclose(a, b, abs_tol=1e-9) for a, b in ends):
+            raise self.refused(
+                f"planes.{axis}",
+                f"must be {count} coordinates from {lower:g} to {upper:g} m, as nodes, lower and "
+                f"upper say",
+            )

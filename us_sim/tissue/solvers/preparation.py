@@ -1,0 +1,82 @@
+"""Making the next solver in a thread, while the present one goes on deforming the tissue."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+
+from us_sim.errors import UsSimError
+from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
+
+__all__ = ["Failed", "Preparation"]
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A plan that cannot be carried out, and why."""
+
+    plan: Plan
+    problem: str
+
+
+class Preparation:
+    """Makes what a plan needs in a thread; the newest plan wins.
+
+    Args:
+        tissue: that goes on meanwhile, and that adopts what was made.
+    """
+
+    def __init__(self, tissue: SwitchableTissue) -> None:
+        self._tissue = tissue
+        self._lock = threading.Lock()
+        self._wanted: Plan | None = None
+        self._outcome: Prepared | Failed | None = None
+        self._thread: threading.Thread | None = None
+        self._began = 0.0
+
+    @property
+    def state(self) -> str:
+        """What is being made, and for how long already; '' when nothing is."""
+        with self._lock:
+            busy = self._thread is not None
+            seconds = time.monotonic() - self._began
+        return f"preparing for {seconds:.0f} s" if busy else ""
+
+    def want(self, plan: Plan) -> None:
+        """Begin to make what a plan needs; what is being made for another is given up after."""
+        with self._lock:
+            self._wanted = plan
+            self._outcome = None
+            if self._thread is None:
+                self._began = time.monotonic()
+                self._thread = threading.Thread(target=self._work, name="solver", daemon=True)
+                self._thread.start()
+
+    def take(self) -> Prepared | Failed | None:
+        """What has come of the newest plan, once; None as long as nothing has."""
+        with self._lock:
+            outcome, self._outcome = self._outcome, None
+            return outcome
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                plan, self._wanted = self._wanted, None
+                if plan is None:
+                    self._thread = None
+                    return
+            outcome: Prepared | Failed
+            try:
+                outcome = self._tissue.make(plan)
+            except UsSimError as error:
+                outcome = Failed(plan, str(error))
+            except Exception as error:  # lest the thread end without a word
+                _logger.exception("preparing %s", plan.solver)
+                outcome = Failed(plan, f"{type(error).__name__}: {error}")
+            with self._lock:
+                if self._wanted is None:
+                    self._outcome = outcome
