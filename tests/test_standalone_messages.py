@@ -332,11 +332,9 @@ def test_services():
         trigger()
     assert service_names("rcl_interfaces") == [
         "DescribeParameters",
-        "GetLoggerLevels",
         "GetParameterTypes",
         "GetParameters",
         "ListParameters",
-        "SetLoggerLevels",
         "SetParameters",
         "SetParametersAtomically",
     ]

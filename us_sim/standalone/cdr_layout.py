@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.standalone.field_setters import ARRAY_TYPES
-from us_sim.standalone.interfaces import Field, interface
+from .field_setters import ARRAY_TYPES
+from .interfaces import Field, interface
 
 __all__ = ["FORMATS", "CdrLayout"]
 

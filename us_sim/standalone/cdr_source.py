@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.standalone.cdr_layout import FORMATS, CdrLayout
-from us_sim.standalone.field_setters import ARRAY_TYPES
-from us_sim.standalone.interfaces import Field, interface
-from us_sim.standalone.message_class import Message, message_class
+from .cdr_layout import FORMATS, CdrLayout
+from .field_setters import ARRAY_TYPES
+from .interfaces import Field, interface
+from .message_class import Message, message_class
 
 __all__ = ["compiled_reader", "compiled_writer", "writer_source"]
 

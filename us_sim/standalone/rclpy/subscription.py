@@ -3,16 +3,17 @@
 import inspect
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Any
 
+from ._endpoints import Inbox, NodeLink, Receiver, message_of, open_reader
 from .callback_groups import CallbackGroup
-from .event_handler import SubscriptionEventCallbacks
 from .qos import QoSProfile
 
 __all__ = ["Subscription"]
 
 
-class Subscription:
+class Subscription(Receiver):
     """Calls back with each message that is received on one topic."""
 
     class CallbackType(Enum):
@@ -23,44 +24,41 @@ class Subscription:
 
     def __init__(
         self,
-        subscription_impl: Any,
+        link: NodeLink,
         msg_type: Any,
         topic: str,
+        full_name: str,
         callback: Callable[..., Any],
         callback_group: CallbackGroup,
         qos_profile: QoSProfile,
         raw: bool,
-        event_callbacks: SubscriptionEventCallbacks,
     ) -> None:
-        self._subscription = subscription_impl
+        self.callback = callback
+        self._reader = open_reader(link, msg_type, topic, full_name, qos_profile)
+        self._inbox = Inbox(self._reader.take, link.wake)
+        self._reader.on_data = self._inbox.notify
+        self._full_name = full_name
+        self._gids: tuple[list[bytes], list[bytes]] = [self._reader.gid], []
         self.msg_type = msg_type
         self.topic = topic
-        self.callback = callback
         self.callback_group = callback_group
-        self._executor_event = False
         self.qos_profile = qos_profile
         self.raw = raw
-        self.event_handlers = event_callbacks.create_event_handlers(
-            callback_group, subscription_impl, topic
-        )
 
     def get_publisher_count(self) -> int:
         """How many publishers are connected."""
-        return self._subscription.get_publisher_count()
-
-    @property
-    def handle(self) -> Any:
-        return self._subscription
+        self._require_existence()
+        return self._reader.matched_count()
 
     def destroy(self) -> None:
         """Leave the topic; use `Node.destroy_subscription`."""
-        for handler in self.event_handlers:
-            handler.destroy()
-        self._subscription.destroy()
+        super().destroy()
+        self._reader.close()
 
     @property
     def topic_name(self) -> str:
-        return self._subscription.get_topic_name()
+        self._require_existence()
+        return self._full_name
 
     @property
     def callback(self) -> Callable[..., Any]:
@@ -83,3 +81,21 @@ class Subscription:
             "Subscription.__init__(): callback should be either be callable with one argument"
             "(to get only the message) or two (to get message and message info)"
         )
+
+    def _take(self) -> Callable[[], Any] | None:
+        """The call to be made for the oldest message that is waiting."""
+        self._require_existence()
+        taken = self._inbox.take()
+        if taken is None:
+            return None
+        data, sample = taken
+        message = data if self.raw else message_of(data, self.msg_type)
+        if self._callback_type is Subscription.CallbackType.MessageOnly:
+            return partial(self.callback, message)
+        info = {
+            "source_timestamp": sample.source_timestamp,
+            "received_timestamp": sample.received_timestamp,
+            "publication_sequence_number": None,
+            "reception_sequence_number": None,
+        }
+        return partial(self.callback, message, info)
