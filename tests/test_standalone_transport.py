@@ -208,12 +208,13 @@ def test_keep_last_keeps_the_newest(participant):
 
 def test_incompatible_quality_of_service_is_reported_to_both(participant, neighbour, bell):
     told = []
-    writer = participant.create_writer(
-        "rt/quality", STRING, BEST_EFFORT, "", lambda policy: told.append(("writer", policy))
-    )
-    reader = neighbour.create_reader(
-        "rt/quality", STRING, RELIABLE, "", lambda policy: told.append(("reader", policy))
-    )
+
+    def teller(side):
+        return lambda policy: told.append((side, policy))
+
+    topic = ("rt/quality", STRING)
+    writer = participant.create_writer(*topic, BEST_EFFORT, on_incompatible=teller("writer"))
+    reader = neighbour.create_reader(*topic, RELIABLE, on_incompatible=teller("reader"))
     bell.wait_until(lambda: len(told) == 2)
     assert set(told) == {("writer", "RELIABILITY"), ("reader", "RELIABILITY")}
     assert writer.matched_count() == reader.matched_count() == 0

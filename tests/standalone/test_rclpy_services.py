@@ -107,7 +107,7 @@ def test_a_request_of_another_middleware_is_not_answered_and_does_no_harm(bench,
     bench.node("server").create_service(SetBool, "switch", answer)
     client = bench.node("client").create_client(SetBool, "switch")
     assert ready(bench, client)
-    client._client.send_request(b"\0\1\0\0")
+    client._endpoint.send_request(b"\0\1\0\0")
     assert bench.result(client.call_async(SetBool.Request(data=True))).success
     assert "a request for /switch is not answered" in capfd.readouterr().err
 

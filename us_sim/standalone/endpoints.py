@@ -78,6 +78,7 @@ class Endpoint:
         self._in_use = threading.Lock()
         self.qos = qos
         self.gid = guid_of(handle)  # 16 bytes
+        self.gids = ([self.gid], []) if isinstance(self, Reader) else ([], [self.gid])
         self._on_incompatible = on_incompatible
         self._mask = self._incompatible[0] | _DATA_AVAILABLE * isinstance(self, Reader)
         self._token = dispatcher.attach(handle, self._mask, self._status_changed)

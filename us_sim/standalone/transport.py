@@ -98,8 +98,8 @@ class Participant:
         dds_type: str,
         qos: Any,
         user_data: str = "",
-        on_incompatible: Callable[[str], None] | None = None,
         ignore_own: bool = False,
+        on_incompatible: Callable[[str], None] | None = None,
     ) -> Reader:
         """A reader on a topic; arguments as for `create_writer`.
 

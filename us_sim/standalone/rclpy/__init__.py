@@ -4,6 +4,9 @@
 Names, arguments, defaults and errors are those of rclpy 7.1 (Jazzy).
 """
 
+import inspect
+from typing import Any
+
 from .context import Context
 from .executors import Executor, SingleThreadedExecutor
 from .node import Node
@@ -89,34 +92,12 @@ def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None 
         uninstall_signal_handlers()
 
 
-def create_node(
-    node_name: str,
-    *,
-    context: Context | None = None,
-    cli_args: list[str] | None = None,
-    namespace: str | None = None,
-    use_global_arguments: bool = True,
-    enable_rosout: bool = True,
-    start_parameter_services: bool = True,
-    parameter_overrides: list[Parameter] | None = None,
-    allow_undeclared_parameters: bool = False,
-    automatically_declare_parameters_from_overrides: bool = False,
-) -> Node:
+def create_node(node_name: str, **arguments: Any) -> Node:
     """Make a node; the arguments are those of `rclpy.node.Node`."""
-    return Node(
-        node_name,
-        context=context,
-        cli_args=cli_args,
-        namespace=namespace,
-        use_global_arguments=use_global_arguments,
-        enable_rosout=enable_rosout,
-        start_parameter_services=start_parameter_services,
-        parameter_overrides=parameter_overrides,
-        allow_undeclared_parameters=allow_undeclared_parameters,
-        automatically_declare_parameters_from_overrides=(
-            automatically_declare_parameters_from_overrides
-        ),
-    )
+    return Node(node_name, **arguments)
+
+
+create_node.__signature__ = inspect.signature(Node)  # type: ignore[attr-defined]
 
 
 def spin_once(

@@ -15,7 +15,7 @@ from .exceptions import NoTypeSupportImportedException
 from .logging import get_logger
 from .qos import QoSProfile
 
-__all__ = ["Inbox", "NodeLink", "Receiver", "message_of", "open_reader", "open_writer"]
+__all__ = ["Connected", "NodeLink", "Receiver", "message_of", "open_reader", "open_writer"]
 
 _REFUSED_BY_WRITER = (
     "New subscription discovered on topic '{}', requesting incompatible QoS. "
@@ -47,7 +47,9 @@ def open_writer(
     """
     warn = _warning(link, _REFUSED_BY_WRITER, topic)
     try:
-        return link.context.participant.create_writer(*_described(msg_type, full_name, qos), warn)
+        return link.context.participant.create_writer(
+            *_described(msg_type, full_name, qos), on_incompatible=warn
+        )
     except DdsError as error:
         raise RCLError(f"failed to create publisher: {error}") from None
 
@@ -58,7 +60,9 @@ def open_reader(
     """A DDS reader for a topic; arguments and errors as for `open_writer`."""
     warn = _warning(link, _REFUSED_BY_READER, topic)
     try:
-        return link.context.participant.create_reader(*_described(msg_type, full_name, qos), warn)
+        return link.context.participant.create_reader(
+            *_described(msg_type, full_name, qos), on_incompatible=warn
+        )
     except DdsError as error:
         raise RCLError(f"failed to create subscription: {error}") from None
 
@@ -114,17 +118,51 @@ class Inbox:
         return fetched
 
 
-class Receiver(Destroyable):
+class Connected(Destroyable):
+    """What is on the network under an absolute name until `destroy`."""
+
+    def __init__(self, full_name: str, endpoint: Any) -> None:
+        self._full_name = full_name
+        self._endpoint = endpoint
+        self._gids: tuple[list[bytes], list[bytes]] = endpoint.gids  # of readers and writers
+
+    def destroy(self) -> None:
+        """Leave the network; use the node's own method for that."""
+        super().destroy()
+        self._endpoint.close()
+
+    def _existing_name(self) -> str:
+        self._require_existence()
+        return self._full_name
+
+
+class Receiver(Connected):
     """A subscription, client or service as executors see it: its inbox says when it is ready."""
 
-    _inbox: Inbox
     _executor_event = False
+
+    def __init__(
+        self, link: NodeLink, full_name: str, endpoint: Any, take: Callable[[], Any]
+    ) -> None:
+        super().__init__(full_name, endpoint)
+        self._inbox = Inbox(take, link.wake)
+        endpoint.on_data = self._inbox.notify
 
     def _stirred(self) -> bool:
         return self._inbox.ready
 
     def _fetch(self) -> bool:
         return self._inbox.fetch()
+
+    def _take(self) -> Callable[[], Any] | None:
+        """The call to be made for the oldest data that wait, None when there are none."""
+        self._require_existence()
+        taken = self._inbox.take()
+        return None if taken is None else self._call_for(*taken)
+
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
+        """The call to be made for serialized data that came from somewhere."""
+        raise NotImplementedError
 
 
 def message_of(data: bytes, cls: Any) -> Any:

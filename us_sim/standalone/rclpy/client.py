@@ -8,7 +8,7 @@ from typing import Any
 
 from ..messages import serialize
 from ..services import ServiceClient
-from ._endpoints import Inbox, NodeLink, Receiver, message_of
+from ._endpoints import NodeLink, Receiver, message_of
 from ._rclpy_pybind11 import RCLError
 from .callback_groups import CallbackGroup
 from .context import Context
@@ -33,12 +33,10 @@ class Client(Receiver):
         qos_profile: QoSProfile,
         callback_group: CallbackGroup,
     ) -> None:
-        participant = link.context.participant
-        self._client = ServiceClient(participant, full_name, srv_type.__msgtype__, qos_profile)
-        self._inbox = Inbox(self._client.take_response, link.wake)
-        self._client.on_data = self._inbox.notify
-        self._full_name = full_name
-        self._gids = self._client.gids
+        endpoint = ServiceClient(
+            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+        )
+        super().__init__(link, full_name, endpoint, endpoint.take_response)
         self.context = context
         self.srv_type = srv_type
         self.srv_name = srv_name
@@ -82,7 +80,7 @@ class Client(Receiver):
             raise RCLError("failed to send request: the client's context is invalid")
         future = Future()
         with self._lock:  # held over sending: the response may come before this returns
-            sequence_number = self._client.send_request(serialize(request))
+            sequence_number = self._endpoint.send_request(serialize(request))
             self._pending_requests[sequence_number] = future
         future.add_done_callback(self.remove_pending_request)
         return future
@@ -103,7 +101,7 @@ class Client(Receiver):
     def service_is_ready(self) -> bool:
         """Whether a service is connected."""
         self._require_existence()
-        return self._client.service_is_ready()
+        return self._endpoint.service_is_ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
         """Wait until a service is connected; whether it was within the time."""
@@ -111,23 +109,12 @@ class Client(Receiver):
 
     @property
     def service_name(self) -> str:
-        self._require_existence()
-        return self._full_name
+        return self._existing_name()
 
-    def destroy(self) -> None:
-        """Leave the service; use `Node.destroy_client`."""
-        super().destroy()
-        self._client.close()
-
-    def _take(self) -> Callable[[], Any] | None:
-        """The call that hands a response to who waits for it."""
-        self._require_existence()
-        taken = self._inbox.take()
-        if taken is None:
-            return None
-        response = message_of(taken[0], self.srv_type.Response)
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
+        response = message_of(data, self.srv_type.Response)
         try:
-            future = self.get_pending_request(taken[1].sequence)
+            future = self.get_pending_request(info.sequence)
         except KeyError:
             return None  # nobody waits for it any more
         return partial(future._set_result_in_executor, response)

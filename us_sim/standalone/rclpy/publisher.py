@@ -4,8 +4,8 @@ from typing import Any
 
 from ..messages import serialize
 from ..transport import DdsError
-from ._endpoints import NodeLink, open_writer
-from ._rclpy_pybind11 import Destroyable, RCLError
+from ._endpoints import Connected, NodeLink, open_writer
+from ._rclpy_pybind11 import RCLError
 from .duration import Duration
 from .logging import get_logger
 from .qos import QoSProfile
@@ -13,17 +13,15 @@ from .qos import QoSProfile
 __all__ = ["Publisher"]
 
 
-class Publisher(Destroyable):
+class Publisher(Connected):
     """Sends messages of one type to one topic."""
 
     def __init__(
         self, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos_profile: QoSProfile
     ) -> None:
-        self._writer = open_writer(link, msg_type, topic, full_name, qos_profile)
+        super().__init__(full_name, open_writer(link, msg_type, topic, full_name, qos_profile))
         self._context = link.context
         self._logger = get_logger(link.logger_name)
-        self._full_name = full_name
-        self._gids: tuple[list[bytes], list[bytes]] = [], [self._writer.gid]
         self.msg_type = msg_type
         self.topic = topic
         self.qos_profile = qos_profile
@@ -43,7 +41,7 @@ class Publisher(Destroyable):
         if not self._context.ok():
             raise RCLError("Failed to publish: publisher's context is invalid")
         try:
-            accepted = self._writer.write(msg)
+            accepted = self._endpoint.write(msg)
         except DdsError as error:
             raise RCLError(f"Failed to publish: {error}") from None
         if not accepted:
@@ -56,17 +54,11 @@ class Publisher(Destroyable):
     def get_subscription_count(self) -> int:
         """How many subscriptions are connected."""
         self._require_existence()
-        return self._writer.matched_count()
+        return self._endpoint.matched_count()
 
     @property
     def topic_name(self) -> str:
-        self._require_existence()
-        return self._full_name
-
-    def destroy(self) -> None:
-        """Leave the topic; use `Node.destroy_publisher`."""
-        super().destroy()
-        self._writer.close()
+        return self._existing_name()
 
     def wait_for_all_acked(self, timeout: Duration = Duration(seconds=-1)) -> bool:  # noqa: B008
         """Wait until every reliable subscription has received everything.
@@ -75,4 +67,4 @@ class Publisher(Destroyable):
             False when that did not happen within the timeout; a negative one never ends.
         """
         self._require_existence()
-        return self._writer.wait_for_acked(timeout.nanoseconds / 1e9)
+        return self._endpoint.wait_for_acked(timeout.nanoseconds / 1e9)

@@ -6,7 +6,7 @@ from typing import Any
 
 from ..messages import serialize
 from ..services import RequestHeader, ServiceServer
-from ._endpoints import Inbox, NodeLink, Receiver, message_of
+from ._endpoints import NodeLink, Receiver, message_of
 from ._rclpy_pybind11 import RCLError
 from .callback_groups import CallbackGroup
 from .logging import get_logger
@@ -28,13 +28,11 @@ class Service(Receiver):
         callback_group: CallbackGroup,
         qos_profile: QoSProfile,
     ) -> None:
-        participant = link.context.participant
-        self._server = ServiceServer(participant, full_name, srv_type.__msgtype__, qos_profile)
-        self._inbox = Inbox(self._server.take_request, link.wake)
-        self._server.on_data = self._inbox.notify
+        endpoint = ServiceServer(
+            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+        )
+        super().__init__(link, full_name, endpoint, endpoint.take_request)
         self._context = link.context
-        self._full_name = full_name
-        self._gids = self._server.gids
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
@@ -53,25 +51,13 @@ class Service(Receiver):
             raise TypeError(f"Expected the header of a request, got {type(header)}")
         self._require_existence()
         if self._context.ok():
-            self._server.send_response(serialize(response), header)
+            self._endpoint.send_response(serialize(response), header)
 
     @property
     def service_name(self) -> str:
-        self._require_existence()
-        return self._full_name
+        return self._existing_name()
 
-    def destroy(self) -> None:
-        """Offer the service no more; use `Node.destroy_service`."""
-        super().destroy()
-        self._server.close()
-
-    def _take(self) -> Callable[[], Any] | None:
-        """The call that answers the oldest request; bytes that are no request get no answer."""
-        self._require_existence()
-        taken = self._inbox.take()
-        if taken is None:
-            return None
-        data, header = taken
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
         try:
             request = message_of(data, self.srv_type.Request)
         except RCLError as error:
@@ -82,7 +68,7 @@ class Service(Receiver):
                 throttle_duration_sec=5.0,
             )
             return None
-        return partial(self._answer, request, header)
+        return partial(self._answer, request, info)
 
     def _answer(self, request: Any, header: RequestHeader) -> None:
         self.send_response(self.callback(request, self.srv_type.Response()), header)

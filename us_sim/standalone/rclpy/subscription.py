@@ -6,7 +6,7 @@ from enum import Enum
 from functools import partial
 from typing import Any
 
-from ._endpoints import Inbox, NodeLink, Receiver, message_of, open_reader
+from ._endpoints import NodeLink, Receiver, message_of, open_reader
 from .callback_groups import CallbackGroup
 from .qos import QoSProfile
 
@@ -34,11 +34,8 @@ class Subscription(Receiver):
         raw: bool,
     ) -> None:
         self.callback = callback
-        self._reader = open_reader(link, msg_type, topic, full_name, qos_profile)
-        self._inbox = Inbox(self._reader.take, link.wake)
-        self._reader.on_data = self._inbox.notify
-        self._full_name = full_name
-        self._gids: tuple[list[bytes], list[bytes]] = [self._reader.gid], []
+        reader = open_reader(link, msg_type, topic, full_name, qos_profile)
+        super().__init__(link, full_name, reader, reader.take)
         self.msg_type = msg_type
         self.topic = topic
         self.callback_group = callback_group
@@ -48,17 +45,11 @@ class Subscription(Receiver):
     def get_publisher_count(self) -> int:
         """How many publishers are connected."""
         self._require_existence()
-        return self._reader.matched_count()
-
-    def destroy(self) -> None:
-        """Leave the topic; use `Node.destroy_subscription`."""
-        super().destroy()
-        self._reader.close()
+        return self._endpoint.matched_count()
 
     @property
     def topic_name(self) -> str:
-        self._require_existence()
-        return self._full_name
+        return self._existing_name()
 
     @property
     def callback(self) -> Callable[..., Any]:
@@ -82,20 +73,14 @@ class Subscription(Receiver):
             "(to get only the message) or two (to get message and message info)"
         )
 
-    def _take(self) -> Callable[[], Any] | None:
-        """The call to be made for the oldest message that is waiting."""
-        self._require_existence()
-        taken = self._inbox.take()
-        if taken is None:
-            return None
-        data, sample = taken
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any]:
         message = data if self.raw else message_of(data, self.msg_type)
         if self._callback_type is Subscription.CallbackType.MessageOnly:
             return partial(self.callback, message)
-        info = {
-            "source_timestamp": sample.source_timestamp,
-            "received_timestamp": sample.received_timestamp,
+        origin = {
+            "source_timestamp": info.source_timestamp,
+            "received_timestamp": info.received_timestamp,
             "publication_sequence_number": None,
             "reception_sequence_number": None,
         }
-        return partial(self.callback, message, info)
+        return partial(self.callback, message, origin)
