@@ -2,45 +2,22 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import rclpy
+
+import us_sim.standalone
 
 pytestmark = pytest.mark.skipif(
     rclpy.__name__ == "rclpy", reason="the real rclpy is here, so nothing is installed"
 )
 
-MODULES = (
-    "callback_groups",
-    "client",
-    "clock",
-    "clock_type",
-    "constants",
-    "context",
-    "duration",
-    "exceptions",
-    "executors",
-    "guard_condition",
-    "impl.logging_severity",
-    "impl.rcutils_logger",
-    "logging",
-    "node",
-    "parameter",
-    "parameter_client",
-    "parameter_service",
-    "publisher",
-    "qos",
-    "qos_overriding_options",
-    "serialization",
-    "service",
-    "signals",
-    "subscription",
-    "task",
-    "time",
-    "time_source",
-    "timer",
-    "topic_endpoint_info",
-    "utilities",
+RCLPY = Path(us_sim.standalone.__file__).parent / "rclpy"
+MODULES = sorted(
+    ".".join(file.relative_to(RCLPY).with_suffix("").parts)
+    for file in RCLPY.rglob("*.py")
+    if file.name != "__init__.py"
 )
 
 
