@@ -1,5 +1,6 @@
 """A private context with an executor, for tests that run against any rclpy."""
 
+import random
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -64,3 +65,35 @@ def bench_with() -> Iterator[Callable[[list[str]], Bench]]:
     yield make
     for bench in made:
         bench.close()
+
+
+@pytest.fixture(scope="module")
+def domain() -> int:
+    return random.Random().randint(1, 100)
+
+
+@pytest.fixture
+def participant(domain: int) -> Iterator[Any]:
+    from transport_bench import LOCALHOST
+
+    from us_sim.standalone.transport import Participant
+
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def neighbour(domain: int) -> Iterator[Any]:
+    from transport_bench import LOCALHOST
+
+    from us_sim.standalone.transport import Participant
+
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def bell() -> Any:
+    from transport_bench import Doorbell
+
+    return Doorbell()

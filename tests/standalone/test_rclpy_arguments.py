@@ -202,3 +202,8 @@ def test_domains_come_from_the_call_or_the_environment(monkeypatch: pytest.Monke
     monkeypatch.setenv("ROS_DOMAIN_ID", "many")
     with pytest.raises(RuntimeError, match="failed to initialize rcl"):
         Context().init([])
+    monkeypatch.setenv("ROS_DOMAIN_ID", "61")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "everywhere")
+    if rclpy.__name__ != "rclpy":
+        with pytest.raises(RuntimeError, match="set it to one of SUBNET, LOCALHOST"):
+            Context().init([])

@@ -9,7 +9,6 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     ParameterEvent,
     ParameterType,
-    ParameterValue,
     SetParametersResult,
 )
 from rclpy.exceptions import (
@@ -21,12 +20,7 @@ from rclpy.exceptions import (
     ParameterNotDeclaredException,
     ParameterUninitializedException,
 )
-from rclpy.parameter import (
-    Parameter,
-    get_parameter_value,
-    parameter_dict_from_yaml_file,
-    parameter_value_to_python,
-)
+from rclpy.parameter import Parameter
 
 VALUES = [
     (True, Parameter.Type.BOOL),
@@ -50,7 +44,6 @@ def test_a_parameter_has_the_type_of_its_value_and_survives_its_message(value, t
     message = parameter.to_parameter_msg()
     assert message.name == "p"
     assert message.value.type == type_.value
-    assert parameter_value_to_python(message.value) == value
     back = Parameter.from_parameter_msg(message)
     assert (back.type_, list(back.value) if isinstance(value, list) else back.value) == (
         type_,
@@ -69,12 +62,6 @@ def test_values_that_parameters_cannot_have_are_refused() -> None:
         Parameter("p", 2, 1)
     assert Parameter("p", value=array.array("d", [1.0])).type_ is Parameter.Type.DOUBLE_ARRAY
     assert Parameter("p", value=(1, 2)).type_ is Parameter.Type.INTEGER_ARRAY
-
-
-def test_texts_become_values_as_on_a_command_line() -> None:
-    assert get_parameter_value("[1.0, 2.0]").double_array_value.tolist() == [1.0, 2.0]
-    assert get_parameter_value("true").type == ParameterType.PARAMETER_BOOL
-    assert get_parameter_value("vein").string_value == "vein"
 
 
 def test_declared_parameters_have_their_default_or_what_was_given_outside(bench) -> None:
@@ -243,23 +230,12 @@ def test_setting_several_at_once_is_all_or_nothing(bench) -> None:
         node.set_parameters_atomically([3])
 
 
-def test_descriptors_can_be_read_and_changed(bench) -> None:
+def test_descriptors_can_be_read(bench) -> None:
     node = bench.node()
     node.declare_parameter("p", 5, ParameterDescriptor(description="how deep"))
     described = node.describe_parameter("p")
     assert (described.name, described.description) == ("p", "how deep")
     assert described.type == ParameterType.PARAMETER_INTEGER
-    small = ParameterDescriptor(
-        type=described.type, integer_range=[IntegerRange(from_value=0, to_value=3)]
-    )
-    with pytest.raises(InvalidParameterValueException):
-        node.set_descriptor("p", small)
-    two = ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=2)
-    assert node.set_descriptor("p", small, two).integer_value == 2
-    assert node.get_parameter("p").value == 2
-    assert not node.set_parameters([Parameter("p", value=4)])[0].successful
-    with pytest.raises(ParameterNotDeclaredException):
-        node.set_descriptor("q", small)
 
 
 def test_parameters_are_listed_by_prefix_and_depth(bench) -> None:
@@ -316,21 +292,3 @@ def test_every_change_is_told_on_parameter_events(bench) -> None:
         ("/left/probe", [], [], ["free"]),
     ]
     assert events[-1].stamp.sec > 1_000_000_000
-
-
-def test_parameter_files_become_messages(tmp_path) -> None:
-    file = tmp_path / "p.yaml"
-    file.write_text(
-        "/**: {ros__parameters: {rate: 1.0, common: true}}\n"
-        "probe: {ros__parameters: {rate: 2.0, image: {width: 512}}}\n"
-    )
-    own = parameter_dict_from_yaml_file(str(file))
-    assert {name: parameter_value_to_python(p.value) for name, p in own.items()} == {
-        "rate": 2.0,
-        "image.width": 512,
-    }
-    everything = parameter_dict_from_yaml_file(str(file), use_wildcard=True)
-    assert everything["common"].value.bool_value
-    assert everything["rate"].value.double_value == 2.0
-    with pytest.raises(RuntimeError, match="does not contain parameters for skin"):
-        parameter_dict_from_yaml_file(str(file), target_nodes=["skin"])

@@ -4,7 +4,6 @@ import array
 import os
 import subprocess
 import sys
-import warnings
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import (
     InvalidHandle,
     NoTypeSupportImportedException,
@@ -29,7 +27,6 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import deserialize_message, serialize_message
-from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Int32, String
 
@@ -152,57 +149,11 @@ def test_keep_last_one_leaves_the_newest(bench) -> None:
     assert len(received) <= 2
 
 
-def test_qualities_that_do_not_meet_are_reported_and_nothing_arrives(bench) -> None:
-    asked: list[Any] = []
-    offered: list[Any] = []
-    node = bench.node()
-    publisher = node.create_publisher(
-        String,
-        "text",
-        qos_profile_sensor_data,
-        event_callbacks=PublisherEventCallbacks(incompatible_qos=offered.append),
-    )
-    received: list[String] = []
-    bench.node("strict").create_subscription(
-        String,
-        "text",
-        received.append,
-        10,
-        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=asked.append),
-    )
-    assert bench.spin_until(lambda: asked and offered)
-    publisher.publish(String())
-    assert publisher.get_subscription_count() == 0
-    assert asked[0].total_count == 1
-    assert QoSPolicyKind(int(asked[0].last_policy_kind)) is QoSPolicyKind.RELIABILITY
-    assert QoSPolicyKind(int(offered[0].last_policy_kind)) is QoSPolicyKind.RELIABILITY
-    assert not received
-
-
-def test_matches_and_missed_deadlines_are_reported(bench) -> None:
-    matches: list[Any] = []
-    missed: list[Any] = []
-    node = bench.node()
-    callbacks = SubscriptionEventCallbacks(matched=matches.append, deadline=missed.append)
-    profile = QoSProfile(depth=1, deadline=Duration(seconds=0.05))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # rclpy uses what it deprecates
-        node.create_subscription(String, "text", print, profile, event_callbacks=callbacks)
-    other = bench.node("other")
-    publisher = other.create_publisher(String, "text", profile)
-    assert bench.spin_until(lambda: matches)
-    assert (matches[0].current_count, matches[0].current_count_change) == (1, 1)
-    publisher.publish(String())
-    assert bench.spin_until(lambda: missed)
-    assert missed[0].total_count >= 1
-    other.destroy_publisher(publisher)
-    assert bench.spin_until(lambda: matches[-1].current_count == 0)
-
-
 def test_incompatible_qualities_are_warned_about_by_default(bench, capfd) -> None:
     node = bench.node("probe")
-    node.create_publisher(String, "text", qos_profile_sensor_data)
-    bench.node("strict").create_subscription(String, "text", print, 10)
+    publisher = node.create_publisher(String, "text", qos_profile_sensor_data)
+    received: list[String] = []
+    bench.node("strict").create_subscription(String, "text", received.append, 10)
     warned: list[str] = []
 
     def both_warned() -> bool:
@@ -213,6 +164,9 @@ def test_incompatible_qualities_are_warned_about_by_default(bench, capfd) -> Non
     text = "".join(warned)
     assert "[probe]: New subscription discovered on topic 'text', requesting" in text
     assert "[strict]: New publisher discovered on topic 'text', offering" in text
+    publisher.publish(String())
+    assert publisher.get_subscription_count() == 0
+    assert not received
 
 
 def test_destroyed_endpoints_are_gone(bench) -> None:
@@ -238,16 +192,6 @@ def test_nothing_is_published_after_shutdown(bench) -> None:
     bench.context.shutdown()
     with pytest.raises(RuntimeError, match="context is invalid"):
         publisher.publish(String())
-
-
-def test_wait_for_message_needs_no_executor(bench) -> None:
-    node = bench.node()
-    publisher = bench.node("other").create_publisher(String, "latched", LATCHED)
-    publisher.publish(String(data="mesh"))
-    found, message = wait_for_message(String, node, "latched", qos_profile=LATCHED, time_to_wait=10)
-    assert found
-    assert message.data == "mesh"
-    assert wait_for_message(String, node, "silent", time_to_wait=0.05) == (False, None)
 
 
 def test_quality_of_service_can_be_overridden_by_parameters(bench_with) -> None:
@@ -349,7 +293,7 @@ def test_processes_exchange_messages(bench) -> None:
         try:
             assert connected(bench, publisher)
             assert bench.spin_until(lambda: node.count_publishers("answer") == 1)
-            assert node.wait_for_node("echo", 5)
+            assert "/echo" in node.get_fully_qualified_node_names()
 
             def answered() -> list[String]:
                 publisher.publish(String(data="vein"))

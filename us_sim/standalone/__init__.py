@@ -12,15 +12,15 @@ def install() -> bool:
     Returns:
         True when what can be imported is this package's subset.
     """
-    from us_sim.standalone.alias import AliasFinder
+    from .alias import AliasFinder
 
     if any(isinstance(finder, AliasFinder) for finder in sys.meta_path):
         return True
     if "rclpy" in sys.modules or importlib.util.find_spec("rclpy") is not None:
         return False
-    from us_sim.standalone.messages import register_message_modules
+    from .messages import register_message_modules
 
     # First, since otherwise the files would be found once more, as other modules.
-    sys.meta_path.insert(0, AliasFinder("rclpy", "us_sim.standalone.rclpy"))
+    sys.meta_path.insert(0, AliasFinder("rclpy", f"{__name__}.rclpy"))
     register_message_modules()
     return True

@@ -14,16 +14,15 @@ from __future__ import annotations
 import struct
 from typing import TypeVar
 
-from us_sim.errors import UsSimError
-from us_sim.standalone.cdr_source import compiled_reader, compiled_writer
-from us_sim.standalone.message_class import Message
+from .cdr_source import compiled_reader, compiled_writer
+from .message_class import Message
 
 __all__ = ["CdrError", "deserialize", "serialize"]
 
 M = TypeVar("M", bound=Message)
 
 
-class CdrError(UsSimError):
+class CdrError(Exception):
     """Bytes are not the serialized message they should be."""
 
 

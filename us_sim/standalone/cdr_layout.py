@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.standalone.field_setters import ARRAY_TYPES
-from us_sim.standalone.interfaces import Field, interface
+from .field_setters import ARRAY_TYPES
+from .interfaces import Field, interface
 
 __all__ = ["FORMATS", "CdrLayout"]
 
@@ -63,6 +63,18 @@ class CdrLayout(ABC):
     def advance(self, size: int) -> None:
         modulus, remainder = self.known
         self.known = (modulus, (remainder + size) % modulus)
+
+    def fields(self, owner: str, type_name: str, placeholder: str) -> None:
+        """All fields of a message; an empty one has a byte in their place."""
+        definition = interface(type_name)
+        for field in definition.fields:
+            term = f"{owner}._{field.name}"
+            if field.shape == "scalar":
+                self.element(field, term)
+            else:
+                self.elements(field, term)
+        if definition.is_empty:
+            self.primitive("B", placeholder)
 
     def primitive(self, code: str, term: str) -> None:
         """Append a primitive to the pending ``struct`` call."""
@@ -137,6 +149,14 @@ class CdrLayout(ABC):
     @abstractmethod
     def pad(self, amount: str) -> None:
         """Emit ``amount`` (an expression) bytes of padding."""
+
+    @abstractmethod
+    def element(self, field: Field, term: str) -> None:
+        """Emit what one value of a field's kind takes."""
+
+    @abstractmethod
+    def elements(self, field: Field, term: str) -> None:
+        """Emit what an array or a sequence takes."""
 
     @abstractmethod
     def struct_call(self, packing: struct.Struct) -> None:

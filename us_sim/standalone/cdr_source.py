@@ -3,6 +3,22 @@
 Consecutive primitives whose alignment is known beforehand go through one ``struct`` call;
 ``array.array`` and NumPy data are copied whole.
 
+rosbags, which the types come from, generates such functions too (`Typestore.serialize_cdr`). They
+do not serve here. They read and make rosbags' own objects, whose sequences are NumPy arrays, where
+rclpy has ``array.array``: each message would have to be rebuilt around each call. And they pack
+number by number, with a call for each. Even given its own objects, rosbags 0.11.9 takes longer
+(µs, the least of three runs on an AMD EPYC with Python 3.11):
+
+=========================== ======================= =======================
+message                     written here / rosbags  read here / rosbags
+=========================== ======================= =======================
+PoseStamped                 1.2 / 4.7               2.2 / 7.2
+DiagnosticArray, 10 values  10 / 21                 12 / 30
+PointCloud2, 3,000 points   4.5 / 12                5.8 / 14
+Image, 512 by 512           13 / 531                16 / 16
+Marker, 3,000 points        508 / 1,691             1,545 / 3,115
+=========================== ======================= =======================
+
 >>> from us_sim.standalone.cdr_source import writer_source
 >>> print(writer_source("geometry_msgs/msg/Point").splitlines()[-2].strip())
 add(c0(v0._x, v0._y, v0._z)); pos += 24
@@ -17,10 +33,10 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.standalone.cdr_layout import FORMATS, CdrLayout
-from us_sim.standalone.field_setters import ARRAY_TYPES
-from us_sim.standalone.interfaces import Field, interface
-from us_sim.standalone.message_class import Message, message_class
+from .cdr_layout import FORMATS, CdrLayout
+from .field_setters import ARRAY_TYPES
+from .interfaces import Field
+from .message_class import Message, message_class
 
 __all__ = ["compiled_reader", "compiled_writer", "writer_source"]
 
@@ -63,15 +79,7 @@ class _Writer(CdrLayout):
         self.line(f"add({call}({', '.join(self.terms)})); pos += {packing.size}")
 
     def message(self, owner: str, type_name: str) -> None:
-        definition = interface(type_name)
-        for field in definition.fields:
-            term = f"{owner}._{field.name}"
-            if field.shape == "scalar":
-                self.element(field, term)
-            else:
-                self.elements(field, term)
-        if definition.is_empty:
-            self.primitive("B", "0")
+        self.fields(owner, type_name, placeholder="0")
 
     def element(self, field: Field, term: str) -> None:
         if field.is_message:
@@ -132,15 +140,7 @@ class _Reader(CdrLayout):
         cls = self.constant(message_class(type_name))
         new = self.constant(object.__new__)
         self.line(f"{owner} = {new}({cls})")
-        definition = interface(type_name)
-        for field in definition.fields:
-            term = f"{owner}._{field.name}"
-            if field.shape == "scalar":
-                self.element(field, term)
-            else:
-                self.elements(field, term)
-        if definition.is_empty:
-            self.primitive("B", "_")
+        self.fields(owner, type_name, placeholder="_")
         return owner
 
     def element(self, field: Field, term: str) -> None:

@@ -17,8 +17,6 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-from us_sim.errors import UsSimError
-
 __all__ = [
     "ANY_STATE",
     "INFINITY",
@@ -39,8 +37,6 @@ ALIVE = 16
 SAMPLE_OF_DATA = 2  # enum ddsi_serdata_kind
 
 RETURN_TIMEOUT = -10
-RETURN_ALREADY_DELETED = -9
-RETURN_BAD_PARAMETER = -3
 
 BUILTIN_PARTICIPANT = 0x7FFF0001
 BUILTIN_PUBLICATION = 0x7FFF0003
@@ -51,7 +47,7 @@ InstanceHandle = ct.c_uint64
 Pointer = ct.c_void_p
 
 
-class DdsError(UsSimError):
+class DdsError(Exception):
     """The transport refuses what it was asked for."""
 
 
@@ -201,24 +197,14 @@ _declare(_INT, "dds_takecdr", Entity, _OUT, ct.c_uint32, _OUT, ct.c_uint32)
 _declare(_INT, "dds_take", Entity, _OUT, _OUT, ct.c_size_t, ct.c_uint32)
 _declare(_INT, "dds_return_loan", Entity, _OUT, ct.c_int32)
 _declare(_INT, "dds_wait_for_acks", Entity, _DURATION)
-_declare(_INT, "dds_assert_liveliness", Entity)
 
 _declare(_INT, "dds_get_matched_subscriptions", Entity, _OUT, ct.c_size_t)
 _declare(_INT, "dds_get_matched_publications", Entity, _OUT, ct.c_size_t)
 for _side in ("publication", "subscription"):
     _declare(ct.POINTER(BuiltinEndpoint), f"dds_get_matched_{_side}_data", Entity, InstanceHandle)
-    _declare(_INT, f"dds_get_{_side}_matched_status", Entity, _OUT)
 _declare(None, "dds_builtintopic_free_endpoint", ct.POINTER(BuiltinEndpoint))
-for _status in (
-    "liveliness_changed",
-    "liveliness_lost",
-    "offered_deadline_missed",
-    "offered_incompatible_qos",
-    "requested_deadline_missed",
-    "requested_incompatible_qos",
-    "sample_lost",
-):
-    _declare(_INT, f"dds_get_{_status}_status", Entity, _OUT)
+_declare(_INT, "dds_get_offered_incompatible_qos_status", Entity, _OUT)
+_declare(_INT, "dds_get_requested_incompatible_qos_status", Entity, _OUT)
 
 _declare(Pointer, "dds_create_qos")
 _declare(None, "dds_delete_qos", Pointer)

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from itertools import count
 
-from us_sim.standalone.ddsc import INFINITY, check, lib
+from .ddsc import INFINITY, check, lib
 
 __all__ = ["Dispatcher"]
 
@@ -36,7 +36,7 @@ class Dispatcher:
         self._soon: deque[Callable[[], None]] = deque()
         self._tokens = count(_WAKE_UP + 1)
         self._handlers: dict[int, Callable[[], None]] = {}
-        self._thread = threading.Thread(target=self._run, name="us_sim DDS", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="DDS dispatcher", daemon=True)
         self._thread.start()
 
     def attach(self, entity: int, status_mask: int, handler: Callable[[], None]) -> int:

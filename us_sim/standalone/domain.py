@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 
-from us_sim.standalone.ddsc import DdsError, check, lib
+from .ddsc import DdsError, check, lib
 
 __all__ = ["DiscoveryRange", "acquire_domain", "release_domain"]
 

@@ -11,17 +11,16 @@ True
 from __future__ import annotations
 
 import ctypes as ct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from us_sim.standalone.ddsc import INFINITY, DdsError, lib
+from .ddsc import INFINITY, DdsError, lib
 
 __all__ = ["EndpointQos", "dds_qos", "participant_qos", "qos_of_profile", "read_qos", "user_data"]
 
 _UNSPECIFIED = (0, INFINITY)
-_BEST_AVAILABLE_DURATION = 2**63 - 2
 _LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds would block for ever
 
 
@@ -48,78 +47,41 @@ class EndpointQos:
     liveliness_lease_duration: int = 0  # ns
 
 
-_BEST_AVAILABLE = 4
-_BEST_AVAILABLE_LIVELINESS = 5
 _DDS_DURABILITY = (EndpointQos.VOLATILE, EndpointQos.TRANSIENT_LOCAL)
 _DDS_LIVELINESS = (EndpointQos.AUTOMATIC, 2, EndpointQos.MANUAL_BY_TOPIC)
 
+# The values of each policy that are not left to the middleware, its default first.
+_KNOWN = {
+    "reliability": (EndpointQos.RELIABLE, EndpointQos.BEST_EFFORT),
+    "durability": _DDS_DURABILITY,
+    "history": (EndpointQos.KEEP_LAST, EndpointQos.KEEP_ALL),
+    "liveliness": (EndpointQos.AUTOMATIC, EndpointQos.MANUAL_BY_TOPIC),
+}
 
-def qos_of_profile(profile: Any, is_writer: bool, opposite: Iterable[EndpointQos]) -> EndpointQos:
+
+def qos_of_profile(profile: Any) -> EndpointQos:
     """The policies to ask for, given rclpy's profile (or anything with its attributes).
 
-    SYSTEM_DEFAULT is reliable, volatile, keep last 1 and automatic; BEST_AVAILABLE is chosen from
-    the ``opposite`` endpoints that are known on the topic, as rmw_dds_common does.
+    SYSTEM_DEFAULT is reliable, volatile, keep last 1 and automatic.
 
     Raises:
-        DdsError: a policy is UNKNOWN, or the depth is negative.
+        DdsError: a policy is UNKNOWN or BEST_AVAILABLE, or the depth is negative.
     """
-    opposite = tuple(opposite)
     depth = int(profile.depth)
     if depth < 0:
         raise DdsError(f"a history depth of {depth} cannot be kept; give at least 1")
-
-    def policy(name: str, default: int, known: tuple[int, ...], best: int) -> int:
-        value = int(getattr(profile, name))
-        if value == 0:
-            return default
-        if value == (_BEST_AVAILABLE_LIVELINESS if name == "liveliness" else _BEST_AVAILABLE):
-            return best
-        if value not in known:
-            raise DdsError(f"the {name} policy {value} is unknown; choose one for this endpoint")
-        return value
-
-    def duration(name: str) -> int:
+    policies = {}
+    for name, known in _KNOWN.items():
+        policies[name] = int(getattr(profile, name)) or known[0]
+        if policies[name] not in known:
+            raise DdsError(
+                f"the {name} policy {getattr(profile, name)!r} cannot be asked for; choose one "
+                f"that says what this endpoint needs"
+            )
+    for name in ("deadline", "lifespan", "liveliness_lease_duration"):
         value = getattr(profile, name)
-        value = int(getattr(value, "nanoseconds", value))
-        if value == _BEST_AVAILABLE_DURATION:
-            values = [getattr(qos, name) for qos in opposite if getattr(qos, name)]
-            return (min if is_writer else max)(values, default=0)
-        return 0 if value in _UNSPECIFIED else value
-
-    all_reliable = all(qos.reliability == EndpointQos.RELIABLE for qos in opposite)
-    all_latched = all(qos.durability == EndpointQos.TRANSIENT_LOCAL for qos in opposite)
-    manual = [qos.liveliness == EndpointQos.MANUAL_BY_TOPIC for qos in opposite]
-    is_manual = any(manual) if is_writer else all(manual)
-    return EndpointQos(
-        reliability=policy(
-            "reliability",
-            EndpointQos.RELIABLE,
-            (EndpointQos.RELIABLE, EndpointQos.BEST_EFFORT),
-            EndpointQos.RELIABLE if is_writer or all_reliable else EndpointQos.BEST_EFFORT,
-        ),
-        durability=policy(
-            "durability",
-            EndpointQos.VOLATILE,
-            _DDS_DURABILITY,
-            EndpointQos.TRANSIENT_LOCAL if is_writer or all_latched else EndpointQos.VOLATILE,
-        ),
-        history=policy(
-            "history",
-            EndpointQos.KEEP_LAST,
-            (EndpointQos.KEEP_LAST, EndpointQos.KEEP_ALL),
-            EndpointQos.KEEP_LAST,
-        ),
-        depth=depth or 1,
-        deadline=duration("deadline"),
-        lifespan=duration("lifespan"),
-        liveliness=policy(
-            "liveliness",
-            EndpointQos.AUTOMATIC,
-            (EndpointQos.AUTOMATIC, EndpointQos.MANUAL_BY_TOPIC),
-            EndpointQos.MANUAL_BY_TOPIC if is_manual else EndpointQos.AUTOMATIC,
-        ),
-        liveliness_lease_duration=duration("liveliness_lease_duration"),
-    )
+        policies[name] = _specified(int(getattr(value, "nanoseconds", value)))
+    return EndpointQos(depth=depth or 1, **policies)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Readers and writers of serialized samples; `us_sim.standalone.transport` makes them."""
+"""Readers and writers of serialized samples; `transport.Participant` makes them."""
 
 from __future__ import annotations
 
@@ -7,19 +7,36 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from us_sim.standalone import ddsc
-from us_sim.standalone.ddsc import DdsError, IoVector, RawSampleInfo, check, guid_of, lib
-from us_sim.standalone.endpoint_event import EndpointEvent, read_events, status_mask
-from us_sim.standalone.endpoint_qos import EndpointQos, user_data
-
-if TYPE_CHECKING:
-    from us_sim.standalone.transport import Participant
+from . import ddsc
+from .ddsc import DdsError, IoVector, RawSampleInfo, check, guid_of, lib
+from .dispatcher import Dispatcher
+from .endpoint_qos import EndpointQos, user_data
 
 __all__ = ["Endpoint", "Reader", "SampleInfo", "Writer"]
 
 _DATA_AVAILABLE = 1 << 8
+
+# The policies by DDS's numbers (dds_qos_policy_id), with the names that rclpy has for them.
+_POLICIES = {
+    2: "DURABILITY",
+    4: "DEADLINE",
+    8: "LIVELINESS",
+    11: "RELIABILITY",
+    13: "HISTORY",
+    21: "LIFESPAN",
+}
+
+
+class _IncompatibleQos(ct.Structure):
+    """dds_offered_incompatible_qos_status_t, and the same for requested ones"""
+
+    _fields_ = (
+        ("total_count", ct.c_uint32),
+        ("total_count_change", ct.c_int32),
+        ("last_policy", ct.c_uint32),
+    )
 
 
 @dataclass(frozen=True)
@@ -38,32 +55,33 @@ class SampleInfo:
 
 
 class Endpoint:
-    """What readers and writers have in common."""
+    """What readers and writers have in common.
+
+    ``on_incompatible`` is called, from another thread, with the name of the policy by which an
+    endpoint on the other side was refused (``RELIABILITY``).
+    """
 
     _side: str  # the other side, as the C functions call it: publication or subscription
+    _incompatible: tuple[int, str]  # the status's bit, and the first word of the C function
 
-    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
-        self._participant = participant
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        handle: int,
+        qos: EndpointQos,
+        on_incompatible: Callable[[str], None] | None = None,
+    ) -> None:
+        self._dispatcher = dispatcher
         self._handle = handle
         self._closed = False
         # Held while samples are in Python's hands: their memory belongs to the domain.
         self._in_use = threading.Lock()
         self.qos = qos
         self.gid = guid_of(handle)  # 16 bytes
-        self._on_event: Callable[[EndpointEvent], None] | None = None
-        self._token = participant._dispatcher.attach(handle, self._mask(), self._status_changed)
-
-    @property
-    def on_event(self) -> Callable[[EndpointEvent], None] | None:
-        """Called with each `EndpointEvent`, also with those from before it was set."""
-        return self._on_event
-
-    @on_event.setter
-    def on_event(self, callback: Callable[[EndpointEvent], None] | None) -> None:
-        self._on_event = callback
-        if not self._closed:
-            check(lib.dds_set_status_mask(self._handle, self._mask()), "the endpoint is closed")
-            self._participant._dispatcher.call_soon(self._status_changed)
+        self.gids = ([self.gid], []) if isinstance(self, Reader) else ([], [self.gid])
+        self._on_incompatible = on_incompatible
+        self._mask = self._incompatible[0] | _DATA_AVAILABLE * isinstance(self, Reader)
+        self._token = dispatcher.attach(handle, self._mask, self._status_changed)
 
     def matched_count(self) -> int:
         """How many endpoints are connected to this one."""
@@ -80,16 +98,21 @@ class Endpoint:
 
     def close(self) -> None:
         """Leave the topic. Callbacks that are running may end after this."""
-        if self._end():
-            self._participant._dispatcher.detach(self._token)
-            self._participant._endpoints.discard(self)
+        if self.end():
+            self._dispatcher.detach(self._token)
             lib.dds_delete(self._handle)
 
-    def _end(self) -> bool:
+    def end(self) -> bool:
         """Neither give nor take samples any more; False if that was so already."""
         with self._in_use:
             was_open, self._closed = not self._closed, True
         return was_open
+
+    def instance_handle(self) -> int:
+        """64 bits that no other endpoint has."""
+        handle = ct.c_uint64()
+        check(lib.dds_get_instance_handle(self._handle, ct.byref(handle)), "the endpoint is closed")
+        return handle.value
 
     def _matched(self, handles: Any, size: int) -> int:
         return getattr(lib, f"dds_get_matched_{self._side}s")(self._handle, handles, size)
@@ -103,36 +126,35 @@ class Endpoint:
         finally:
             lib.dds_builtintopic_free_endpoint(endpoint)
 
-    def _mask(self) -> int:
-        # Statuses that nobody asks for are left alone, so that who asks later still learns of them.
-        return 0 if self._on_event is None else status_mask(self._side)
-
     def _status_changed(self) -> None:
         status = ct.c_uint32()
-        if self._closed or lib.dds_take_status(self._handle, ct.byref(status), self._mask()) < 0:
+        if self._closed or lib.dds_take_status(self._handle, ct.byref(status), self._mask) < 0:
             return
         self._notify(status.value)
 
     def _notify(self, status: int) -> None:
-        callback = self._on_event
-        if callback is not None:
-            for event in read_events(self._handle, self._side, status):
-                callback(event)
+        bit, word = self._incompatible
+        result = _IncompatibleQos()
+        if self._on_incompatible is None or not status & bit:
+            return
+        read = getattr(lib, f"dds_get_{word}_incompatible_qos_status")
+        if read(self._handle, ct.byref(result)) >= 0:
+            self._on_incompatible(_POLICIES.get(result.last_policy, "INVALID"))
 
 
 class Writer(Endpoint):
-    """Publishes serialized samples.
-
-    ``on_event`` may be set to a function of an `EndpointEvent`, which another thread calls.
-    """
+    """Publishes serialized samples."""
 
     _side = "subscription"
+    _incompatible = (1 << 3, "offered")
 
-    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
-        super().__init__(participant, handle, qos)
-        sertype = ct.c_void_p()
-        check(lib.dds_get_entity_sertype(handle, ct.byref(sertype)), "the writer has no type")
-        self._sertype = sertype
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._sertype = ct.c_void_p()
+        check(
+            lib.dds_get_entity_sertype(self._handle, ct.byref(self._sertype)),
+            "the writer has no type",
+        )
 
     def write(self, data: bytes | bytearray | memoryview) -> bool:
         """Send one sample: a four-byte CDR header and at least one byte.
@@ -181,34 +203,24 @@ class Writer(Endpoint):
         check(returned, "nothing can be acknowledged to a closed writer")
         return True
 
-    def assert_liveliness(self) -> None:
-        """Say that this writer is alive, where its liveliness is MANUAL_BY_TOPIC."""
-        check(lib.dds_assert_liveliness(self._handle), "the writer is closed")
-
 
 class Reader(Endpoint):
-    """Receives serialized samples.
-
-    ``on_data`` may be set to a function without arguments that is called, from another thread,
-    when samples may be waiting; ``on_event`` as for writers.
-    """
+    """Receives serialized samples."""
 
     _side = "publication"
-
-    def __init__(self, participant: Participant, handle: int, qos: EndpointQos) -> None:
-        self._on_data: Callable[[], None] | None = None
-        super().__init__(participant, handle, qos)
+    _incompatible = (1 << 4, "requested")
+    _on_data: Callable[[], None] | None = None
 
     @property
     def on_data(self) -> Callable[[], None] | None:
-        """Called when data may be waiting, and once after it was set."""
+        """Called from another thread when samples may be waiting, and once after it was set."""
         return self._on_data
 
     @on_data.setter
     def on_data(self, callback: Callable[[], None] | None) -> None:
         self._on_data = callback
         if callback is not None:
-            self._participant._dispatcher.call_soon(callback)
+            self._dispatcher.call_soon(callback)
 
     def take(self) -> tuple[bytes, SampleInfo] | None:
         """The oldest sample that is waiting, removed from the reader; None if there is none."""
@@ -231,9 +243,6 @@ class Reader(Endpoint):
     def user_data_of(self, publication_handle: int) -> dict[str, str] | None:
         """The USER_DATA of a writer that is connected to this reader; None if it has gone."""
         return self._user_data_of(publication_handle)
-
-    def _mask(self) -> int:
-        return super()._mask() | _DATA_AVAILABLE
 
     def _notify(self, status: int) -> None:
         callback = self._on_data

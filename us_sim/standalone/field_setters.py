@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.standalone.interfaces import Field
+from .interfaces import Field
 
 __all__ = ["ARRAY_TYPES", "Setter", "field_setter"]
 

@@ -10,26 +10,23 @@ import ctypes as ct
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from us_sim.standalone import ddsc
-from us_sim.standalone.cdr import CdrError, deserialize, serialize
-from us_sim.standalone.ddsc import BuiltinEndpoint, BuiltinParticipant, RawSampleInfo, check, lib
-from us_sim.standalone.endpoint_qos import EndpointQos, read_qos, user_data
-from us_sim.standalone.interfaces import type_hash
-from us_sim.standalone.message_class import message_class
-
-if TYPE_CHECKING:
-    from us_sim.standalone.transport import Participant
+from . import ddsc
+from .cdr import CdrError, deserialize, serialize
+from .ddsc import BuiltinEndpoint, BuiltinParticipant, RawSampleInfo, check, lib
+from .endpoint_qos import EndpointQos, read_qos, user_data
+from .interfaces import type_hash
+from .message_class import message_class
+from .transport import Participant
 
 __all__ = ["Graph", "GraphEndpoint", "GraphNode"]
 
 _TOPIC = "ros_discovery_info"
 _TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 _DDS_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
-_DATA_AVAILABLE = 1 << 8
 
 
 @dataclass(frozen=True)
@@ -64,28 +61,22 @@ class GraphNode:
     reader_gids: tuple[bytes, ...] = ()
     writer_gids: tuple[bytes, ...] = ()
     participant: bytes = b""
-    enclave: str = "/"
 
 
 class Graph:
-    """What is known of a domain, always up to date with what has been received.
-
-    ``on_change`` may be set to a function without arguments; it is called from another thread after
-    something appeared, changed or went.
-    """
+    """What is known of a domain, always up to date with what has been received."""
 
     def __init__(self, participant: Participant) -> None:
-        self.on_change: Callable[[], None] | None = None
         self._participant = participant
         self._lock = threading.RLock()
         self._closed = False
         self._endpoints: dict[bytes, GraphEndpoint] = {}
-        self._enclaves: dict[bytes, str] = {}
+        self._participants: set[bytes] = set()  # the others
         self._nodes: dict[bytes, tuple[GraphNode, ...]] = {}
         self._announced: tuple[GraphNode, ...] = ()
         self._builtin = {
             topic: check(
-                lib.dds_create_reader(participant._handle, topic, None, None),
+                lib.dds_create_reader(participant.handle, topic, None, None),
                 "the domain cannot be observed",
             )
             for topic in (
@@ -105,14 +96,12 @@ class Graph:
             hash_of_type,
             ignore_own=True,
         )
-        self._reader.on_data = self._something_came
-        for reader in self._builtin.values():
-            participant._dispatcher.attach(reader, _DATA_AVAILABLE, self._something_came)
+        self._reader.on_data = self._refresh  # or they would pile up until somebody asks
 
     def endpoints(self, topic: str | None = None) -> list[GraphEndpoint]:
         """All endpoints, or those on one DDS topic."""
-        self._refresh_early()
         with self._lock:
+            self._refresh()
             return [
                 endpoint
                 for endpoint in self._endpoints.values()
@@ -121,12 +110,12 @@ class Graph:
 
     def nodes(self) -> list[GraphNode]:
         """All nodes: this participant's first, then the others'."""
-        self._refresh_early()
         with self._lock:
+            self._refresh()
             others = [
-                replace(node, enclave=self._enclaves[gid])
+                node
                 for gid, nodes in self._nodes.items()
-                if gid in self._enclaves
+                if gid in self._participants
                 for node in nodes
             ]
             return [*self._announced, *others]
@@ -136,83 +125,52 @@ class Graph:
         with self._lock:
             if self._closed:
                 return
-            self._announced = tuple(
-                replace(node, participant=self._participant.gid, enclave=self._participant.enclave)
-                for node in nodes
-            )
-            self._writer.write(serialize(_to_message(self._participant.gid, self._announced)))
-        self._participant._dispatcher.call_soon(self.notify)
+            gid = self._participant.gid
+            self._announced = tuple(replace(node, participant=gid) for node in nodes)
+            self._writer.write(serialize(_to_message(gid, self._announced)))
 
     def close(self) -> None:
         """Learn nothing more, and forget everything."""
         with self._lock:
             self._closed = True
-            self.on_change = None
             self._announced = ()
-            for known in (self._endpoints, self._enclaves, self._nodes):
-                known.clear()
+            self._endpoints.clear()
+            self._nodes.clear()
 
-    def _something_came(self) -> None:
-        # Reading leaves nothing to trigger on, so the status needs no separate reset.
-        if self._refresh():
-            self.notify()
-
-    def _refresh_early(self) -> None:
-        """Take in what the dispatcher has not seen yet, and have ``on_change`` told of it."""
-        if self._refresh():
-            self._participant._dispatcher.call_soon(self.notify)
-
-    def notify(self) -> None:
-        """Call ``on_change``."""
-        callback = self.on_change
-        if callback is not None:
-            callback()
-
-    def _refresh(self) -> bool:
-        """Take in what was received; whether there was anything."""
+    def _refresh(self) -> None:
+        """Take in what was received."""
         with self._lock:
             if self._closed:
-                return False
-            participants = self._take_all(ddsc.BUILTIN_PARTICIPANT, self._take_participant)
-            writers = self._take_all(ddsc.BUILTIN_PUBLICATION, self._take_endpoint)
-            readers = self._take_all(ddsc.BUILTIN_SUBSCRIPTION, self._take_endpoint)
-            changed = participants or writers or readers
+                return
+            self._take_all(ddsc.BUILTIN_PARTICIPANT, BuiltinParticipant, self._take_participant)
+            self._take_all(ddsc.BUILTIN_PUBLICATION, BuiltinEndpoint, self._take_endpoint)
+            self._take_all(ddsc.BUILTIN_SUBSCRIPTION, BuiltinEndpoint, self._take_endpoint)
             while (sample := self._reader.take()) is not None:
-                changed = True
                 try:
                     message: Any = deserialize(sample[0], message_class(_TYPE))
                 except CdrError:
                     continue
                 gid = bytes(message.gid.data)
                 self._nodes[gid] = tuple(_from_message(message, gid))
-            return changed
 
-    def _take_all(self, topic: int, take: Callable[[Any, bool, bool], None]) -> bool:
+    def _take_all(self, topic: int, kind: Any, take: Callable[[Any, bool, bool], None]) -> None:
         reader = self._builtin[topic]
-        kind: Any = BuiltinParticipant if topic == ddsc.BUILTIN_PARTICIPANT else BuiltinEndpoint
         sample, info = ct.c_void_p(), RawSampleInfo()
-        changed = False
         while lib.dds_take(reader, ct.byref(sample), ct.byref(info), 1, 1) == 1:
             content = ct.cast(sample, ct.POINTER(kind)).contents
             is_alive = info.instance_state == ddsc.ALIVE
             if info.valid_data or not is_alive:
                 take(content, is_alive, topic == ddsc.BUILTIN_PUBLICATION)
-                changed = True
             lib.dds_return_loan(reader, ct.byref(sample), 1)
             sample.value = None
-        return changed
 
     def _take_participant(self, content: Any, is_alive: bool, _is_writer: bool) -> None:
         gid = bytes(content.key)
-        if gid == self._participant.gid:
-            return
         if not is_alive:
-            self._enclaves.pop(gid, None)
+            self._participants.discard(gid)
             self._nodes.pop(gid, None)
-            return
-        enclave = user_data(content.qos).get("enclave")
-        if enclave is not None:
-            self._enclaves[gid] = enclave
+        elif gid != self._participant.gid and "enclave" in user_data(content.qos):
+            self._participants.add(gid)
 
     def _take_endpoint(self, content: Any, is_alive: bool, is_writer: bool) -> None:
         gid = bytes(content.key)

@@ -18,8 +18,6 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from us_sim.errors import UsSimError
-
 __all__ = [
     "Field",
     "Interface",
@@ -38,10 +36,6 @@ _SERVICES = {
         "string[] names",
         "rcl_interfaces/ParameterDescriptor[] descriptors",
     ),
-    "rcl_interfaces/srv/GetLoggerLevels": (
-        "string[] names",
-        "rcl_interfaces/LoggerLevel[] levels",
-    ),
     "rcl_interfaces/srv/GetParameterTypes": ("string[] names", "uint8[] types"),
     "rcl_interfaces/srv/GetParameters": (
         "string[] names",
@@ -50,10 +44,6 @@ _SERVICES = {
     "rcl_interfaces/srv/ListParameters": (
         "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth",
         "rcl_interfaces/ListParametersResult result",
-    ),
-    "rcl_interfaces/srv/SetLoggerLevels": (
-        "rcl_interfaces/LoggerLevel[] levels",
-        "rcl_interfaces/SetLoggerLevelsResult[] results",
     ),
     "rcl_interfaces/srv/SetParameters": (
         "rcl_interfaces/Parameter[] parameters",
@@ -86,7 +76,7 @@ _IDL_NAMES = {
 }
 
 
-class InterfaceError(UsSimError):
+class InterfaceError(Exception):
     """There is no such message or service."""
 
 

@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from us_sim.standalone.field_setters import ARRAY_TYPES, Setter, field_setter
-from us_sim.standalone.interfaces import Field, interface
+from .field_setters import ARRAY_TYPES, Setter, field_setter
+from .interfaces import Field, interface
 
 __all__ = ["Message", "message_class"]
 

@@ -16,8 +16,8 @@ from functools import cache
 from types import ModuleType
 from typing import Any, ClassVar
 
-from us_sim.standalone.cdr import CdrError, deserialize, serialize
-from us_sim.standalone.interfaces import (
+from .cdr import CdrError, deserialize, serialize
+from .interfaces import (
     InterfaceError,
     interface,
     message_names,
@@ -25,7 +25,7 @@ from us_sim.standalone.interfaces import (
     service_names,
     type_hash,
 )
-from us_sim.standalone.message_class import Message, message_class
+from .message_class import Message, message_class
 
 __all__ = [
     "CdrError",
@@ -87,7 +87,7 @@ def register_message_modules() -> None:
     for package in packages():
         if package in sys.modules or importlib.util.find_spec(package) is not None:
             continue
-        parent = ModuleType(package, f"Messages of {package}, provided by us_sim.standalone.")
+        parent = ModuleType(package, f"Messages of {package}, provided by {__package__}.")
         parent.__path__ = []
         sys.modules[package] = parent
         for folder, names in (("msg", message_names(package)), ("srv", service_names(package))):

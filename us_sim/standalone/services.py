@@ -7,7 +7,6 @@ their USER_DATA, so that a client knows when both directions are connected.
 
 from __future__ import annotations
 
-import ctypes as ct
 import struct
 import time
 from collections.abc import Callable
@@ -15,9 +14,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
-from us_sim.standalone.ddsc import check, lib
-from us_sim.standalone.interfaces import type_hash
-from us_sim.standalone.transport import Participant
+from .interfaces import type_hash
+from .transport import Participant
 
 __all__ = ["RequestHeader", "ServiceClient", "ServiceServer"]
 
@@ -81,12 +79,9 @@ class _ServiceEndpoint:
         self._reader.on_data = callback
 
     @property
-    def reader_gid(self) -> bytes:
-        return self._reader.gid
-
-    @property
-    def writer_gid(self) -> bytes:
-        return self._writer.gid
+    def gids(self) -> tuple[list[bytes], list[bytes]]:
+        """Of the reader and of the writer."""
+        return [self._reader.gid], [self._writer.gid]
 
     def close(self) -> None:
         """Leave both topics."""
@@ -156,15 +151,7 @@ class ServiceClient(_ServiceEndpoint):
     def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
         """Prepare to call a service; arguments as for `ServiceServer`."""
         super().__init__(participant, service, type_name, qos, is_server=False)
-        handle = ct.c_uint64()
-        check(
-            lib.dds_get_instance_handle(self._writer._handle, ct.byref(handle)),
-            f"no client can be made for {service!r}",
-        )
-        self._number = handle.value
-        # A server is in the graph shortly before it is connected: who waits for it on the graph's
-        # on_change must look again then.
-        self._writer.on_event = self._reader.on_event = lambda _: participant.graph.notify()
+        self._number = self._writer.instance_handle()
 
     def service_is_ready(self) -> bool:
         """Whether a server is connected in both directions."""

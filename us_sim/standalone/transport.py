@@ -21,23 +21,23 @@ import atexit
 import ctypes as ct
 import threading
 import weakref
+from collections.abc import Callable
 from typing import Any
 
-from us_sim.standalone import ddsc
-from us_sim.standalone.ddsc import DdsError, check, guid_of, lib
-from us_sim.standalone.dispatcher import Dispatcher
-from us_sim.standalone.domain import DiscoveryRange, acquire_domain, release_domain
-from us_sim.standalone.endpoint_event import EndpointEvent
-from us_sim.standalone.endpoint_qos import EndpointQos, dds_qos, participant_qos, qos_of_profile
-from us_sim.standalone.endpoints import Endpoint, Reader, SampleInfo, Writer
+from . import ddsc
+from .ddsc import DdsError, check, guid_of, lib
+from .dispatcher import Dispatcher
+from .domain import DiscoveryRange, acquire_domain, release_domain
+from .endpoint_qos import EndpointQos, dds_qos, participant_qos, qos_of_profile
+from .endpoints import Endpoint, Reader, SampleInfo, Writer
 
-__all__ = ["DdsError", "EndpointEvent", "Participant", "Reader", "SampleInfo", "Writer"]
+__all__ = ["DdsError", "Participant", "Reader", "SampleInfo", "Writer"]
 
 
 class Participant:
     """This process in a DDS domain; several may share a domain.
 
-    ``graph`` tells what else is there (`us_sim.standalone.graph`).
+    What else is there, `graph.Graph` tells.
     """
 
     def __init__(
@@ -48,18 +48,16 @@ class Participant:
         Raises:
             DdsError: the domain cannot be joined.
         """
-        from us_sim.standalone.graph import Graph
-
         self.domain_id = domain_id
         self.enclave = enclave
-        self._endpoints: set[Endpoint] = set()
+        self._endpoints: weakref.WeakSet[Endpoint] = weakref.WeakSet()
         self._topics: dict[tuple[str, str], int] = {}
         self._lock = threading.Lock()
         self._closed = False
         acquire_domain(domain_id, reach or DiscoveryRange.from_environment())
         try:
             with participant_qos(f"enclave={enclave};") as qos:
-                self._handle = check(
+                self.handle = check(
                     lib.dds_create_participant(domain_id, qos, None),
                     f"DDS domain {domain_id} cannot be joined; "
                     f"too many processes on this host may be in it",
@@ -67,12 +65,18 @@ class Participant:
         except DdsError:
             release_domain(domain_id)
             raise
-        self.gid = guid_of(self._handle)  # 16 bytes
-        self._dispatcher = Dispatcher(self._handle)
-        self.graph = Graph(self)
+        self.gid = guid_of(self.handle)  # 16 bytes
+        self.dispatcher = Dispatcher(self.handle)
         _open_participants.add(self)
 
-    def create_writer(self, dds_topic: str, dds_type: str, qos: Any, user_data: str = "") -> Writer:
+    def create_writer(
+        self,
+        dds_topic: str,
+        dds_type: str,
+        qos: Any,
+        user_data: str = "",
+        on_incompatible: Callable[[str], None] | None = None,
+    ) -> Writer:
         """A writer on a topic.
 
         Args:
@@ -80,17 +84,13 @@ class Participant:
             dds_type: for example ``sensor_msgs::msg::dds_::Image_``.
             qos: a QoSProfile of rclpy's, or an EndpointQos.
             user_data: for example ``typehash=RIHS01_…;``.
+            on_incompatible: called with the name of the policy by which a reader was refused.
 
         Raises:
             DdsError: the topic or the quality of service is refused.
         """
-        endpoint_qos = self._resolve(dds_topic, qos, is_writer=True)
-        with self._lock, dds_qos(endpoint_qos, user_data) as handle:
-            writer = check(
-                lib.dds_create_writer(self._handle, self._topic(dds_topic, dds_type), handle, None),
-                f"no writer can be made on {dds_topic!r}; check its quality of service",
-            )
-        return self._remember(Writer(self, writer, endpoint_qos))
+        policies, handle = self._create("writer", dds_topic, dds_type, qos, user_data, False)
+        return self._remember(Writer(self.dispatcher, handle, policies, on_incompatible))
 
     def create_reader(
         self,
@@ -99,19 +99,29 @@ class Participant:
         qos: Any,
         user_data: str = "",
         ignore_own: bool = False,
+        on_incompatible: Callable[[str], None] | None = None,
     ) -> Reader:
         """A reader on a topic; arguments as for `create_writer`.
 
         Args:
             ignore_own: leave out what this participant's own writers write.
         """
-        endpoint_qos = self._resolve(dds_topic, qos, is_writer=False)
-        with self._lock, dds_qos(endpoint_qos, user_data, ignore_own) as handle:
-            reader = check(
-                lib.dds_create_reader(self._handle, self._topic(dds_topic, dds_type), handle, None),
-                f"no reader can be made on {dds_topic!r}; check its quality of service",
+        policies, handle = self._create("reader", dds_topic, dds_type, qos, user_data, ignore_own)
+        return self._remember(Reader(self.dispatcher, handle, policies, on_incompatible))
+
+    def _create(
+        self, kind: str, dds_topic: str, dds_type: str, qos: Any, user_data: str, ignore_own: bool
+    ) -> tuple[EndpointQos, int]:
+        """The policies and the C handle of a new reader or writer."""
+        if self._closed:
+            raise DdsError(f"the participant is closed, so {dds_topic!r} cannot be joined")
+        policies = qos if isinstance(qos, EndpointQos) else qos_of_profile(qos)
+        create = getattr(lib, f"dds_create_{kind}")
+        with self._lock, dds_qos(policies, user_data, ignore_own) as dds_policies:
+            return policies, check(
+                create(self.handle, self._topic(dds_topic, dds_type), dds_policies, None),
+                f"no {kind} can be made on {dds_topic!r}; check its quality of service",
             )
-        return self._remember(Reader(self, reader, endpoint_qos))
 
     def close(self) -> None:
         """Leave the domain, ending every endpoint. Nothing is called back after this."""
@@ -121,10 +131,9 @@ class Participant:
             self._closed = True
         _open_participants.discard(self)
         self._silence()
-        self.graph.close()
         for endpoint in list(self._endpoints):
-            endpoint._end()
-        lib.dds_delete(self._handle)
+            endpoint.end()
+        lib.dds_delete(self.handle)
         release_domain(self.domain_id)
 
     def __enter__(self) -> Participant:
@@ -137,20 +146,8 @@ class Participant:
         """Receive nothing more and end the thread that calls back."""
         for endpoint in list(self._endpoints):
             if isinstance(endpoint, Reader):
-                endpoint._end()
-        self._dispatcher.close()
-
-    def _resolve(self, dds_topic: str, qos: Any, is_writer: bool) -> EndpointQos:
-        if self._closed:
-            raise DdsError(f"the participant is closed, so {dds_topic!r} cannot be joined")
-        if isinstance(qos, EndpointQos):
-            return qos
-        opposite = [
-            endpoint.qos
-            for endpoint in self.graph.endpoints(dds_topic)
-            if endpoint.is_writer != is_writer
-        ]
-        return qos_of_profile(qos, is_writer, opposite)
+                endpoint.end()
+        self.dispatcher.close()
 
     def _topic(self, dds_topic: str, dds_type: str) -> int:
         key = (dds_topic, dds_type)
@@ -158,7 +155,7 @@ class Participant:
             descriptor = ddsc.topic_descriptor(dds_type)
             self._topics[key] = check(
                 lib.dds_create_topic(
-                    self._handle, ct.byref(descriptor), dds_topic.encode(), None, None
+                    self.handle, ct.byref(descriptor), dds_topic.encode(), None, None
                 ),
                 f"there can be no topic {dds_topic!r} of type {dds_type!r}",
             )

@@ -4,18 +4,17 @@
 Names, arguments, defaults and errors are those of rclpy 7.1 (Jazzy).
 """
 
-from typing import TYPE_CHECKING
+import inspect
+from typing import Any
 
 from .context import Context
+from .executors import Executor, SingleThreadedExecutor
+from .node import Node
 from .parameter import Parameter
 from .signals import SignalHandlerOptions, install_signal_handlers, uninstall_signal_handlers
 from .task import Future
 from .utilities import get_default_context, get_rmw_implementation_identifier, ok, try_shutdown
 from .utilities import shutdown as _shutdown
-
-if TYPE_CHECKING:
-    from .executors import Executor
-    from .node import Node
 
 __all__ = [
     "Context",
@@ -37,7 +36,7 @@ __all__ = [
     "uninstall_signal_handlers",
 ]
 
-_global_executor: "Executor | None" = None
+_global_executor: Executor | None = None
 
 
 def init(
@@ -64,12 +63,10 @@ def init(
     install_signal_handlers(signal_handler_options)
 
 
-def get_global_executor() -> "Executor":
+def get_global_executor() -> Executor:
     """The executor that `spin` and the like use when none is given."""
     global _global_executor
     if _global_executor is None:
-        from .executors import SingleThreadedExecutor
-
         _global_executor = SingleThreadedExecutor()
         get_default_context().on_shutdown(_end_global_executor)
     return _global_executor
@@ -95,42 +92,16 @@ def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None 
         uninstall_signal_handlers()
 
 
-def create_node(
-    node_name: str,
-    *,
-    context: Context | None = None,
-    cli_args: list[str] | None = None,
-    namespace: str | None = None,
-    use_global_arguments: bool = True,
-    enable_rosout: bool = True,
-    start_parameter_services: bool = True,
-    parameter_overrides: list[Parameter] | None = None,
-    allow_undeclared_parameters: bool = False,
-    automatically_declare_parameters_from_overrides: bool = False,
-    enable_logger_service: bool = False,
-) -> "Node":
+def create_node(node_name: str, **arguments: Any) -> Node:
     """Make a node; the arguments are those of `rclpy.node.Node`."""
-    from .node import Node
+    return Node(node_name, **arguments)
 
-    return Node(
-        node_name,
-        context=context,
-        cli_args=cli_args,
-        namespace=namespace,
-        use_global_arguments=use_global_arguments,
-        enable_rosout=enable_rosout,
-        start_parameter_services=start_parameter_services,
-        parameter_overrides=parameter_overrides,
-        allow_undeclared_parameters=allow_undeclared_parameters,
-        automatically_declare_parameters_from_overrides=(
-            automatically_declare_parameters_from_overrides
-        ),
-        enable_logger_service=enable_logger_service,
-    )
+
+create_node.__signature__ = inspect.signature(Node)  # type: ignore[attr-defined]
 
 
 def spin_once(
-    node: "Node", *, executor: "Executor | None" = None, timeout_sec: float | None = None
+    node: Node, *, executor: Executor | None = None, timeout_sec: float | None = None
 ) -> None:
     """Run one callback of a node, waiting for one to be ready until the time is over."""
     executor = get_global_executor() if executor is None else executor
@@ -141,7 +112,7 @@ def spin_once(
         executor.remove_node(node)
 
 
-def spin(node: "Node", executor: "Executor | None" = None) -> None:
+def spin(node: Node, executor: Executor | None = None) -> None:
     """Run a node's callbacks until the context is shut down.
 
     Raises:
@@ -157,9 +128,9 @@ def spin(node: "Node", executor: "Executor | None" = None) -> None:
 
 
 def spin_until_future_complete(
-    node: "Node",
+    node: Node,
     future: Future,
-    executor: "Executor | None" = None,
+    executor: Executor | None = None,
     timeout_sec: float | None = None,
 ) -> None:
     """Run a node's callbacks until a future is done, or the time is over."""

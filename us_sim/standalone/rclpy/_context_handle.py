@@ -4,18 +4,26 @@ import os
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Condition, RLock
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from threading import RLock
 
+from ..graph import Graph, GraphNode
+from ..transport import DdsError, Participant
 from ._arguments import Arguments
-from ._local_node import LocalNode
 from ._rclpy_pybind11 import RCLError
 from ._wake_up import WakeUp
 
-if TYPE_CHECKING:
-    from ..transport import Participant
+__all__ = ["ContextHandle", "LocalNode"]
 
-__all__ = ["ContextHandle"]
+
+@dataclass(eq=False)
+class LocalNode:
+    """What others learn about a node of this process: its name, its readers and its writers."""
+
+    name: str
+    namespace: str
+    readers: list[bytes] = field(default_factory=list)
+    writers: list[bytes] = field(default_factory=list)
 
 
 class ContextHandle:
@@ -25,15 +33,18 @@ class ContextHandle:
     """
 
     def __init__(self, arguments: Arguments, domain_id: int | None) -> None:
-        self.graph_changed = Condition()
         self._valid = True
         self._waiting: tuple[weakref.ReferenceType[WakeUp], ...] = ()
-        self._participant: Participant | None = None
         self._nodes: list[LocalNode] = []
         self._postponing = 0
         self._lock = RLock()
         self.arguments = arguments
         self.domain_id = _domain_from_environment() if domain_id is None else domain_id
+        try:
+            self.participant = Participant(self.domain_id, arguments.enclave)
+        except DdsError as error:
+            raise RCLError(f"failed to initialize rcl: {error}") from None
+        self.graph = Graph(self.participant)
 
     def ok(self) -> bool:
         return self._valid
@@ -58,21 +69,6 @@ class ContextHandle:
         with self._lock:  # the tuple is replaced, never changed: a signal may read it at any time
             alive = tuple(reference for reference in self._waiting if reference() is not None)
             self._waiting = (*alive, weakref.ref(waiting))
-
-    @property
-    def participant(self) -> "Participant":
-        """The DDS participant, made when it is first asked for."""
-        with self._lock:
-            if self._participant is None:
-                from ..transport import Participant
-
-                self._participant = Participant(self.domain_id, self.arguments.enclave)
-                self._participant.graph.on_change = self._on_graph_change
-            return self._participant
-
-    def _on_graph_change(self, *_: Any) -> None:
-        with self.graph_changed:
-            self.graph_changed.notify_all()
 
     def add_node(self, node: LocalNode) -> None:
         """Have a node known to others."""
@@ -102,18 +98,20 @@ class ContextHandle:
     def announce(self) -> None:
         """Tell others which nodes there are, and with which endpoints."""
         with self._lock:
-            if self._participant is not None and not self._postponing:
-                self._participant.graph.announce([node.description() for node in self._nodes])
+            if not self._postponing:
+                self.graph.announce(
+                    GraphNode(node.namespace, node.name, tuple(node.readers), tuple(node.writers))
+                    for node in self._nodes
+                )
 
     def close(self) -> None:
         """Leave the network. What the nodes still hold does nothing from now on."""
-        with self._lock:
-            participant, self._participant = self._participant, None
-        if participant is not None:
-            participant.close()
+        self.graph.close()
+        self.participant.close()
 
     def __del__(self) -> None:
-        self.close()
+        if hasattr(self, "graph"):  # the domain could be joined
+            self.close()
 
 
 def _domain_from_environment() -> int:

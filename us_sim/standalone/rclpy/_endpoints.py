@@ -1,4 +1,4 @@
-"""What stands behind publishers and subscriptions: DDS writers and readers.
+"""From rclpy's topics and services to DDS readers and writers.
 
 Readers say from the transport's thread that data may be waiting; executors take it in their own.
 """
@@ -7,23 +7,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ..messages import CdrError, deserialize, serialize, type_hash
-from ..transport import DdsError, EndpointEvent
+from ..messages import CdrError, deserialize, type_hash
+from ..transport import DdsError, Reader, Writer
 from ._context_handle import ContextHandle
-from ._rclpy_pybind11 import InvalidHandle, RCLError
-from .duration import Duration
+from ._rclpy_pybind11 import Destroyable, RCLError
+from .exceptions import NoTypeSupportImportedException
+from .logging import get_logger
 from .qos import QoSProfile
 
-__all__ = [
-    "Endpoint",
-    "Inbox",
-    "NodeLink",
-    "PublisherHandle",
-    "SubscriptionHandle",
-    "message_of",
-]
+__all__ = ["Connected", "NodeLink", "Receiver", "message_of", "open_reader", "open_writer"]
 
-Listener = Callable[[EndpointEvent], None]
+_REFUSED_BY_WRITER = (
+    "New subscription discovered on topic '{}', requesting incompatible QoS. "
+    "No messages will be sent to it. Last incompatible policy: {}"
+)
+_REFUSED_BY_READER = (
+    "New publisher discovered on topic '{}', offering incompatible QoS. "
+    "No messages will be received from it. Last incompatible policy: {}"
+)
 
 
 @dataclass(frozen=True)
@@ -35,102 +36,54 @@ class NodeLink:
     wake: Callable[[], None]
 
 
-class Endpoint:
-    """Common to publishers, subscriptions, clients and services: it exists until `destroy`."""
+def open_writer(
+    link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
+) -> Writer:
+    """A DDS writer for a topic, given its name as the node wrote it and the absolute one.
 
-    def __init__(self, link: NodeLink, name: str) -> None:
-        self.logger_name = link.logger_name
-        self._context = link.context
-        self._wake = link.wake
-        self._name = name
-        self._destroyed = False
-
-    def _require_existence(self) -> None:
-        if self._destroyed:
-            raise InvalidHandle("cannot use Destroyable because destruction was requested")
-
-
-class _TopicEndpoint(Endpoint):
-    """A reader or a writer of a topic, and who listens to what happens to it."""
-
-    _endpoint: Any
-
-    def __init__(self, link: NodeLink, topic: str) -> None:
-        super().__init__(link, topic)
-        self._listeners: dict[str, Listener] = {}
-
-    @property
-    def gid(self) -> bytes:
-        """16 bytes that no other endpoint has."""
-        return self._endpoint.gid
-
-    def get_topic_name(self) -> str:
-        """The absolute name of the topic."""
-        self._require_existence()
-        return self._name
-
-    def add_event_listener(self, kind: str, listener: Listener) -> None:
-        """Have a kind of event reported, from the transport's thread, once `listen` was called."""
-        self._listeners[kind] = listener
-
-    def listen(self) -> None:
-        """Report events from now on, those before included."""
-        if self._listeners:
-            self._endpoint.on_event = self._dispatch
-
-    def remove_event_listener(self, kind: str) -> None:
-        """The counterpart of `add_event_listener`."""
-        self._listeners.pop(kind, None)
-
-    def _dispatch(self, event: EndpointEvent) -> None:
-        listener = self._listeners.get(event.kind)
-        if listener is not None:
-            listener(event)
-            self._wake()
-
-    def destroy(self) -> None:
-        """Leave the topic."""
-        if not self._destroyed:
-            self._destroyed = True
-            self._endpoint.close()
+    Raises:
+        NoTypeSupportImportedException: the class is none of messages.
+        RCLError: the quality of service is refused.
+    """
+    warn = _warning(link, _REFUSED_BY_WRITER, topic)
+    try:
+        return link.context.participant.create_writer(
+            *_described(msg_type, full_name, qos), on_incompatible=warn
+        )
+    except DdsError as error:
+        raise RCLError(f"failed to create publisher: {error}") from None
 
 
-class PublisherHandle(_TopicEndpoint):
-    """Writes messages to a topic."""
+def open_reader(
+    link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
+) -> Reader:
+    """A DDS reader for a topic; arguments and errors as for `open_writer`."""
+    warn = _warning(link, _REFUSED_BY_READER, topic)
+    try:
+        return link.context.participant.create_reader(
+            *_described(msg_type, full_name, qos), on_incompatible=warn
+        )
+    except DdsError as error:
+        raise RCLError(f"failed to create subscription: {error}") from None
 
-    def __init__(self, link: NodeLink, msg_type: Any, topic: str, qos: QoSProfile) -> None:
-        super().__init__(link, topic)
-        self._endpoint = link.context.participant.create_writer(*_topic(topic, msg_type, qos))
-        self._write = self._endpoint.write
 
-    def publish(self, msg: Any) -> bool:
-        """Send a message; False when a subscription was too slow to accept it."""
-        return self.publish_raw(serialize(msg))
+def _warning(link: NodeLink, text: str, topic: str) -> Callable[[str], None]:
+    logger = get_logger(link.logger_name)
+    return lambda policy: logger.warning(text.format(topic, policy))
 
-    def publish_raw(self, data: bytes) -> bool:
-        """Send a serialized message; False when a subscription was too slow to accept it."""
-        self._require_existence()
-        if not self._context.ok():
-            raise RCLError("Failed to publish: publisher's context is invalid")
-        try:
-            return self._write(data)
-        except DdsError as error:
-            raise RCLError(f"Failed to publish: {error}") from None
 
-    def get_subscription_count(self) -> int:
-        """How many subscriptions are connected."""
-        self._require_existence()
-        return self._endpoint.matched_count()
-
-    def assert_liveliness(self) -> None:
-        """Say that this publisher is alive."""
-        self._require_existence()
-        self._endpoint.assert_liveliness()
-
-    def wait_for_all_acked(self, timeout: Duration) -> bool:
-        """Whether everything was received within a time; a negative one never ends."""
-        self._require_existence()
-        return self._endpoint.wait_for_acked(timeout.nanoseconds / 1e9)
+def _described(msg_type: Any, full_name: str, qos: QoSProfile) -> tuple[str, str, QoSProfile, str]:
+    """DDS topic, DDS type, quality and user data."""
+    name = getattr(msg_type, "__msgtype__", None)
+    if not isinstance(msg_type, type) or name is None or hasattr(msg_type, "Request"):
+        raise NoTypeSupportImportedException()
+    package, folder, short_name = name.split("/")
+    return (
+        full_name[1:] if qos.avoid_ros_namespace_conventions else f"rt{full_name}",
+        f"{package}::{folder}::dds_::{short_name}_",
+        qos,
+        f"typehash={type_hash(name)};",
+    )
 
 
 class Inbox:
@@ -141,14 +94,14 @@ class Inbox:
 
     def __init__(self, take: Callable[[], Any], wake: Callable[[], None]) -> None:
         self.ready = False
-        self.wake = wake
+        self._wake = wake
         self._take = take
         self._fetched: Any = None
 
     def notify(self) -> None:
         """Data may have come; called from the transport's thread."""
         self.ready = True
-        self.wake()
+        self._wake()
 
     def fetch(self) -> bool:
         """Whether there is something to take."""
@@ -165,33 +118,51 @@ class Inbox:
         return fetched
 
 
-class SubscriptionHandle(_TopicEndpoint):
-    """Reads messages from a topic."""
+class Connected(Destroyable):
+    """What is on the network under an absolute name until `destroy`."""
 
-    def __init__(self, link: NodeLink, msg_type: Any, topic: str, qos: QoSProfile) -> None:
-        super().__init__(link, topic)
-        self._endpoint = link.context.participant.create_reader(*_topic(topic, msg_type, qos))
-        self.inbox = Inbox(self._endpoint.take, self._wake)
-        self._endpoint.on_data = self.inbox.notify
+    def __init__(self, full_name: str, endpoint: Any) -> None:
+        self._full_name = full_name
+        self._endpoint = endpoint
+        self._gids: tuple[list[bytes], list[bytes]] = endpoint.gids  # of readers and writers
 
-    def take_message(self, msg_type: Any, raw: bool) -> tuple[Any, dict[str, Any]] | None:
-        """The oldest message that is waiting (as bytes if raw) and where it came from."""
+    def destroy(self) -> None:
+        """Leave the network; use the node's own method for that."""
+        super().destroy()
+        self._endpoint.close()
+
+    def _existing_name(self) -> str:
         self._require_existence()
-        taken = self.inbox.take()
-        if taken is None:
-            return None
-        data, info = taken
-        return data if raw else message_of(data, msg_type), {
-            "source_timestamp": info.source_timestamp,
-            "received_timestamp": info.received_timestamp,
-            "publication_sequence_number": None,
-            "reception_sequence_number": None,
-        }
+        return self._full_name
 
-    def get_publisher_count(self) -> int:
-        """How many publishers are connected."""
+
+class Receiver(Connected):
+    """A subscription, client or service as executors see it: its inbox says when it is ready."""
+
+    _executor_event = False
+
+    def __init__(
+        self, link: NodeLink, full_name: str, endpoint: Any, take: Callable[[], Any]
+    ) -> None:
+        super().__init__(full_name, endpoint)
+        self._inbox = Inbox(take, link.wake)
+        endpoint.on_data = self._inbox.notify
+
+    def _stirred(self) -> bool:
+        return self._inbox.ready
+
+    def _fetch(self) -> bool:
+        return self._inbox.fetch()
+
+    def _take(self) -> Callable[[], Any] | None:
+        """The call to be made for the oldest data that wait, None when there are none."""
         self._require_existence()
-        return self._endpoint.matched_count()
+        taken = self._inbox.take()
+        return None if taken is None else self._call_for(*taken)
+
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
+        """The call to be made for serialized data that came from somewhere."""
+        raise NotImplementedError
 
 
 def message_of(data: bytes, cls: Any) -> Any:
@@ -200,11 +171,3 @@ def message_of(data: bytes, cls: Any) -> Any:
         return deserialize(data, cls)
     except CdrError as error:
         raise RCLError(f"failed to take message: {error}") from None
-
-
-def _topic(topic: str, msg_type: Any, qos: QoSProfile) -> tuple[str, str, QoSProfile, str]:
-    """DDS topic, DDS type, quality and user data of an endpoint."""
-    package, folder, name = msg_type.__msgtype__.split("/")
-    dds_topic = topic[1:] if qos.avoid_ros_namespace_conventions else f"rt{topic}"
-    dds_type = f"{package}::{folder}::dds_::{name}_"
-    return dds_topic, dds_type, qos, f"typehash={type_hash(msg_type.__msgtype__)};"

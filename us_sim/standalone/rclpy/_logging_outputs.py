@@ -4,18 +4,16 @@ Levels belong to logger names: a logger without one takes its parent's, and at t
 """
 
 import os
-import re
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
 
 from ._arguments import Arguments
 from .impl.logging_severity import LoggingSeverity
 
-__all__ = ["Record", "add_rosout", "add_sublogger", "configure", "effective_level", "emit"]
+__all__ = ["Record", "add_rosout", "configure", "effective_level", "emit"]
 
 _COLORS = {
     LoggingSeverity.DEBUG: "\033[32m",
@@ -32,6 +30,7 @@ class Record:
 
     severity: LoggingSeverity
     name: str
+    node: str  # the logger of the node that the logger belongs to, itself where there is none
     message: str
     function: str
     file: str
@@ -45,7 +44,6 @@ _default_level = LoggingSeverity.INFO
 _disabled: frozenset[str] = frozenset()
 _users = 0
 _rosout: dict[str, Callable[[Record], None]] = {}
-_subloggers: dict[str, int] = {}
 
 
 def configure(arguments: Arguments) -> None:
@@ -80,11 +78,6 @@ def set_level(name: str, level: LoggingSeverity) -> None:
             _default_level = level
 
 
-def own_level(name: str) -> LoggingSeverity:
-    """The level that a logger was given, UNSET when it was not."""
-    return _levels.get(name, LoggingSeverity.UNSET) if name else _default_level
-
-
 def effective_level(name: str) -> LoggingSeverity:
     """The level that holds for a logger: its own, its nearest ancestor's, or the default."""
     while name and _levels:
@@ -105,37 +98,18 @@ def remove_rosout(name: str) -> None:
     """Stop publishing what a node's logger and its children say."""
     with _lock:
         _rosout.pop(name, None)
-        for sublogger in [other for other in _subloggers if other.startswith(f"{name}.")]:
-            _subloggers.pop(sublogger)
-            _rosout.pop(sublogger, None)
 
 
-def add_sublogger(parent: str, name: str) -> bool:
-    """Publish what a child says when its parent is published; False when it is not."""
-    with _lock:
-        publish = _rosout.get(parent)
-        if publish is None:
-            return False
-        _subloggers[name] = _subloggers.get(name, 0) + 1
-        _rosout[name] = publish
-        return True
-
-
-def remove_sublogger(name: str) -> None:
-    """The counterpart of `add_sublogger`."""
-    with _lock:
-        if name in _subloggers:
-            _subloggers[name] -= 1
-            if not _subloggers[name]:
-                del _subloggers[name]
-                _rosout.pop(name, None)
+def is_published(name: str) -> bool:
+    """Whether a logger is a node's whose messages are published."""
+    return name in _rosout
 
 
 def emit(record: Record) -> None:
-    """Write a record to the console and publish it."""
+    """Write a record to the console, and publish it if its logger belongs to a node."""
     if "stdout" not in _disabled:
         _write(record)
-    publish = _rosout.get(record.name)
+    publish = _rosout.get(record.node)
     if publish is not None and "rosout" not in _disabled:
         publish(record)
 
@@ -145,7 +119,9 @@ def _write(record: Record) -> None:
     stream = sys.stdout if environment.get("RCUTILS_LOGGING_USE_STDOUT") == "1" else sys.stderr
     if stream is None:
         return
-    text = format_record(record, environment.get("RCUTILS_CONSOLE_OUTPUT_FORMAT"))
+    seconds, nanoseconds = divmod(record.stamp, 1_000_000_000)
+    moment = f"{seconds}.{nanoseconds:09d}"
+    text = f"[{record.severity.name}] [{moment}] [{record.name}]: {record.message}"
     colorized = environment.get("RCUTILS_COLORIZED_OUTPUT", "")
     if colorized == "1" or (colorized != "0" and stream.isatty()):
         text = f"{_COLORS[record.severity]}{text}\033[0m"
@@ -154,30 +130,6 @@ def _write(record: Record) -> None:
         stream.flush()
     except (OSError, ValueError):
         pass  # a closed or broken stream must not end the node that logs
-
-
-def format_record(record: Record, template: str | None = None) -> str:
-    """The line for a record; templates have the tokens of RCUTILS_CONSOLE_OUTPUT_FORMAT."""
-    seconds, nanoseconds = divmod(record.stamp, 1_000_000_000)
-    moment = f"{seconds}.{nanoseconds:09d}"
-    if not template:
-        return f"[{record.severity.name}] [{moment}] [{record.name}]: {record.message}"
-    tokens = {
-        "severity": record.severity.name,
-        "name": record.name,
-        "message": record.message,
-        "function_name": record.function,
-        "file_name": record.file,
-        "line_number": str(record.line),
-        "time": moment,
-        "time_as_nanoseconds": str(record.stamp),
-    }
-    if "date_time_with_ms" in template:
-        local = datetime.fromtimestamp(seconds)
-        tokens["date_time_with_ms"] = f"{local:%Y-%m-%d %H:%M:%S}.{nanoseconds // 1_000_000:03d}"
-    escapes = {"\\n": "\n", "\\t": "\t", "\\a": "\a", "\\033": "\033", "\\x1b": "\033"}
-    template = re.sub(r"\\(n|t|a|033|x1b)", lambda found: escapes[found.group()], template)
-    return re.sub(r"\{(\w+)\}", lambda found: tokens.get(found.group(1), found.group()), template)
 
 
 def now() -> int:

@@ -10,12 +10,23 @@ Every check returns None, or the sentence that rcl writes and the index of the o
 
 import re
 
+from .exceptions import (
+    InvalidNamespaceException,
+    InvalidNodeNameException,
+    InvalidServiceNameException,
+    InvalidTopicNameException,
+)
+
 __all__ = [
     "error_in_full_topic_name",
     "error_in_namespace",
     "error_in_node_name",
     "error_in_topic_name",
     "expand",
+    "require_full_name",
+    "require_namespace",
+    "require_node_name",
+    "require_topic_name",
 ]
 
 Fault = tuple[str, int] | None
@@ -129,6 +140,34 @@ def _error_in_characters(name: str) -> Fault:
     if opened is not None:
         return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
     return None
+
+
+def require_node_name(name: str) -> None:
+    """Raise InvalidNodeNameException when a node name is not allowed."""
+    if error := error_in_node_name(name):
+        raise InvalidNodeNameException(name, *error)
+
+
+def require_namespace(namespace: str) -> None:
+    """Raise InvalidNamespaceException when an absolute namespace is not allowed."""
+    if error := error_in_namespace(namespace):
+        raise InvalidNamespaceException(namespace, *error)
+
+
+def require_topic_name(name: str, *, is_service: bool) -> None:
+    """Raise InvalidTopicNameException, or InvalidServiceNameException, as a person writes it."""
+    _refuse(name, error_in_topic_name(name), is_service)
+
+
+def require_full_name(name: str, *, is_service: bool) -> None:
+    """As `require_topic_name`, for an expanded name."""
+    _refuse(name, error_in_full_topic_name(name), is_service)
+
+
+def _refuse(name: str, error: Fault, is_service: bool) -> None:
+    if error:
+        kind = InvalidServiceNameException if is_service else InvalidTopicNameException
+        raise kind(name, *error)
 
 
 def expand(name: str, node_name: str, namespace: str) -> str:

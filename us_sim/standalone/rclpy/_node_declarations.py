@@ -7,6 +7,7 @@ from typing import Any
 from ..messages import message_class
 from ._node_parameters import NodeParameters
 from .exceptions import (
+    InvalidParameterException,
     InvalidParameterTypeException,
     InvalidParameterValueException,
     ParameterAlreadyDeclaredException,
@@ -14,7 +15,6 @@ from .exceptions import (
     ParameterNotDeclaredException,
 )
 from .parameter import Parameter
-from .validate_parameter_name import validate_parameter_name
 
 __all__ = ["NodeDeclarations"]
 
@@ -71,7 +71,7 @@ class NodeDeclarations(NodeParameters):
         values: list[Parameter] = []
         descriptors: dict[str, Any] = {}
         for index, declaration in enumerate(parameters):
-            name, value, descriptor = self._read_declaration(namespace, index, declaration)
+            name, value, descriptor = self._rcl_read_declaration(namespace, index, declaration)
             if not ignore_override and name in self._parameter_overrides:
                 value = self._parameter_overrides[name].value
             values.append(Parameter(name, value=value))
@@ -80,7 +80,7 @@ class NodeDeclarations(NodeParameters):
         if declared:
             raise ParameterAlreadyDeclaredException(declared)
         for parameter in values:
-            result = self._set_all([parameter], descriptors, declaring=True)
+            result = self._rcl_set_all([parameter], descriptors, declaring=True)
             if not result.successful:
                 if result.reason.startswith("Wrong parameter type"):
                     raise InvalidParameterTypeException(
@@ -89,7 +89,7 @@ class NodeDeclarations(NodeParameters):
                 raise InvalidParameterValueException(parameter.name, parameter.value, result.reason)
         return [self._parameters[parameter.name] for parameter in values]
 
-    def _read_declaration(
+    def _rcl_read_declaration(
         self, namespace: str, index: int, declaration: tuple[Any, ...]
     ) -> tuple[str, Any, Any]:
         """Full name, default and completed descriptor of one declaration."""
@@ -105,7 +105,8 @@ class NodeDeclarations(NodeParameters):
             )
         if namespace:
             name = f"{namespace}.{name}"
-        validate_parameter_name(name)
+        if not name:
+            raise InvalidParameterException(name)
         if len(declaration) < 3:
             descriptor = ParameterDescriptor()
         if not isinstance(descriptor, ParameterDescriptor):
@@ -176,38 +177,3 @@ class NodeDeclarations(NodeParameters):
     def describe_parameters(self, names: list[str]) -> list[Any]:
         """The descriptors of several parameters; raises as `describe_parameter`."""
         return [self.describe_parameter(name) for name in names]
-
-    def set_descriptor(self, name: str, descriptor: Any, alternative_value: Any = None) -> Any:
-        """Describe a parameter anew.
-
-        Args:
-            name: of the parameter.
-            descriptor: a `rcl_interfaces/msg/ParameterDescriptor`.
-            alternative_value: a `rcl_interfaces/msg/ParameterValue` to be set when the present
-                value is not allowed any more.
-
-        Returns:
-            The value that holds now, as a `rcl_interfaces/msg/ParameterValue`.
-
-        Raises:
-            ParameterNotDeclaredException: the parameter is not known.
-            ParameterImmutableException: it is read-only.
-            InvalidParameterValueException: neither value is allowed.
-        """
-        if name not in self._parameters:
-            if not self._allow_undeclared_parameters:
-                raise ParameterNotDeclaredException(name)
-            return self.get_parameter(name).get_parameter_value()
-        if self.describe_parameter(name).read_only:
-            raise ParameterImmutableException(name)
-        choices = [self.get_parameter(name)]
-        if alternative_value is not None:
-            message = ParameterMsg(name=name, value=alternative_value)
-            choices.append(Parameter.from_parameter_msg(message))
-        for choice in choices:
-            reason = self._reason_against(choice, descriptor, check_read_only=False)
-            if not reason:
-                self._parameters[name] = choice
-                self._descriptors[name] = descriptor
-                return choice.get_parameter_value()
-        raise InvalidParameterValueException(name, choices[-1].value, reason)

@@ -1,7 +1,7 @@
 """The parameters of a node: getting, listing and setting them, and who has a say in it."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..messages import message_class
 from ._parameter_ranges import reason_against
@@ -28,7 +28,7 @@ class NodeParameters:
     _clock: ROSClock
     _parameter_event_publisher: Publisher | None
 
-    def _keep_parameters(
+    def _rcl_keep_parameters(
         self, overrides: dict[str, Parameter], allow_undeclared_parameters: bool
     ) -> None:
         self._parameters: dict[str, Parameter] = {}
@@ -39,9 +39,9 @@ class NodeParameters:
         self._on_set_parameters_callbacks: list[Callable[..., Any]] = []
         self._post_set_parameters_callbacks: list[Callable[..., Any]] = []
 
-    if TYPE_CHECKING:
-
-        def get_fully_qualified_name(self) -> str: ...
+    def get_fully_qualified_name(self) -> str:
+        """This node's absolute name."""
+        raise NotImplementedError
 
     def has_parameter(self, name: str) -> bool:
         """Whether a parameter is known."""
@@ -170,9 +170,9 @@ class NodeParameters:
         unknown = [p.name for p in parameter_list if p.name not in self._parameters]
         if unknown and not self._allow_undeclared_parameters:
             raise ParameterNotDeclaredException(unknown)
-        return self._set_all(parameter_list, None, declaring=False)
+        return self._rcl_set_all(parameter_list, None, declaring=False)
 
-    def _set_all(
+    def _rcl_set_all(
         self, parameters: list[Parameter], descriptors: dict[str, Any] | None, declaring: bool
     ) -> Any:
         """Check, ask the callbacks, set, and tell everybody; `descriptors` come with declaring."""
@@ -183,7 +183,7 @@ class NodeParameters:
             reason = (
                 ""
                 if descriptor is None
-                else self._reason_against(parameter, descriptor, check_read_only=not declaring)
+                else self._rcl_reason_against(parameter, descriptor, check_read_only=not declaring)
             )
             if reason:
                 return SetParametersResult(successful=False, reason=reason)
@@ -193,7 +193,7 @@ class NodeParameters:
                 return result
         event = ParameterEvent(node=self.get_fully_qualified_name())
         for parameter in parameters:
-            changes = self._set_one(parameter, descriptors, declaring)
+            changes = self._rcl_set_one(parameter, descriptors, declaring)
             getattr(event, changes).append(parameter.to_parameter_msg())
         event.stamp = self._clock.now().to_msg()
         if self._parameter_event_publisher is not None:
@@ -202,7 +202,7 @@ class NodeParameters:
             callback(parameters)
         return SetParametersResult(successful=True)
 
-    def _set_one(
+    def _rcl_set_one(
         self, parameter: Parameter, descriptors: dict[str, Any] | None, declaring: bool
     ) -> str:
         """Set what was checked; returns which part of a parameter event tells it."""
@@ -219,7 +219,7 @@ class NodeParameters:
         self._parameters[name] = parameter
         return "new_parameters" if is_new else "changed_parameters"
 
-    def _reason_against(
+    def _rcl_reason_against(
         self, parameter: Parameter, descriptor: Any, *, check_read_only: bool
     ) -> str:
         """Why a descriptor does not allow a value, '' when it does; completes the descriptor."""

@@ -5,15 +5,19 @@ from typing import Any
 
 from ..messages import message_class
 from . import _logging_outputs as outputs
-from ._endpoints import NodeLink, PublisherHandle
+from ._endpoints import NodeLink
 from ._rclpy_pybind11 import InvalidHandle, RCLError
 from .duration import Duration
+from .publisher import Publisher
 from .qos import DurabilityPolicy, QoSProfile
 from .time import Time
 
 __all__ = ["Rosout"]
 
 Log: Any = message_class("rcl_interfaces/msg/Log")
+_QOS = QoSProfile(
+    depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10)
+)
 
 
 class Rosout:
@@ -21,16 +25,7 @@ class Rosout:
 
     def __init__(self, link: NodeLink) -> None:
         self._name = link.logger_name
-        self.publisher = PublisherHandle(
-            link,
-            Log,
-            "/rosout",
-            QoSProfile(
-                depth=1000,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL,
-                lifespan=Duration(seconds=10),
-            ),
-        )
+        self.publisher = Publisher(link, Log, "/rosout", "/rosout", _QOS)
         outputs.add_rosout(self._name, self._publish)
 
     def _publish(self, record: outputs.Record) -> None:

@@ -2,38 +2,47 @@
 
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+from ..messages import serialize
+from ..services import ServiceClient
+from ._endpoints import NodeLink, Receiver, message_of
+from ._rclpy_pybind11 import RCLError
 from .callback_groups import CallbackGroup
 from .context import Context
 from .qos import QoSProfile
 from .task import Future
 
-__all__ = ["Client"]
+__all__ = ["Client", "wait_until"]
 
-_LONGEST_WAIT = 0.25  # s; the graph's changes wake it earlier
+_PAUSE = 0.01  # s, between two looks at whether a service is there
 
 
-class Client:
+class Client(Receiver):
     """Sends requests to one service."""
 
     def __init__(
         self,
         context: Context,
-        client_impl: Any,
+        link: NodeLink,
         srv_type: Any,
         srv_name: str,
+        full_name: str,
         qos_profile: QoSProfile,
         callback_group: CallbackGroup,
     ) -> None:
+        endpoint = ServiceClient(
+            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+        )
+        super().__init__(link, full_name, endpoint, endpoint.take_response)
         self.context = context
-        self._client = client_impl
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.qos_profile = qos_profile
         self.callback_group = callback_group
         self._pending_requests: dict[int, Future] = {}
-        self._executor_event = False
         self._lock = threading.Lock()
 
     def call(self, request: Any, timeout_sec: float | None = None) -> Any:
@@ -66,11 +75,12 @@ class Client:
         """
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(f"Expected {self.srv_type.Request}, got {type(request)}")
+        self._require_existence()
+        if not self.context.ok():
+            raise RCLError("failed to send request: the client's context is invalid")
         future = Future()
         with self._lock:  # held over sending: the response may come before this returns
-            sequence_number = self._client.send_request(request)
-            if sequence_number in self._pending_requests:
-                raise RuntimeError(f"Sequence ({sequence_number}) conflicts with pending request")
+            sequence_number = self._endpoint.send_request(serialize(request))
             self._pending_requests[sequence_number] = future
         future.add_done_callback(self.remove_pending_request)
         return future
@@ -90,28 +100,31 @@ class Client:
 
     def service_is_ready(self) -> bool:
         """Whether a service is connected."""
-        return self._client.service_server_is_available()
+        self._require_existence()
+        return self._endpoint.service_is_ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
         """Wait until a service is connected; whether it was within the time."""
-        deadline = None if timeout_sec is None else time.monotonic() + timeout_sec
-        graph_changed = self.context.handle.graph_changed  # type: ignore[union-attr]
-        while self.context.ok() and not self.service_is_ready():
-            rest = _LONGEST_WAIT if deadline is None else deadline - time.monotonic()
-            if rest <= 0:
-                break
-            with graph_changed:
-                graph_changed.wait(min(rest, _LONGEST_WAIT))
-        return self.service_is_ready()
-
-    @property
-    def handle(self) -> Any:
-        return self._client
+        return wait_until(self.service_is_ready, self.context, timeout_sec)
 
     @property
     def service_name(self) -> str:
-        return self._client.service_name
+        return self._existing_name()
 
-    def destroy(self) -> None:
-        """Leave the service; use `Node.destroy_client`."""
-        self._client.destroy()
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
+        response = message_of(data, self.srv_type.Response)
+        try:
+            future = self.get_pending_request(info.sequence)
+        except KeyError:
+            return None  # nobody waits for it any more
+        return partial(future._set_result_in_executor, response)
+
+
+def wait_until(condition: Callable[[], bool], context: Context, timeout_sec: float | None) -> bool:
+    """Wait while the context is up; whether the condition came true within the time."""
+    deadline = None if timeout_sec is None else time.monotonic() + timeout_sec
+    while context.ok() and not condition():
+        if deadline is not None and time.monotonic() >= deadline:
+            break
+        time.sleep(_PAUSE)
+    return condition()

@@ -9,38 +9,23 @@ Time(nanoseconds=3000000000, clock_type=ROS_TIME)
 
 import time as wall
 import weakref
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Protocol
 
-from ._time_jump import ClockChange, JumpHandle, JumpThreshold, TimeJump
-from ._wake_up import WakeUp
 from .clock_type import ClockType
-from .constants import S_TO_NS
-from .duration import Duration
-from .exceptions import NotInitializedException
 from .time import Time
 
-if TYPE_CHECKING:
-    from .context import Context
-    from .timer import Timer
+__all__ = ["Clock", "ClockType", "ROSClock"]
 
-__all__ = [
-    "Clock",
-    "ClockChange",
-    "ClockType",
-    "JumpHandle",
-    "JumpThreshold",
-    "ROSClock",
-    "TimeJump",
-]
+
+class _Timer(Protocol):
+    def _on_time_jump(self, before: int, is_other_time: bool) -> None: ...
 
 
 class Clock:
     """Tells the time of one kind; `Clock(clock_type=ClockType.ROS_TIME)` is a ROSClock."""
 
     _clock_type: ClockType
-    _jump_handles: list[JumpHandle]
-    _timers: "weakref.WeakSet[Timer]"
+    _timers: "weakref.WeakSet[_Timer]"
 
     def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> "Clock":
         if not isinstance(clock_type, ClockType):
@@ -53,7 +38,6 @@ class Clock:
         else:
             self = super().__new__(cls)
         self._clock_type = clock_type
-        self._jump_handles = []
         self._timers = weakref.WeakSet()
         return self
 
@@ -77,65 +61,6 @@ class Clock:
         """Whether this clock advances with real time, so that one can wait for it."""
         return True
 
-    def create_jump_callback(
-        self,
-        threshold: JumpThreshold,
-        *,
-        pre_callback: Callable[[], None] | None = None,
-        post_callback: Callable[[TimeJump], None] | None = None,
-    ) -> JumpHandle:
-        """Have functions called before and after this clock is set further than a threshold.
-
-        Raises:
-            ValueError: neither callback was given, or one is not callable.
-        """
-        return JumpHandle(
-            clock=self,
-            threshold=threshold,
-            pre_callback=pre_callback,
-            post_callback=post_callback,
-        )
-
-    def sleep_until(self, until: Time, context: "Context | None" = None) -> bool:
-        """Sleep until this clock shows a time.
-
-        Returns:
-            True when the time came; False when the context was shut down before, or ROS time was
-            switched between simulated and real.
-
-        Raises:
-            NotInitializedException: the context is not up.
-            ValueError: the time is of another kind of clock.
-        """
-        if context is None:
-            from .utilities import get_default_context
-
-            context = get_default_context()
-        handle = context.handle
-        if handle is None or not handle.ok():
-            raise NotInitializedException()
-        if until.clock_type != self._clock_type:
-            raise ValueError("until's clock type does not match this clock's type")
-        waiting = WakeUp()
-        handle.register(waiting)
-        ran_by_itself = self._runs_by_itself()
-        threshold = JumpThreshold(
-            min_forward=Duration(nanoseconds=1),
-            min_backward=Duration(nanoseconds=-1),
-            on_clock_change=True,
-        )
-        with self.create_jump_callback(threshold, post_callback=lambda _: waiting.wake()):
-            while handle.ok() and self._runs_by_itself() == ran_by_itself:
-                remaining = until.nanoseconds - self._now()
-                if remaining <= 0:
-                    return True
-                waiting.wait(remaining / S_TO_NS if ran_by_itself else None)
-        return False
-
-    def sleep_for(self, rel_time: Duration, context: "Context | None" = None) -> bool:
-        """Sleep for a while by this clock; returns and raises as `sleep_until`."""
-        return self.sleep_until(self.now() + rel_time, context)
-
 
 class ROSClock(Clock):
     """A clock that shows system time until it is set by a simulator."""
@@ -158,45 +83,18 @@ class ROSClock(Clock):
             raise TypeError(
                 f"Time must be specified as rclpy.time.Time. Received type: {type(time)}"
             )
-        if self._active:
-            self._jump(
-                ClockChange.ROS_TIME_NO_CHANGE,
-                time.nanoseconds - self._override,
-                override=time.nanoseconds,
-            )
-        else:
-            self._override = time.nanoseconds
+        self._change(self._active, time.nanoseconds)
 
     def _set_ros_time_is_active(self, enabled: bool) -> None:
-        if enabled == self._active:
-            return
-        difference = self._override - wall.time_ns()
-        if enabled:
-            self._jump(ClockChange.ROS_TIME_ACTIVATED, difference, active=True)
-        else:
-            self._jump(ClockChange.ROS_TIME_DEACTIVATED, -difference, active=False)
+        self._change(enabled, self._override)
 
-    def _jump(
-        self,
-        change: ClockChange,
-        delta: int,
-        *,
-        active: bool | None = None,
-        override: int | None = None,
-    ) -> None:
-        jump = TimeJump(change, Duration(nanoseconds=delta))
-        concerned: list[Any] = [h for h in self._jump_handles if h.is_concerned_by(jump)]
-        for jump_handle in concerned:
-            jump_handle.before()
-        before = self._now()
-        if active is not None:
-            self._active = active
-        if override is not None:
-            self._override = override
-        for timer in list(self._timers):
-            timer._on_time_jump(jump, before)
-        for jump_handle in concerned:
-            jump_handle.after(jump)
+    def _change(self, active: bool, override: int) -> None:
+        """Show another time, and let the timers know what was shown before."""
+        before, is_other_time = self._now(), active != self._active
+        self._active, self._override = active, override
+        if active or is_other_time:
+            for timer in list(self._timers):
+                timer._on_time_jump(before, is_other_time)
 
     def _now(self) -> int:
         return self._override if self._active else wall.time_ns()

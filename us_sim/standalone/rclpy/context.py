@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from inspect import ismethod
 from threading import RLock
-from types import TracebackType
 
 from . import _logging_outputs, signals
 from ._arguments import parse_arguments
@@ -132,10 +131,5 @@ class Context(AbstractContextManager["Context"]):
         self.init()
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_val: BaseException | None,
-        exc_tb: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.try_shutdown()

@@ -9,6 +9,7 @@ True
 from functools import total_ordering
 from typing import Any
 
+from ..messages import message_class
 from .constants import S_TO_NS
 
 __all__ = ["Duration", "Infinite"]
@@ -32,8 +33,6 @@ class Duration:
 
     def to_msg(self) -> Any:
         """This span as a `builtin_interfaces/msg/Duration`."""
-        from ..messages import message_class
-
         seconds, nanoseconds = divmod(self._nanoseconds, S_TO_NS)
         cls = message_class("builtin_interfaces/msg/Duration")
         return cls(sec=seconds, nanosec=nanoseconds)
@@ -41,8 +40,6 @@ class Duration:
     @classmethod
     def from_msg(cls, msg: Any) -> "Duration":
         """The span that a `builtin_interfaces/msg/Duration` holds; raises TypeError for others."""
-        from ..messages import message_class
-
         expected: Any = message_class("builtin_interfaces/msg/Duration")
         if not isinstance(msg, expected):
             raise TypeError("Must pass a builtin_interfaces.msg.Duration object")

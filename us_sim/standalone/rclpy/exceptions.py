@@ -25,7 +25,6 @@ __all__ = [
     "ParameterImmutableException",
     "ParameterNotDeclaredException",
     "ParameterUninitializedException",
-    "ROSInterruptException",
 ]
 
 
@@ -140,10 +139,3 @@ class ParameterUninitializedException(ParameterException):
 
     def __init__(self, parameter_name: str):
         super().__init__(f"The parameter '{parameter_name}' is not initialized", parameter_name)
-
-
-class ROSInterruptException(Exception):
-    """An operation ended because rclpy was shut down."""
-
-    def __init__(self) -> None:
-        super().__init__("rclpy.shutdown() has been called")

@@ -1,39 +1,230 @@
 """Executors: they wait until something is ready and run its callback.
 
+Waiting costs nothing: data, triggers, shutdown and the like wake the waiting thread.
+
 >>> from us_sim.standalone.rclpy.context import Context
 >>> with Context() as context, SingleThreadedExecutor(context=context) as executor:
-...     task = executor.create_task(max, 3, 5)
-...     executor.spin_once(timeout_sec=1.0)
->>> task.result()
-5
+...     executor.spin_once(timeout_sec=0.0)
 """
 
 import os
+import threading
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from typing import Any
 
-from ._executor import Executor, Work, never
-from ._executor_outcomes import (
-    ConditionReachedException,
-    ExternalShutdownException,
-    ShutdownException,
-    TimeoutException,
-    TimeoutObject,
-)
+from ._rclpy_pybind11 import InvalidHandle
+from ._running import RunningCallbacks
+from ._wake_up import WakeUp
+from .constants import S_TO_NS
 from .context import Context
-from .task import Task
+from .exceptions import NotInitializedException
+from .node import Node
+from .task import Future
+from .utilities import get_default_context
 
 __all__ = [
-    "ConditionReachedException",
     "Executor",
     "ExternalShutdownException",
     "MultiThreadedExecutor",
-    "ShutdownException",
     "SingleThreadedExecutor",
-    "TimeoutException",
-    "TimeoutObject",
 ]
+
+
+class ExternalShutdownException(Exception):
+    """The context was shut down."""
+
+
+def _never() -> bool:
+    """The condition of a wait that nothing but readiness and time ends."""
+    return False
+
+
+class Executor(AbstractContextManager["Executor"]):
+    """What SingleThreadedExecutor and MultiThreadedExecutor have in common."""
+
+    _runs_elsewhere = False  # callbacks run in other threads than the one that waits
+
+    def __init__(self, *, context: Context | None = None) -> None:
+        self._context = get_default_context() if context is None else context
+        if self._context.handle is None:
+            raise NotInitializedException("cannot create executor")
+        self._nodes: dict[Node, None] = {}
+        self._nodes_lock = threading.RLock()
+        self._wake_up = WakeUp()
+        self._context.handle.register(self._wake_up)
+        self._is_shutdown = False
+        self._running = RunningCallbacks()
+        self._round: Iterator[Any] = iter(())
+
+    @property
+    def context(self) -> Context:
+        return self._context
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Start no more callbacks, and wait for those that run in other threads.
+
+        Returns:
+            False when they did not end within the timeout.
+        """
+        self._is_shutdown = True
+        self.wake()
+        if not self._running.wait(timeout_sec):
+            return False
+        with self._nodes_lock:
+            self._nodes = {}
+        self._round = iter(())
+        return True
+
+    def add_node(self, node: Node) -> bool:
+        """Run a node's callbacks; False when it was added before."""
+        with self._nodes_lock:
+            if node in self._nodes:
+                return False
+            self._nodes[node] = None
+            node.executor = self
+        self.wake()
+        return True
+
+    def remove_node(self, node: Node) -> None:
+        """Run a node's callbacks no more."""
+        with self._nodes_lock:
+            if node in self._nodes:
+                del self._nodes[node]
+                self.wake()
+
+    def wake(self) -> None:
+        """Have the waiting thread look at everything anew."""
+        self._wake_up.wake()
+
+    def get_nodes(self) -> list[Node]:
+        """The nodes that were added."""
+        with self._nodes_lock:
+            return list(self._nodes)
+
+    def spin(self) -> None:
+        """Run callbacks until the context or this executor is shut down."""
+        while self._context.ok() and not self._is_shutdown:
+            self.spin_once()
+
+    def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
+        """Run callbacks until a future is done, or the time is over."""
+        future.add_done_callback(lambda _: self.wake())
+        timeout = None if timeout_sec is None or timeout_sec < 0 else timeout_sec
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while self._context.ok() and not future.done() and not self._is_shutdown:
+            self._spin_once(timeout, future.done)
+            if deadline is not None:
+                timeout = deadline - time.monotonic()
+                if timeout <= 0:
+                    return
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Run one callback, waiting for one to be ready until the time is over."""
+        self._spin_once(timeout_sec, _never)
+
+    def spin_once_until_future_complete(
+        self, future: Future, timeout_sec: float | None = None
+    ) -> None:
+        """Run one callback, waiting until the future is done or the time is over."""
+        future.add_done_callback(lambda _: self.wake())
+        self._spin_once(timeout_sec, future.done)
+
+    def _spin_once(self, timeout_sec: float | None, condition: Callable[[], bool]) -> None:
+        entity = self._next_ready(timeout_sec, condition)
+        if entity is not None:
+            self._run(entity)
+
+    def _next_ready(self, timeout_sec: float | None, condition: Callable[[], bool]) -> Any:
+        """What is to be run next; None when there is nothing in time, or the wait is ended.
+
+        Whatever is ready at once runs in one round, each once, before anything runs again.
+
+        Raises:
+            ExternalShutdownException: the context is down.
+        """
+        forever = timeout_sec is None or timeout_sec < 0
+        deadline = None if forever else time.monotonic() + (timeout_sec or 0.0)
+        entity = next(self._round, None)
+        while entity is None and not self._is_shutdown and not condition():
+            rest = self._time_to_wait(deadline)
+            if rest is None or rest > 0:
+                self._wake_up.wait(rest)
+            if self._is_shutdown:
+                break
+            if not self._context.ok():
+                raise ExternalShutdownException()
+            self._round = self._ready()
+            entity = next(self._round, None)
+            if deadline is not None and time.monotonic() >= deadline:
+                break
+        return None if self._is_shutdown else entity
+
+    def _ready(self) -> Iterator[Any]:
+        """What may start, each looked at when its turn comes, in rclpy's order."""
+        for node in self.get_nodes():
+            for entity in node._rcl_entities():
+                if node not in self._nodes:
+                    break
+                if entity._stirred() and self._may_start(entity) and entity._fetch():
+                    entity._executor_event = True
+                    yield entity
+
+    def _may_start(self, entity: Any) -> bool:
+        return not entity._executor_event and entity.callback_group.can_execute(entity)
+
+    def _time_to_wait(self, deadline: float | None) -> float | None:
+        """Seconds until a timer is due or the deadline comes; 0 when something may be ready.
+
+        None stands for ever: only a message, a trigger or the like will end that.
+        """
+        rest = None if deadline is None else deadline - time.monotonic()
+        for node in self.get_nodes():
+            if any(e._stirred() and self._may_start(e) for e in node._rcl_entities()):
+                return 0.0
+            for timer in list(node.timers):
+                until_due = timer._real_time_left()
+                if until_due is not None and self._may_start(timer):
+                    seconds = until_due / S_TO_NS
+                    rest = seconds if rest is None else min(rest, seconds)
+        return rest
+
+    def _run(self, entity: Any) -> None:
+        """Call an entity's callback, unless its group is busy after all."""
+        if self._is_shutdown or not entity.callback_group.beginning_execution(entity):
+            entity._executor_event = False
+            self.wake()
+            return
+        self._running.begin()
+        try:
+            call = self._taken(entity)
+            if call is not None:
+                call()
+        finally:
+            self._running.end()
+            entity.callback_group.ending_execution(entity)
+            if self._runs_elsewhere:
+                self.wake()
+
+    def _taken(self, entity: Any) -> Callable[[], Any] | None:
+        """The call that an entity's data ask for; the next data may be looked at after that."""
+        try:
+            return entity._take()
+        except InvalidHandle:  # it was destroyed meanwhile
+            return None
+        finally:
+            entity._executor_event = False
+            if self._runs_elsewhere:
+                self.wake()
+
+    def __enter__(self) -> "Executor":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
 
 
 class SingleThreadedExecutor(Executor):
@@ -42,23 +233,11 @@ class SingleThreadedExecutor(Executor):
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
 
-    def _spin_once(
-        self, timeout_sec: float | TimeoutObject | None, condition: Callable[[], bool]
-    ) -> None:
-        try:
-            work = self.wait_for_ready_callbacks(timeout_sec, None, condition)
-        except (ShutdownException, TimeoutException, ConditionReachedException):
-            return
-        self._run(work)
-        error = work[0].exception()
-        if error is not None:
-            raise error
-
 
 class MultiThreadedExecutor(Executor):
     """Runs callbacks in several threads, as far as callback groups allow."""
 
-    _wakes_after_callbacks = True
+    _runs_elsewhere = True
 
     def __init__(self, num_threads: int | None = None, *, context: Context | None = None) -> None:
         super().__init__(context=context)
@@ -73,7 +252,7 @@ class MultiThreadedExecutor(Executor):
                 "Use the SingleThreadedExecutor instead.",
                 stacklevel=2,
             )
-        self._failed: list[Task] = []
+        self._errors: list[BaseException] = []
         self._executor = ThreadPoolExecutor(num_threads, thread_name_prefix="rclpy")
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -81,33 +260,19 @@ class MultiThreadedExecutor(Executor):
         self._executor.shutdown(wait=False)
         return ended
 
-    def _spin_once(
-        self, timeout_sec: float | TimeoutObject | None, condition: Callable[[], bool]
-    ) -> None:
-        if condition is never:
-            condition = self._has_failures
+    def _spin_once(self, timeout_sec: float | None, condition: Callable[[], bool]) -> None:
         try:
-            work = self.wait_for_ready_callbacks(timeout_sec, None, condition)
-        except (
-            ExternalShutdownException,
-            ShutdownException,
-            TimeoutException,
-            ConditionReachedException,
-        ):
-            pass
-        else:
-            self._executor.submit(self._run, work)
-        self._raise_failures()
+            entity = self._next_ready(timeout_sec, lambda: bool(self._errors) or condition())
+        except ExternalShutdownException:
+            entity = None
+        if entity is not None:
+            self._executor.submit(self._run_and_keep_error, entity)
+        if self._errors:
+            raise self._errors.pop(0)
 
-    def _run(self, work: Work) -> None:
-        super()._run(work)
-        if work[0]._exception is not None:
-            self._failed.append(work[0])
+    def _run_and_keep_error(self, entity: Any) -> None:
+        try:
+            self._run(entity)
+        except Exception as error:
+            self._errors.append(error)
             self.wake()
-
-    def _has_failures(self) -> bool:
-        return bool(self._failed)
-
-    def _raise_failures(self) -> None:
-        if self._failed:
-            raise self._failed.pop(0).exception()

@@ -3,16 +3,19 @@
 from collections.abc import Callable
 from typing import Any
 
+from ._rclpy_pybind11 import Destroyable
 from .callback_groups import CallbackGroup
 from .context import Context
-from .exceptions import InvalidHandle, NotInitializedException
+from .exceptions import NotInitializedException
 from .utilities import get_default_context
 
 __all__ = ["GuardCondition"]
 
 
-class GuardCondition:
+class GuardCondition(Destroyable):
     """Triggered any number of times before the executor looks, it calls back once."""
+
+    _executor_event = False
 
     def __init__(
         self,
@@ -25,19 +28,26 @@ class GuardCondition:
             raise NotInitializedException("cannot create guard condition")
         self._context_handle = context.handle
         self._triggered = False
-        self._destroyed = False
         self.callback = callback
         self.callback_group = callback_group
-        self._executor_event = False
 
     def trigger(self) -> None:
         """Have the callback called soon; raises InvalidHandle after `destroy`."""
-        if self._destroyed:
-            raise InvalidHandle("cannot use Destroyable because destruction was requested")
+        self._require_existence()
         self._triggered = True
         self._context_handle.wake_all()
 
     def destroy(self) -> None:
         """Forget that it was triggered, and be triggered no more."""
-        self._destroyed = True
+        super().destroy()
         self._triggered = False
+
+    def _stirred(self) -> bool:
+        return self._triggered
+
+    def _fetch(self) -> bool:
+        return self._triggered
+
+    def _take(self) -> Callable[..., Any] | None:
+        self._triggered = False
+        return self.callback

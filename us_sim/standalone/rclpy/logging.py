@@ -13,8 +13,6 @@ __all__ = [
     "LoggingSeverity",
     "get_logger",
     "get_logger_effective_level",
-    "get_logger_level",
-    "get_logging_severity_from_string",
     "set_logger_level",
 ]
 
@@ -40,16 +38,3 @@ def set_logger_level(
 def get_logger_effective_level(name: str) -> LoggingSeverity:
     """The level that holds for a logger, its own or an inherited one."""
     return outputs.effective_level(name)
-
-
-def get_logger_level(name: str) -> LoggingSeverity:
-    """The level that a logger was given, UNSET when it was not."""
-    return outputs.own_level(name)
-
-
-def get_logging_severity_from_string(log_severity: str) -> LoggingSeverity:
-    """The severity of a name in any case; raises RuntimeError for an unknown one."""
-    try:
-        return LoggingSeverity[log_severity.upper()]
-    except KeyError:
-        raise RuntimeError(f"Failed to get log severity from name: {log_severity}") from None

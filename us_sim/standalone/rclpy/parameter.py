@@ -12,16 +12,9 @@ import array
 from enum import Enum
 from typing import Any
 
-from ._parameter_files import read_parameter_file
-from ._parameter_values import ParameterSyntaxError, parse_value
+from ..messages import message_class
 
-__all__ = [
-    "PARAMETER_SEPARATOR_STRING",
-    "Parameter",
-    "get_parameter_value",
-    "parameter_dict_from_yaml_file",
-    "parameter_value_to_python",
-]
+__all__ = ["PARAMETER_SEPARATOR_STRING", "Parameter"]
 
 PARAMETER_SEPARATOR_STRING = "."
 
@@ -132,84 +125,15 @@ class Parameter:
 
     def get_parameter_value(self):
         """This value as a `rcl_interfaces/msg/ParameterValue`."""
-        message = _value_message(self._type.value)
+        message: Any = message_class("rcl_interfaces/msg/ParameterValue")(type=self._type.value)
         if self._type.value in _FIELDS:
             setattr(message, _FIELDS[self._type.value], self._value)
         return message
 
     def to_parameter_msg(self):
         """This parameter as a `rcl_interfaces/msg/Parameter`."""
-        return _parameter_message(self._name, self.get_parameter_value())
+        cls = message_class("rcl_interfaces/msg/Parameter")
+        return cls(name=self._name, value=self.get_parameter_value())
 
     def __repr__(self) -> str:
         return f"Parameter({self._name!r}, {self._type}, {self._value!r})"
-
-
-def get_parameter_value(string_value: str) -> Any:
-    """The `rcl_interfaces/msg/ParameterValue` that a text means, as on a command line."""
-    try:
-        value = parse_value(string_value)
-    except ParameterSyntaxError:
-        value = string_value
-    return Parameter("", value=string_value if value is None else value).get_parameter_value()
-
-
-def parameter_value_to_python(parameter_value: Any) -> Any:
-    """The Python value that a `rcl_interfaces/msg/ParameterValue` holds."""
-    if parameter_value.type == 0:
-        return None
-    if parameter_value.type not in _FIELDS:
-        raise RuntimeError(f"unexpected parameter type {parameter_value.type}")
-    value = getattr(parameter_value, _FIELDS[parameter_value.type])
-    return list(value) if parameter_value.type >= 5 else value
-
-
-def parameter_dict_from_yaml_file(
-    parameter_file: str,
-    use_wildcard: bool = False,
-    target_nodes: list[str] | None = None,
-    namespace: str = "",
-) -> dict[str, Any]:
-    """The `rcl_interfaces/msg/Parameter`s of a parameter file by their names.
-
-    Args:
-        parameter_file: path of the YAML file.
-        use_wildcard: whether parameters under `/**` count.
-        target_nodes: names of the nodes whose parameters count; None for all.
-        namespace: put before each parameter's name.
-
-    Raises:
-        RuntimeError: the file is no parameter file, or has nothing for these nodes.
-    """
-    try:
-        found = read_parameter_file(parameter_file)
-    except ParameterSyntaxError as error:
-        raise RuntimeError(str(error)) from None
-    nodes = {node for node, _, _ in found}
-    for node in target_nodes or []:
-        if node not in nodes:
-            raise RuntimeError(
-                f"Param file does not contain parameters for {node},only for nodes: {sorted(nodes)}"
-            )
-    wanted = set(target_nodes) if target_nodes else nodes - {"/**"}
-    if use_wildcard and "/**" in nodes:
-        wanted.add("/**")
-    if not wanted:
-        raise RuntimeError("Param file does not contain selected parameters")
-    chosen = sorted((p for p in found if p[0] in wanted), key=lambda p: p[0] != "/**")
-    return {
-        namespace + name: Parameter(namespace + name, value=value).to_parameter_msg()
-        for _, name, value in chosen
-    }
-
-
-def _value_message(type_: int) -> Any:
-    from ..messages import message_class
-
-    return message_class("rcl_interfaces/msg/ParameterValue")(type=type_)
-
-
-def _parameter_message(name: str, value: Any) -> Any:
-    from ..messages import message_class
-
-    return message_class("rcl_interfaces/msg/Parameter")(name=name, value=value)

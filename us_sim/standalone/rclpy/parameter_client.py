@@ -1,22 +1,17 @@
 """The parameters of another node."""
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..messages import message_class, service_class
+from ..messages import service_class
 from .callback_groups import CallbackGroup
-from .event_handler import SubscriptionEventCallbacks
+from .client import wait_until
 from .node import Node
-from .parameter import Parameter, parameter_dict_from_yaml_file
-from .qos import QoSProfile, qos_profile_parameter_events, qos_profile_services_default
-from .qos_overriding_options import QoSOverridingOptions
-from .subscription import Subscription
+from .parameter import Parameter
+from .qos import QoSProfile, qos_profile_services_default
 from .task import Future
 
 __all__ = ["AsyncParameterClient"]
-
-_LONGEST_WAIT = 0.25  # s; the graph's changes wake it earlier
 
 
 class AsyncParameterClient:
@@ -57,15 +52,7 @@ class AsyncParameterClient:
 
     def wait_for_services(self, timeout_sec: float | None = None) -> bool:
         """Wait until all six services are connected; whether they were within the time."""
-        deadline = None if timeout_sec is None else time.monotonic() + timeout_sec
-        graph_changed = self.node._context_handle.graph_changed
-        while not self.services_are_ready() and self.node.context.ok():
-            rest = _LONGEST_WAIT if deadline is None else deadline - time.monotonic()
-            if rest <= 0:
-                break
-            with graph_changed:
-                graph_changed.wait(min(rest, _LONGEST_WAIT))
-        return self.services_are_ready()
+        return wait_until(self.services_are_ready, self.node.context, timeout_sec)
 
     def list_parameters(
         self,
@@ -105,54 +92,6 @@ class AsyncParameterClient:
     ) -> Future:
         """Set all Parameters or `rcl_interfaces/msg/Parameter`s, or none."""
         return self._call("set_parameters_atomically", callback, parameters=_messages(parameters))
-
-    def delete_parameters(
-        self, names: list[str], callback: Callable[..., Any] | None = None
-    ) -> Future:
-        """Have parameters undeclared, which their node has to allow."""
-        return self.set_parameters([Parameter(name) for name in names], callback)
-
-    def load_parameter_file(
-        self,
-        parameter_file: str,
-        use_wildcard: bool = False,
-        callback: Callable[..., Any] | None = None,
-    ) -> Future:
-        """Set the parameters of a YAML file one by one, those under /** too if asked to."""
-        parameters = parameter_dict_from_yaml_file(parameter_file, use_wildcard)
-        return self.set_parameters(list(parameters.values()), callback)
-
-    def load_parameter_file_atomically(
-        self,
-        parameter_file: str,
-        use_wildcard: bool = False,
-        callback: Callable[..., Any] | None = None,
-    ) -> Future:
-        """Set all parameters of a YAML file or none, those under /** too if asked to."""
-        parameters = parameter_dict_from_yaml_file(parameter_file, use_wildcard)
-        return self.set_parameters_atomically(list(parameters.values()), callback)
-
-    def on_parameter_event(
-        self,
-        callback: Callable[..., Any],
-        qos_profile: QoSProfile = qos_profile_parameter_events,
-        *,
-        callback_group: CallbackGroup | None = None,
-        event_callbacks: SubscriptionEventCallbacks | None = None,
-        qos_overriding_options: QoSOverridingOptions | None = None,
-        raw: bool = False,
-    ) -> Subscription:
-        """Call back when parameters of any node change."""
-        return self.node.create_subscription(
-            message_class("rcl_interfaces/msg/ParameterEvent"),
-            "/parameter_events",
-            callback,
-            qos_profile,
-            callback_group=callback_group,
-            event_callbacks=event_callbacks,
-            qos_overriding_options=qos_overriding_options,
-            raw=raw,
-        )
 
     def _call(self, service: str, callback: Callable[..., Any] | None, **fields: Any) -> Future:
         client = self._clients[service]

@@ -1,15 +1,12 @@
 """The six services by which others read, describe and set a node's parameters."""
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..messages import message_class, service_class
 from .exceptions import ParameterNotDeclaredException, ParameterUninitializedException
 from .parameter import Parameter
 from .qos import qos_profile_parameters
-
-if TYPE_CHECKING:
-    from .node import Node
 
 __all__ = ["ParameterService"]
 
@@ -17,7 +14,7 @@ __all__ = ["ParameterService"]
 class ParameterService:
     """Offers `<node>/get_parameters` and the five others."""
 
-    def __init__(self, node: "Node"):
+    def __init__(self, node: Any):
         self._node = weakref.ref(node)
         for name, callback in {
             "DescribeParameters": self._describe_parameters,
@@ -83,14 +80,14 @@ class ParameterService:
         response.result = _set_atomically(self._require_node(), parameters)
         return response
 
-    def _require_node(self) -> "Node":
+    def _require_node(self) -> Any:
         node = self._node()
         if node is None:
             raise ReferenceError("Expected valid node weak reference")
         return node
 
 
-def _set_atomically(node: "Node", parameters: list[Parameter]) -> Any:
+def _set_atomically(node: Any, parameters: list[Parameter]) -> Any:
     try:
         return node.set_parameters_atomically(parameters)
     except ParameterNotDeclaredException as error:

@@ -2,35 +2,29 @@
 
 from typing import Any
 
-from .callback_groups import CallbackGroup
+from ..messages import serialize
+from ..transport import DdsError
+from ._endpoints import Connected, NodeLink, open_writer
+from ._rclpy_pybind11 import RCLError
 from .duration import Duration
-from .event_handler import PublisherEventCallbacks
 from .logging import get_logger
 from .qos import QoSProfile
 
 __all__ = ["Publisher"]
 
 
-class Publisher:
+class Publisher(Connected):
     """Sends messages of one type to one topic."""
 
     def __init__(
-        self,
-        publisher_impl: Any,
-        msg_type: Any,
-        topic: str,
-        qos_profile: QoSProfile,
-        event_callbacks: PublisherEventCallbacks,
-        callback_group: CallbackGroup,
+        self, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos_profile: QoSProfile
     ) -> None:
-        self._publisher = publisher_impl
-        self._logger = get_logger(publisher_impl.logger_name)
+        super().__init__(full_name, open_writer(link, msg_type, topic, full_name, qos_profile))
+        self._context = link.context
+        self._logger = get_logger(link.logger_name)
         self.msg_type = msg_type
         self.topic = topic
         self.qos_profile = qos_profile
-        self.event_handlers = event_callbacks.create_event_handlers(
-            callback_group, publisher_impl, topic
-        )
 
     def publish(self, msg: Any) -> None:
         """Send a message, or bytes that were serialized before.
@@ -40,11 +34,16 @@ class Publisher:
             RCLError: the context was shut down.
         """
         if isinstance(msg, self.msg_type):
-            accepted = self._publisher.publish(msg)
-        elif isinstance(msg, bytes):
-            accepted = self._publisher.publish_raw(msg)
-        else:
+            msg = serialize(msg)
+        elif not isinstance(msg, bytes):
             raise TypeError(f"Expected {self.msg_type}, got {type(msg)}")
+        self._require_existence()
+        if not self._context.ok():
+            raise RCLError("Failed to publish: publisher's context is invalid")
+        try:
+            accepted = self._endpoint.write(msg)
+        except DdsError as error:
+            raise RCLError(f"Failed to publish: {error}") from None
         if not accepted:
             self._logger.warning(
                 f"A message on '{self.topic}' was dropped: a reliable subscription "
@@ -54,25 +53,12 @@ class Publisher:
 
     def get_subscription_count(self) -> int:
         """How many subscriptions are connected."""
-        return self._publisher.get_subscription_count()
+        self._require_existence()
+        return self._endpoint.matched_count()
 
     @property
     def topic_name(self) -> str:
-        return self._publisher.get_topic_name()
-
-    @property
-    def handle(self) -> Any:
-        return self._publisher
-
-    def destroy(self) -> None:
-        """Leave the topic; use `Node.destroy_publisher`."""
-        for handler in self.event_handlers:
-            handler.destroy()
-        self._publisher.destroy()
-
-    def assert_liveliness(self) -> None:
-        """Say that this publisher is alive, where its liveliness is MANUAL_BY_TOPIC."""
-        self._publisher.assert_liveliness()
+        return self._existing_name()
 
     def wait_for_all_acked(self, timeout: Duration = Duration(seconds=-1)) -> bool:  # noqa: B008
         """Wait until every reliable subscription has received everything.
@@ -80,4 +66,5 @@ class Publisher:
         Returns:
             False when that did not happen within the timeout; a negative one never ends.
         """
-        return self._publisher.wait_for_all_acked(timeout)
+        self._require_existence()
+        return self._endpoint.wait_for_acked(timeout.nanoseconds / 1e9)

@@ -1,27 +1,20 @@
-"""Quality of service: policies, profiles, presets and whether two profiles can meet.
+"""Quality of service: policies, profiles and presets.
 
 >>> QoSProfile(depth=10).reliability.name
 'RELIABLE'
->>> compatible, reason = qos_check_compatible(qos_profile_sensor_data, QoSProfile(depth=1))
->>> compatible.name, reason
-('ERROR', 'ERROR: Best effort publisher and reliable subscription;')
 """
 
 import warnings
 from enum import Enum, IntEnum
 from typing import Any
 
-from ._qos_compatibility import QoSCompatibility, qos_check_compatible
 from .duration import Duration
 
 __all__ = [
-    "DeadlineBestAvailable",
     "DurabilityPolicy",
     "HistoryPolicy",
     "InvalidQoSProfileException",
-    "LivelinessLeaseDurationeBestAvailable",
     "LivelinessPolicy",
-    "QoSCompatibility",
     "QoSDurabilityPolicy",
     "QoSHistoryPolicy",
     "QoSLivelinessPolicy",
@@ -31,10 +24,7 @@ __all__ = [
     "QoSProfile",
     "QoSReliabilityPolicy",
     "ReliabilityPolicy",
-    "qos_check_compatible",
-    "qos_policy_name_from_kind",
     "qos_profile_action_status_default",
-    "qos_profile_best_available",
     "qos_profile_default",
     "qos_profile_parameter_events",
     "qos_profile_parameters",
@@ -60,11 +50,6 @@ class QoSPolicyKind(IntEnum):
     AVOID_ROS_NAMESPACE_CONVENTIONS = 1 << 9
 
 
-def qos_policy_name_from_kind(policy_kind: QoSPolicyKind | int) -> str:
-    """The name of a policy, for messages to a person."""
-    return QoSPolicyKind(policy_kind).name
-
-
 class InvalidQoSProfileException(Exception):
     """A QoSProfile was asked for with arguments that contradict each other."""
 
@@ -73,21 +58,7 @@ class InvalidQoSProfileException(Exception):
 
 
 class QoSPolicyEnum(IntEnum):
-    """A policy whose values have the short names that parameters and tools use."""
-
-    @classmethod
-    def short_keys(cls) -> list[str]:
-        """Every value's name in lower case."""
-        return [name.lower() for name in cls.__members__]
-
-    @classmethod
-    def get_from_short_key(cls, name: str) -> int:
-        """The value of a short name, in any case; raises KeyError for an unknown one."""
-        return cls[name.upper()].value
-
-    @property
-    def short_key(self) -> str:
-        return self.name.lower()
+    """A policy; its values in lower case are what parameters call them."""
 
 
 class HistoryPolicy(QoSPolicyEnum):
@@ -106,7 +77,6 @@ class ReliabilityPolicy(QoSPolicyEnum):
     RELIABLE = 1
     BEST_EFFORT = 2
     UNKNOWN = 3
-    BEST_AVAILABLE = 4
 
 
 class DurabilityPolicy(QoSPolicyEnum):
@@ -116,7 +86,6 @@ class DurabilityPolicy(QoSPolicyEnum):
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
     UNKNOWN = 3
-    BEST_AVAILABLE = 4
 
 
 class LivelinessPolicy(QoSPolicyEnum):
@@ -126,7 +95,6 @@ class LivelinessPolicy(QoSPolicyEnum):
     AUTOMATIC = 1
     MANUAL_BY_TOPIC = 3
     UNKNOWN = 4
-    BEST_AVAILABLE = 5
 
 
 QoSHistoryPolicy = HistoryPolicy
@@ -238,9 +206,6 @@ _PRINTED = (
     "_avoid_ros_namespace_conventions",
 )
 
-DeadlineBestAvailable = Duration(nanoseconds=2**63 - 2)
-LivelinessLeaseDurationeBestAvailable = Duration(nanoseconds=2**63 - 2)
-
 qos_profile_unknown = QoSProfile(
     history=HistoryPolicy.UNKNOWN,
     depth=0,
@@ -259,14 +224,6 @@ qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST
 qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)
 qos_profile_parameter_events = QoSProfile(depth=1000)
-qos_profile_best_available = QoSProfile(
-    depth=10,
-    reliability=ReliabilityPolicy.BEST_AVAILABLE,
-    durability=DurabilityPolicy.BEST_AVAILABLE,
-    deadline=DeadlineBestAvailable,
-    liveliness=LivelinessPolicy.BEST_AVAILABLE,
-    liveliness_lease_duration=LivelinessLeaseDurationeBestAvailable,
-)
 qos_profile_action_status_default = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -281,14 +238,3 @@ class QoSPresetProfiles(Enum):
     PARAMETERS = qos_profile_parameters
     PARAMETER_EVENTS = qos_profile_parameter_events
     ACTION_STATUS_DEFAULT = qos_profile_action_status_default
-    BEST_AVAILABLE = qos_profile_best_available
-
-    @classmethod
-    def short_keys(cls) -> list[str]:
-        """Every preset's name in lower case."""
-        return [name.lower() for name in cls.__members__]
-
-    @classmethod
-    def get_from_short_key(cls, name: str) -> QoSProfile:
-        """The profile of a short name, in any case; raises KeyError for an unknown one."""
-        return cls[name.upper()].value

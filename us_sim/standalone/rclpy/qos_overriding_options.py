@@ -5,18 +5,16 @@
 
 import copy
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..messages import message_class
 from . import qos as policies
 from .duration import Duration
 from .exceptions import ParameterAlreadyDeclaredException
+from .parameter import Parameter
 from .qos import QoSPolicyEnum, QoSPolicyKind, QoSProfile
 
-if TYPE_CHECKING:
-    from ._node_declarations import NodeDeclarations
-    from .parameter import Parameter
-
-__all__ = ["InvalidQosOverridesError", "QoSOverridingOptions"]
+__all__ = ["InvalidQosOverridesError", "QoSOverridingOptions", "overridden"]
 
 
 class InvalidQosOverridesError(Exception):
@@ -64,21 +62,19 @@ class QoSOverridingOptions:
         )
 
 
-def _overridden(
+def overridden(
     kind: str,
-    node: "NodeDeclarations",
+    node: Any,
     topic_name: str,
     qos: QoSProfile,
     options: QoSOverridingOptions | None,
 ) -> QoSProfile:
-    """A profile after the overrides for a 'publisher' or 'subscription' of an absolute topic.
+    """A profile after a node's overrides for a 'publisher' or 'subscription' of an absolute topic.
 
     Declares a read-only parameter for each policy that may be overridden.
     """
     if options is None:
         return qos
-    from ..messages import message_class
-
     qos = copy.copy(qos)
     suffix = "" if options.entity_id is None else f"_{options.entity_id}"
     description = f"for {kind} `{topic_name}` with id `{options.entity_id}`"
@@ -113,7 +109,7 @@ def _parameter_value(qos: QoSProfile, policy: QoSPolicyKind) -> str | int | bool
     return value.nanoseconds if isinstance(value, Duration) else value
 
 
-def _apply(qos: QoSProfile, policy: QoSPolicyKind, parameter: "Parameter") -> None:
+def _apply(qos: QoSProfile, policy: QoSPolicyKind, parameter: Parameter) -> None:
     name, value = policy.name.lower(), parameter.value
     current = getattr(qos, name)
     if isinstance(current, QoSPolicyEnum):

@@ -2,22 +2,24 @@
 
 from typing import Any
 
-from ._type_support import require_message_class
+from ..messages import deserialize, serialize
+from .exceptions import NoTypeSupportImportedException
 
 __all__ = ["deserialize_message", "serialize_message"]
 
 
 def serialize_message(message: Any) -> bytes:
     """The CDR bytes of a message, with their four-byte header."""
-    from ..messages import serialize
-
-    require_message_class(type(message))
+    _require_message_class(type(message))
     return serialize(message)
 
 
 def deserialize_message(serialized_message: bytes, message_type: Any) -> Any:
     """The message of a class that CDR bytes hold."""
-    from ..messages import deserialize
-
-    require_message_class(message_type)
+    _require_message_class(message_type)
     return deserialize(serialized_message, message_type)
+
+
+def _require_message_class(cls: Any) -> None:
+    if not isinstance(cls, type) or not hasattr(cls, "__msgtype__") or hasattr(cls, "Request"):
+        raise NoTypeSupportImportedException()

@@ -1,33 +1,42 @@
 """Services: made by `Node.create_service`."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from ._rclpy_pybind11 import rmw_request_id_t, rmw_service_info_t
+from ..messages import serialize
+from ..services import RequestHeader, ServiceServer
+from ._endpoints import NodeLink, Receiver, message_of
+from ._rclpy_pybind11 import RCLError
 from .callback_groups import CallbackGroup
+from .logging import get_logger
 from .qos import QoSProfile
 
 __all__ = ["Service"]
 
 
-class Service:
+class Service(Receiver):
     """Calls back with each request, and answers with what the callback returns."""
 
     def __init__(
         self,
-        service_impl: Any,
+        link: NodeLink,
         srv_type: Any,
         srv_name: str,
+        full_name: str,
         callback: Callable[..., Any],
         callback_group: CallbackGroup,
         qos_profile: QoSProfile,
     ) -> None:
-        self._service = service_impl
+        endpoint = ServiceServer(
+            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+        )
+        super().__init__(link, full_name, endpoint, endpoint.take_request)
+        self._context = link.context
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
         self.callback_group = callback_group
-        self._executor_event = False
         self.qos_profile = qos_profile
 
     def send_response(self, response: Any, header: Any) -> None:
@@ -38,20 +47,28 @@ class Service:
         """
         if not isinstance(response, self.srv_type.Response):
             raise TypeError(f"Expected {self.srv_type.Response}, got {type(response)}")
-        if isinstance(header, rmw_service_info_t):
-            header = header.request_id
-        if not isinstance(header, rmw_request_id_t):
+        if not isinstance(header, RequestHeader):
             raise TypeError(f"Expected the header of a request, got {type(header)}")
-        self._service.service_send_response(response, header)
-
-    @property
-    def handle(self) -> Any:
-        return self._service
+        self._require_existence()
+        if self._context.ok():
+            self._endpoint.send_response(serialize(response), header)
 
     @property
     def service_name(self) -> str:
-        return self._service.name
+        return self._existing_name()
 
-    def destroy(self) -> None:
-        """Offer the service no more; use `Node.destroy_service`."""
-        self._service.destroy()
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
+        try:
+            request = message_of(data, self.srv_type.Request)
+        except RCLError as error:
+            get_logger("rclpy").warning(
+                f"a request for {self._full_name} is not answered: {error}; a client on Fast DDS "
+                f"cannot call a service on Cyclone DDS: set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp "
+                f"there",
+                throttle_duration_sec=5.0,
+            )
+            return None
+        return partial(self._answer, request, info)
+
+    def _answer(self, request: Any, header: RequestHeader) -> None:
+        self.send_response(self.callback(request, self.srv_type.Response()), header)

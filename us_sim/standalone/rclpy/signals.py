@@ -4,7 +4,6 @@ As in rclpy, SIGINT also does what Python does (KeyboardInterrupt in the main th
 SIGTERM ends nothing by itself: `spin` raises ExternalShutdownException.
 """
 
-import atexit
 import signal
 import threading
 import weakref
@@ -89,12 +88,3 @@ def _shut_down_contexts(number: int, frame: FrameType | None) -> None:
     previous = _previous.get(number)
     if callable(previous):
         previous(number, frame)
-
-
-@atexit.register
-def _leave_the_network() -> None:
-    """Without a farewell other machines would believe for seconds that we are still there."""
-    for reference in _contexts:
-        handle = reference()
-        if handle is not None:
-            handle.close()

@@ -3,16 +3,17 @@
 import inspect
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Any
 
+from ._endpoints import NodeLink, Receiver, message_of, open_reader
 from .callback_groups import CallbackGroup
-from .event_handler import SubscriptionEventCallbacks
 from .qos import QoSProfile
 
 __all__ = ["Subscription"]
 
 
-class Subscription:
+class Subscription(Receiver):
     """Calls back with each message that is received on one topic."""
 
     class CallbackType(Enum):
@@ -23,44 +24,32 @@ class Subscription:
 
     def __init__(
         self,
-        subscription_impl: Any,
+        link: NodeLink,
         msg_type: Any,
         topic: str,
+        full_name: str,
         callback: Callable[..., Any],
         callback_group: CallbackGroup,
         qos_profile: QoSProfile,
         raw: bool,
-        event_callbacks: SubscriptionEventCallbacks,
     ) -> None:
-        self._subscription = subscription_impl
+        self.callback = callback
+        reader = open_reader(link, msg_type, topic, full_name, qos_profile)
+        super().__init__(link, full_name, reader, reader.take)
         self.msg_type = msg_type
         self.topic = topic
-        self.callback = callback
         self.callback_group = callback_group
-        self._executor_event = False
         self.qos_profile = qos_profile
         self.raw = raw
-        self.event_handlers = event_callbacks.create_event_handlers(
-            callback_group, subscription_impl, topic
-        )
 
     def get_publisher_count(self) -> int:
         """How many publishers are connected."""
-        return self._subscription.get_publisher_count()
-
-    @property
-    def handle(self) -> Any:
-        return self._subscription
-
-    def destroy(self) -> None:
-        """Leave the topic; use `Node.destroy_subscription`."""
-        for handler in self.event_handlers:
-            handler.destroy()
-        self._subscription.destroy()
+        self._require_existence()
+        return self._endpoint.matched_count()
 
     @property
     def topic_name(self) -> str:
-        return self._subscription.get_topic_name()
+        return self._existing_name()
 
     @property
     def callback(self) -> Callable[..., Any]:
@@ -83,3 +72,15 @@ class Subscription:
             "Subscription.__init__(): callback should be either be callable with one argument"
             "(to get only the message) or two (to get message and message info)"
         )
+
+    def _call_for(self, data: bytes, info: Any) -> Callable[[], Any]:
+        message = data if self.raw else message_of(data, self.msg_type)
+        if self._callback_type is Subscription.CallbackType.MessageOnly:
+            return partial(self.callback, message)
+        origin = {
+            "source_timestamp": info.source_timestamp,
+            "received_timestamp": info.received_timestamp,
+            "publication_sequence_number": None,
+            "reception_sequence_number": None,
+        }
+        return partial(self.callback, message, origin)

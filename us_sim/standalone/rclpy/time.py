@@ -10,6 +10,7 @@ Duration(nanoseconds=1000000000)
 from functools import total_ordering
 from typing import Any
 
+from ..messages import message_class
 from .clock_type import ClockType
 from .constants import S_TO_NS
 from .duration import Duration
@@ -56,16 +57,12 @@ class Time:
 
     def to_msg(self) -> Any:
         """This point as a `builtin_interfaces/msg/Time`."""
-        from ..messages import message_class
-
         seconds, nanoseconds = divmod(self._nanoseconds, S_TO_NS)
         return message_class("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
 
     @classmethod
     def from_msg(cls, msg: Any, clock_type: ClockType = ClockType.ROS_TIME) -> "Time":
         """The point that a `builtin_interfaces/msg/Time` holds; raises TypeError for others."""
-        from ..messages import message_class
-
         expected: Any = message_class("builtin_interfaces/msg/Time")
         if not isinstance(msg, expected):
             raise TypeError("Must pass a builtin_interfaces.msg.Time object")

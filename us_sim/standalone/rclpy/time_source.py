@@ -1,7 +1,7 @@
 """Simulated time for a node: while its parameter `use_sim_time` is true, /clock sets its clocks."""
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..messages import message_class
 from .clock import ROSClock
@@ -9,10 +9,6 @@ from .clock_type import ClockType
 from .parameter import Parameter
 from .qos import QoSProfile, ReliabilityPolicy
 from .time import Time
-
-if TYPE_CHECKING:
-    from .node import Node
-    from .subscription import Subscription
 
 __all__ = ["CLOCK_TOPIC", "USE_SIM_TIME_NAME", "TimeSource"]
 
@@ -23,9 +19,9 @@ USE_SIM_TIME_NAME = "use_sim_time"
 class TimeSource:
     """Sets the attached clocks from the topic /clock, for one node."""
 
-    def __init__(self, *, node: "Node | None" = None):
-        self._clock_sub: Subscription | None = None
-        self._node: weakref.ReferenceType[Node] | None = None
+    def __init__(self, *, node: Any = None):
+        self._clock_sub: Any = None
+        self._node: weakref.ReferenceType[Any] | None = None
         self._clocks: list[ROSClock] = []
         self._last_time = Time(clock_type=ClockType.ROS_TIME)
         self._active = False
@@ -57,7 +53,7 @@ class TimeSource:
             node.destroy_subscription(self._clock_sub)
             self._clock_sub = None
 
-    def attach_node(self, node: "Node") -> None:
+    def attach_node(self, node: Any) -> None:
         """Follow a node's parameter `use_sim_time`, which is declared if need be."""
         self._node = weakref.ref(node)
         if not node.has_parameter(USE_SIM_TIME_NAME):

@@ -1,22 +1,22 @@
-"""Timers, whose callbacks executors call periodically, and rates, which a thread sleeps by."""
+"""Timers, whose callbacks executors call periodically."""
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
-from ._rclpy_pybind11 import RCLError
-from ._time_jump import ClockChange, TimeJump
+from ._rclpy_pybind11 import Destroyable, RCLError
 from .callback_groups import CallbackGroup
 from .clock import Clock
 from .context import Context
-from .exceptions import InvalidHandle, NotInitializedException, ROSInterruptException
+from .exceptions import NotInitializedException
 from .utilities import get_default_context
 
-__all__ = ["Rate", "Timer"]
+__all__ = ["Timer"]
 
 
-class Timer:
+class Timer(Destroyable):
     """Calls back each period. Periods that were missed are skipped, not caught up with."""
+
+    _executor_event = False
 
     def __init__(
         self,
@@ -39,10 +39,8 @@ class Timer:
         self._last_call = clock._now()
         self._next_call = self._last_call + self._period
         self._canceled = not autostart
-        self._destroyed = False
         self.callback = callback
         self.callback_group = callback_group
-        self._executor_event = False
         clock._timers.add(self)
 
     @property
@@ -95,16 +93,30 @@ class Timer:
 
     def destroy(self) -> None:
         """Stop the timer for good."""
-        self._destroyed = True
+        super().destroy()
         self._canceled = True
         self._clock._timers.discard(self)
 
-    def _require_existence(self) -> None:
-        if self._destroyed:
-            raise InvalidHandle("cannot use Destroyable because destruction was requested")
-
     def _is_due(self) -> bool:
         return not self._canceled and self._next_call <= self._clock._now()
+
+    def _stirred(self) -> bool:
+        return self._is_due()
+
+    def _fetch(self) -> bool:
+        return True
+
+    def _real_time_left(self) -> int | None:
+        """Nanoseconds of real time until it is due; None when real time does not bring that."""
+        if self._canceled or not self._clock._runs_by_itself():
+            return None
+        return self._next_call - self._clock._now()
+
+    def _take(self) -> Callable[..., Any] | None:
+        if self._canceled:
+            return None
+        self._advance()
+        return self.callback
 
     def _advance(self) -> None:
         """Take note of a call: the next one is at the first period that is still to come."""
@@ -118,68 +130,14 @@ class Timer:
             else:
                 self._next_call = now
 
-    def _on_time_jump(self, jump: TimeJump, before: int) -> None:
+    def _on_time_jump(self, before: int, is_other_time: bool) -> None:
         """Keep the rest of the period when another kind of time begins; restart it when time
         goes back by more than a period."""
         now = self._clock._now()
-        if jump.clock_change in (
-            ClockChange.ROS_TIME_ACTIVATED,
-            ClockChange.ROS_TIME_DEACTIVATED,
-        ):
+        if is_other_time:
             self._last_call += now - before
             self._next_call += now - before
         elif now < self._last_call:
             self._last_call = now
             self._next_call = now + self._period
         self._context_handle.wake_all()
-
-
-class Rate:
-    """Sleeps until the next period of a timer, which an executor has to run in another thread."""
-
-    def __init__(self, timer: Timer, *, context: Context):
-        self._timer = timer
-        self._is_shutdown = False
-        self._is_destroyed = False
-        self._event = threading.Event()
-        self._lock = threading.Lock()
-        self._num_sleepers = 0
-        timer.callback = self._event.set
-        context.on_shutdown(self._on_shutdown)
-
-    def _on_shutdown(self) -> None:
-        self._is_shutdown = True
-        self.destroy()
-
-    def destroy(self) -> None:
-        """End every sleep, now and later."""
-        self._is_destroyed = True
-        self._event.set()
-
-    def sleep(self) -> None:
-        """Sleep until the timer's next period.
-
-        Raises:
-            ROSInterruptException: the context is or was shut down.
-            RuntimeError: this rate was destroyed.
-            InvalidHandle: its timer was destroyed.
-        """
-        if self._is_shutdown:
-            raise ROSInterruptException()
-        if self._is_destroyed:
-            raise RuntimeError("Rate cannot sleep because it has been destroyed")
-        if self._timer._destroyed:
-            self.destroy()
-            raise InvalidHandle("Rate cannot sleep because the timer has been destroyed")
-        with self._lock:
-            self._num_sleepers += 1
-        try:
-            self._event.wait()
-        finally:
-            with self._lock:
-                self._num_sleepers -= 1
-                if self._num_sleepers == 0:
-                    self._event.clear()
-            if self._is_shutdown:
-                self.destroy()
-                raise ROSInterruptException()

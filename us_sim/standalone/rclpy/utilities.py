@@ -5,7 +5,6 @@ import threading
 from collections.abc import Sequence
 
 from ._arguments import parse_arguments
-from .constants import S_TO_NS
 from .context import Context
 
 __all__ = [
@@ -14,7 +13,6 @@ __all__ = [
     "ok",
     "remove_ros_args",
     "shutdown",
-    "timeout_sec_to_nsec",
     "try_shutdown",
 ]
 
@@ -54,10 +52,3 @@ def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
 def get_rmw_implementation_identifier() -> str:
     """Which middleware this speaks: the mapping of ROS onto DDS is Cyclone's."""
     return "rmw_cyclonedds_cpp"
-
-
-def timeout_sec_to_nsec(timeout_sec: float | None) -> int:
-    """Nanoseconds of a timeout; -1 for None and negative ones, which never end."""
-    if timeout_sec is None or timeout_sec < 0:
-        return -1
-    return int(float(timeout_sec) * S_TO_NS)

@@ -29,20 +29,16 @@ class RcutilsLogger:
 
     def __init__(self, name=""):
         self.name = name
-        self._published_as_child = False
+        self._node_logger = name  # whose publisher on /rosout is used
         self._contexts: dict[tuple[Any, ...], dict[str, Any]] = {}
-
-    def __del__(self):
-        if self._published_as_child:
-            outputs.remove_sublogger(self.name)
 
     def get_child(self, name):
         """The logger under this one; raises ValueError for an empty name."""
         if not name:
             raise ValueError("Child logger name must not be empty.")
         child = RcutilsLogger(f"{self.name}.{name}" if self.name else name)
-        if self.name:
-            child._published_as_child = outputs.add_sublogger(self.name, child.name)
+        if outputs.is_published(self._node_logger):
+            child._node_logger = self._node_logger
         return child
 
     def set_level(self, level):
@@ -85,6 +81,7 @@ class RcutilsLogger:
             outputs.Record(
                 severity,
                 name,
+                self._node_logger,
                 str(message),
                 code.co_name,
                 code.co_filename,
