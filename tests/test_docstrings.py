@@ -27,7 +27,7 @@ def test_examples(name):
     "name",
     [
         "us_sim.geometry.pose",
-        "us_sim.geometry.collider",
+        "us_sim.geometry.collider_distance",
         "us_sim.tissue.solvers.fem_cg",
         "us_sim.tissue.solvers.msds",
         "us_sim.tissue.solvers.msds_implicit",

@@ -56,7 +56,7 @@ def test_a_camera_that_sees_the_video_finds_the_probe_where_it_was(video):
     registration, calibration = tracker_poses_of(scene)
     camera = read_camera_info(video.camera_info)
     np.testing.assert_array_equal(camera.lens[0], CAMERA.lens[0])
-    source = CameraSource(camera, camera_body_of(scene), scene.tracker.camera)
+    source = CameraSource(camera, camera_body_of(scene), scene.tracker.source.given)
     capture = cv2.VideoCapture(str(video.file))
     assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(RATE)
     for number, pose in enumerate(video.poses):

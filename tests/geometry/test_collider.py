@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.collider_distance import curved_box_distance, signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 
@@ -98,10 +98,11 @@ def test_on_the_core_the_normal_points_into_the_tissue():
 def test_a_hardly_curved_face_is_flat():
     points = np.random.default_rng(2).uniform(-0.08, 0.08, (300, 3))
     flat = RoundedBox(0.05, 0.015, 0.1, 0.003)
-    found, normal = signed_distance(Convex(1e5, 0.05, 0.015, 0.1, 0.003), Pose(), points)
+    curved = np.append(flat.offset_box, 1e-5)  # 1/m, less than any that settings allow
+    found = np.array([curved_box_distance(curved, 0.0, *at) for at in points])
     expected, direction = signed_distance(flat, Pose(), points)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
-    np.testing.assert_allclose(normal, direction, atol=1e-5)
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-8)
+    np.testing.assert_allclose(found[:, 1:], direction, atol=1e-5)
 
 
 def test_the_curved_face_is_where_a_convex_array_of_that_radius_has_its_beams_start():
@@ -174,16 +175,19 @@ def test_moving_probe_and_points_together_changes_nothing(collider, where, posit
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Sphere(0.0), "Sphere.radius is 0.0"),
-        (lambda: Sphere(float("nan")), "Sphere.radius is nan"),
-        (lambda: Capsule(0.01, -1.0), "Capsule.length is -1.0"),
-        (lambda: Capsule("wide", 1.0), "Capsule.radius is 'wide'"),
-        (lambda: RoundedBox(0.05, 0.015, float("inf"), 0.003), "RoundedBox.height is inf"),
+        (lambda: Sphere(0.0), "collider.radius: 0 m is outside"),
+        (lambda: Sphere(float("nan")), "collider.radius: nan is not finite"),
+        (lambda: Capsule(0.01, -1.0), "collider.length: -1 m is outside"),
+        (lambda: Capsule("wide", 1.0), "collider.radius: 'wide' is not a length"),
+        (
+            lambda: RoundedBox(0.05, 0.015, float("inf"), 0.003),
+            "collider.height: inf is not finite",
+        ),
         (lambda: RoundedBox(0.05, 0.015, 0.1, 0.008), "at most 0.0075 m"),
-        (lambda: Convex(-0.05, 0.06, 0.02, 0.06, 0.005), "Convex.radius is -0.05"),
-        (lambda: Convex(0.05, 0.06, 0.02, 0.06, 0.011), "Convex.rounding .* at most 0.01 m"),
+        (lambda: Convex(-0.05, 0.06, 0.02, 0.06, 0.005), "collider.radius: -0.05 m is outside"),
+        (lambda: Convex(0.05, 0.06, 0.02, 0.06, 0.011), "collider.rounding: .* at most 0.01 m"),
         (lambda: Convex(0.03, 0.06, 0.02, 0.06, 0.005), "steeper than 75 .* at most 0.0583 m"),
-        (lambda: Convex(0.055, 0.07, 0.02, 0.015, 0.005), "Convex.height .* at least 0.02 m"),
+        (lambda: Convex(0.055, 0.07, 0.02, 0.015, 0.005), "collider.height: .* at least 0.02 m"),
     ],
 )
 def test_impossible_dimensions_are_refused(make, words):

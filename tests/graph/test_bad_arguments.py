@@ -18,7 +18,11 @@ import pytest
         ),
         ("tissue_deformer", ["-p", "lockstep:=5"], "lockstep"),
         ("tissue_deformer", ["-p", "solver:=magic"], "magic"),
-        ("slice_interpolator", ["-p", "threads:=0"], "threads is 0; it must be from 1 to 256"),
+        (
+            "slice_interpolator",
+            ["-p", "threads:=0"],
+            "threads out of range. Min: 1, Max: 256",
+        ),
         ("path_player", ["-p", "path:=nowhere.mcap"], "nowhere.mcap"),
         ("path_player", ["-p", "rate:=-1.0"], "rate"),
         ("path_player", ["-p", "rate:=1.0"], "parameter `path` is missing; name a bag to play"),

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
-from us_sim.errors import TrackingError
+from us_sim.errors import TrackingError, UsSimError
 from us_sim.nodes.camera_driver import CameraDriver
 from us_sim.nodes.camera_images import camera_from, grey_from
 from us_sim.tracking.camera.info import write_camera_info
@@ -140,7 +140,10 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
     [
         ({"source": "nothing.avi"}, "there is no such file"),
         ({"source": "{text}"}, "no video that OpenCV can read"),
-        ({"source": "0", "encoding": "yuv"}, "mono8 or bgr8"),
+        (
+            {"source": "0", "encoding": "yuv"},
+            "encoding: 'yuv' is not one of mono8, bgr8",
+        ),
         ({"source": "0", "camera_info": "nothing.yaml"}, "nothing.yaml"),
         ({"source": "0", "camera_info": "{text}"}, "camera info"),
     ],
@@ -149,5 +152,5 @@ def test_what_cannot_be_used_is_refused_in_a_sentence(bench, tmp_path, bad, sent
     text = tmp_path / "text.avi"
     text.write_text("no video\n")
     bad = {key: value.format(text=text) for key, value in bad.items()}
-    with pytest.raises(TrackingError, match=sentence):
+    with pytest.raises(UsSimError, match=sentence):
         bench.make(CameraDriver, **bad)

@@ -8,11 +8,12 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from igtl_peers import free_port, pyigtl_server
+from rclpy.exceptions import ParameterException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
-from us_sim.errors import SceneError
+from us_sim.errors import SettingsError
 from us_sim.nodes.conversions import affine_message, image_message
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.probe_tracker import ProbeTracker
@@ -116,11 +117,11 @@ def test_the_image_is_served_where_it_lies(bench, tmp_path, small_scene, referen
 @pytest.mark.parametrize(
     ("bad", "sentence"),
     [
-        ({"world": "moon"}, "ras or lps"),
-        ({"reference": "x"}, "volume or patient"),
-        ({"port": -1}, "port is -1"),
+        ({"world": "moon"}, "openigtlink_bridge.world: 'moon' is not one of ras, lps"),
+        ({"reference": "x"}, "openigtlink_bridge.reference: 'x' is not one of volume, patient"),
+        ({"port": -1}, "port"),
     ],
 )
 def test_wrong_parameters_are_refused(bench, small_scene, bad, sentence):
-    with pytest.raises(SceneError, match=sentence):
+    with pytest.raises((SettingsError, ParameterException), match=sentence):
         bench.make(OpenIGTLinkBridge, scene=str(small_scene), **bad)

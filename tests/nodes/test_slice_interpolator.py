@@ -148,7 +148,7 @@ def test_the_console_is_changed_while_running(bench, rigid):
         ("gain", 100.0, "gain"),
         ("gain", float("nan"), "gain"),
         ("grey_map", "purple", "'purple' is not one of linear"),
-        ("time_gain", [0.0, 200.0], "time_gain: 200 dB is outside"),
+        ("time_gain", [0.0, 200.0], "time_gain[1]: 200 dB is outside"),
         ("elevation_planes", 99, "elevation_planes"),
         ("depth", 3.0, "depth"),
     ],
@@ -170,7 +170,7 @@ def test_a_setting_given_at_the_start_is_refused_before_the_volume_is_made(
     bench, small_scene, monkeypatch
 ):
     monkeypatch.setattr(slice_interpolator, "volume_of", None)
-    words = "^slice_interpolator: imaging.grey_map: 'purple' is not one of linear, soft, contrast$"
+    words = "^slice_interpolator.grey_map: 'purple' is not one of linear, soft, contrast$"
     with pytest.raises(ProbeError, match=words):
         bench.make(SliceInterpolator, scene=str(small_scene), grey_map="purple")
 

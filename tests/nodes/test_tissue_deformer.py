@@ -10,9 +10,9 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.errors import SceneError, SolverError
+from us_sim.errors import SceneError, SettingsError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes import tissue_deformer
+from us_sim.nodes import live_tissue
 from us_sim.nodes.conversions import contact_model_from, tetrahedra_from, vectors_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.scene.building import tissue_model_of, volume_of
@@ -93,7 +93,7 @@ def test_two_methods_run_side_by_side_and_diagnostics_say_how_far_they_are_apart
     )
     refused = node.set_parameters([Parameter("compare_with", value="fem")])[0]
     assert not refused.successful
-    assert "itself" in refused.reason
+    assert "fem is in use already: compare with another" in refused.reason
     assert node.set_parameters([Parameter("compare_with", value="")])[0].successful
     press(bench, publisher, nodes, 0.004, 13)
     assert "compared_with" not in node.health.values
@@ -228,14 +228,14 @@ def test_a_broken_pose_is_survived(bench, deformer):
         ("solver", "wrong", "^tissue_deformer.solver: 'wrong' is not one of fem, "),
         ("solver", "", "^tissue_deformer.solver: '' is not one of fem, "),
         ("compare_with", "wrong", "^tissue_deformer.compare_with: 'wrong' is not one of fem, "),
-        ("compare_with", "fem", "^fem cannot be compared with itself"),
+        ("compare_with", "fem", "^tissue_deformer.compare_with: fem is in use already"),
     ],
 )
 def test_a_method_that_cannot_be_is_refused_before_the_volume_is_made(
     bench, small_scene, monkeypatch, name, value, sentence
 ):
-    monkeypatch.setattr(tissue_deformer, "volume_of", None)
-    with pytest.raises(SolverError, match=sentence):
+    monkeypatch.setattr(live_tissue, "volume_of", None)
+    with pytest.raises(SettingsError, match=sentence):
         bench.make(TissueDeformer, scene=str(small_scene), **{name: value})
 
 

@@ -106,7 +106,7 @@ def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):
         ({"file": "{bag}", "frame": "moon"}, {}, "in frame 'patient'"),
         ({"file": "{bag}", "body": "nothing"}, {}, "nothing"),
         ({"file": "{recording}"}, {}, "name one of ProbeToTracker, ReferenceToTracker"),
-        ({}, {"source": "moon"}, "it must be one of camera, haptic"),
+        ({}, {"source": "moon"}, "probe_tracker.source: 'moon' is not one of pose, pose_array"),
     ],
 )
 def test_what_cannot_be_played_is_refused_in_a_sentence(

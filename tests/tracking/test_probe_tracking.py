@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from us_sim.errors import PoseError, TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import FILTERS
 from us_sim.tracking.filter.outlier_gate import OutlierGate
-from us_sim.tracking.filter.pose_filter import make_filter
-from us_sim.tracking.filter.settings import FILTER_METHODS, FilterSettings, GateSettings
+from us_sim.tracking.filter.pose_filter import create_filter
+from us_sim.tracking.filter.settings import GateSettings
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.probe_tracking import ProbeTracking
 from us_sim.tracking.state import TrackingState
@@ -23,7 +24,7 @@ START = 5_000_000_000
 
 def tracking(method="none", gate=None, **kwargs):
     gate = OutlierGate(gate) if gate else None
-    return ProbeTracking(Pose(), Pose(), make_filter(FilterSettings(method)), gate, **kwargs)
+    return ProbeTracking(Pose(), Pose(), create_filter(method), gate, **kwargs)
 
 
 def at(ms, x=0.0, covariance=None):
@@ -42,7 +43,7 @@ twists = st.tuples(*[numbers] * 6).map(np.array)
 @given(twists, twists, twists)
 def test_the_probe_is_where_registration_body_and_calibration_put_it(a, b, c):
     registration, body, calibration = se3.exp(a), se3.exp(b), se3.exp(c)
-    tracked = ProbeTracking(registration, calibration, make_filter(FilterSettings()))
+    tracked = ProbeTracking(registration, calibration, create_filter("none"))
     probe = tracked.take(Measurement(START, body), START)
     expected = registration.matrix @ body.matrix @ calibration.matrix
     np.testing.assert_allclose(probe.pose.matrix, expected, atol=1e-12)
@@ -58,7 +59,7 @@ def test_the_covariance_is_that_of_the_probe_in_patient():
         np.eye(6) + 0.4 * rng.normal(size=(6, 6))
     )
     covariance = root @ root.T
-    tracked = ProbeTracking(registration, calibration, make_filter(FilterSettings()))
+    tracked = ProbeTracking(registration, calibration, create_filter("none"))
     told = tracked.take(Measurement(START, body, covariance, error=0.4), START)
     slopes = np.empty((6, 6))
     step = 1e-6
@@ -89,7 +90,7 @@ def test_the_time_offset_is_added_to_the_stamp_and_to_nothing_else():
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(-2500, 1500), st.floats(-0.05, 0.05)), max_size=25),
-    st.sampled_from(FILTER_METHODS),
+    st.sampled_from(FILTERS.names),
 )
 def test_no_pose_is_published_but_under_its_own_stamp(steps, method):
     tracked, stamp, newest = tracking(method, GateSettings(), time_offset=0.5), START * 10, None
@@ -112,7 +113,7 @@ def test_what_is_not_newer_is_refused_and_counted():
     assert tracked.last_problem == "the pose is not newer than the one before it"
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 def test_stamps_that_jump_back_start_everything_anew(method):
     tracked = tracking(method, GateSettings())
     take(tracked, *(at(10 * k, 0.001 * k) for k in range(300)))
@@ -134,7 +135,7 @@ def test_a_looping_recording_gives_the_same_poses_each_time():
     assert tracked.restarts == {"stamp": 1}
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 def test_after_it_was_lost_it_starts_where_it_is_found(method):
     tracked = tracking(method, GateSettings(), lost_after=0.5)
     take(tracked, *(at(10 * k, 0.001 * k) for k in range(50)))
@@ -146,7 +147,7 @@ def test_after_it_was_lost_it_starts_where_it_is_found(method):
     assert tracked.restarts == {"gap": 1}
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 def test_a_real_jump_locks_nothing_out_and_is_not_smeared(method):
     """Refused at first; then the filter starts at the new place and not between the two."""
     tracked = tracking(method, GateSettings(accept_after=5))
@@ -183,7 +184,7 @@ def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
     assert answers[4].pose.position[0] == 0.3
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 def test_after_nonsense_the_filter_starts_where_the_probe_is_found(method):
     rng = np.random.default_rng(8)
     tracked = tracking(method, GateSettings())
@@ -215,7 +216,7 @@ def test_a_covariance_of_no_distribution_is_refused():
     assert tracked.last_problem == "the pose's covariance has a negative variance"
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 @pytest.mark.parametrize("unknown", [0.0, 1e9, 1.7e308])
 def test_covariances_that_say_nothing_do_no_harm(method, unknown):
     tracked = tracking(method, GateSettings())
@@ -279,7 +280,7 @@ def recorded(shared_data):
     return times, matrices
 
 
-@pytest.mark.parametrize("method", FILTER_METHODS)
+@pytest.mark.parametrize("method", FILTERS.names)
 @pytest.mark.parametrize(
     ("name", "refused"),
     [

@@ -4,7 +4,7 @@ A twist is (6,): translation (m), then rotation (rad), the order of a measuremen
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking import se3
+>>> from us_sim.geometry import se3
 >>> quarter_turn = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2]))
 >>> half_way = se3.interpolate(Pose(), quarter_turn, 0.5)
 >>> np.degrees(se3.log(half_way)[5]).round(6).item(), half_way.position.round(6).tolist()

@@ -51,7 +51,7 @@ class TissueDeformer(SceneNode):
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
         self._contact: ContactModelPublisher | None = None
-        if self.scene.tracker.source == "haptic":
+        if self.scene.tracker.source.name == "haptic":
             from us_sim.nodes.contact_model_publisher import ContactModelPublisher
 
             self._contact = ContactModelPublisher(self)

@@ -75,8 +75,9 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
     def find_file(name: str, key: str) -> str:
         return _existing(name, origin, [*folders, Path.cwd()], key)
 
-    reader = Reader(origin, find_file, SceneError)
-    scene = reader.read(Scene, _with_named_structures(document)).named(origin)
+    document = _with_named_structures(document)
+    Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
+    scene = Reader(origin, find_file, SceneError).read(Scene, document).named(origin)
     probe_of(scene)
     return scene
 

@@ -37,7 +37,7 @@ def test_to_pixel_undoes_pixels():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"aperture": 0.004}, "probe.aperture: 0.004 m is outside 0.005 to 0.2 m"),
+        ({"aperture": 0.002}, "probe.aperture: 0.002 m is outside 0.003 to 0.2 m"),
         ({"aperture": float("nan")}, "probe.aperture: nan is not finite"),
         ({"depth": 0.5}, "probe.depth: 0.5 m is outside 0.005 to 0.4 m"),
         ({"depth": "deep"}, "probe.depth: 'deep' is not a length"),

@@ -250,7 +250,7 @@ def test_the_plane_is_the_image_to_probe_map_moved_by_the_pose(probe, position, 
 
 def test_square_pixels_are_square():
     geometry = {"radius": 0.05, "opening_angle": 60 * DEGREE, "depth": 0.15}
-    probe = ConvexProbe.with_square_pixels(600, **geometry)
+    probe = ConvexProbe(**geometry).with_square_pixels(600)
     assert probe.rows == 600
     assert probe.columns == 766  # 200 mm of 156.699 mm / 600 are 765.8
     assert abs(probe.pixel_spacing[0] / probe.pixel_spacing[1] - 1) < 0.5 / 765
@@ -265,9 +265,7 @@ WIRES = {
         [(-15, 8), (-4, 21), (0, 30), (12, 42), (-9, 52)],
     ),
     "convex": (
-        ConvexProbe.with_square_pixels(
-            200, radius=0.03, opening_angle=60 * DEGREE, depth=0.06, lines=96
-        ),
+        ConvexProbe(0.03, 60 * DEGREE, 0.06, lines=96).with_square_pixels(200),
         [(-24, 6), (0, 12), (12, 31), (20, 50), (-15, 44)],
     ),
     "convex with other pixels": (
@@ -275,9 +273,7 @@ WIRES = {
         [(-48, 6), (0, 12), (32, 24), (45, 30), (-30, 33)],
     ),
     "sector": (
-        SectorProbe.with_square_pixels(
-            220, aperture=0.015, opening_angle=80 * DEGREE, depth=0.06, lines=128
-        ),
+        SectorProbe(0.015, 80 * DEGREE, 0.06, lines=128).with_square_pixels(220),
         [(-30, 20), (0, 9), (12, 31), (33, 45), (-15, 53)],
     ),
     "sector from behind the face": (
@@ -360,8 +356,8 @@ def test_wires_appear_at_their_millimetre(name):
         (lambda: ConvexProbe(0.05, 1.0, 0.1, lines=1.5), "probe.lines: 1.5 is not a whole number"),
         (lambda: LinearProbe(0.04, 0.1, 5, 5, samples=0), "probe.samples: 0 is outside"),
         (lambda: LinearProbe(0.04, 0.1, 5, 5, focus=0.0), "probe.focus: 0 m is outside"),
-        (lambda: LinearProbe.with_square_pixels(4096, aperture=0.1, depth=0.05), "8192 columns"),
-        (lambda: SectorProbe(0.06, 1.5, 0.1), "probe.aperture: 0.06 m is outside 0.003 to 0.05 m"),
+        (lambda: LinearProbe(0.1, 0.05).with_square_pixels(4096), "8192 columns"),
+        (lambda: SectorProbe(0.3, 1.5, 0.1), "probe.aperture: 0.3 m is outside 0.003 to 0.2 m"),
         (lambda: SectorProbe(0.02, 3.0, 0.1), "probe.opening_angle: 3 rad is outside"),
         (
             lambda: SectorProbe(0.02, 90 * DEGREE, 0.1, radius=0.02),

@@ -13,12 +13,11 @@ from us_sim.errors import TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.filter.kalman import ConstantVelocityKalman
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.tracking.filter.settings import KalmanSettings
 from us_sim.tracking.measurement import Measurement
 
 ACCELERATION, ANGULAR_ACCELERATION = 0.7, 6.0
-SETTINGS = FilterSettings(
-    "kalman",
+SETTINGS = KalmanSettings(
     acceleration=ACCELERATION,
     angular_acceleration=ANGULAR_ACCELERATION,
     position_deviation=4e-4,
@@ -141,7 +140,7 @@ def test_it_errs_as_much_as_it_says():
 def test_errors_go_on_as_the_predicted_pose_says_by_differences():
     """Turning by 1.5 rad within the step, where the rotation's errors turn too."""
     rng = np.random.default_rng(9)
-    quiet = FilterSettings("kalman", acceleration=1e-6, angular_acceleration=1e-6)
+    quiet = KalmanSettings(acceleration=1e-6, angular_acceleration=1e-6)
     stamp, later, step = 10**9, 13 * 10**8, 1e-6
     place = (rng.normal(size=3), Pose(orientation=rng.normal(size=4)).orientation)
     velocity = np.array([0.1, -0.2, 0.3, 3.0, -3.5, 2.0])
@@ -185,9 +184,7 @@ def test_not_behind_a_uniform_motion(rate):
 @pytest.mark.parametrize("rate", [30.0, 200.0])
 @pytest.mark.parametrize("frequency", [0.5, 2.0, 4.0])
 def test_behind_a_sway_by_the_stated_lag(rate, frequency):
-    kalman = ConstantVelocityKalman(
-        FilterSettings("kalman", acceleration=0.05, position_deviation=2e-3)
-    )
+    kalman = ConstantVelocityKalman(KalmanSettings(acceleration=0.05, position_deviation=2e-3))
     times = np.arange(round(12 * rate)) / rate
     way = 0.01 * np.sin(2 * np.pi * frequency * times)
     out = np.array(
@@ -214,7 +211,7 @@ def delay(times, signal, frequency):
 def test_it_settles_at_the_steady_gain_of_the_riccati_equation():
     rng = np.random.default_rng(5)
     step, noise, acceleration = 0.01, 3e-4, 0.1
-    kalman = ConstantVelocityKalman(FilterSettings("kalman", acceleration=acceleration))
+    kalman = ConstantVelocityKalman(KalmanSettings(acceleration=acceleration))
     for k in range(1000):
         stamp = round(1e9 * step * k)
         filtered = kalman.update(Measurement(stamp, Pose(rng.normal(0, noise, 3))))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.filter.one_euro import OneEuro
-from us_sim.tracking.filter.settings import FilterSettings
+from us_sim.tracking.filter.settings import OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
 
@@ -46,8 +46,7 @@ def delay(times, signal, frequency):
     return delays[np.argmax(np.cos(ahead * delays) * sine - np.sin(ahead * delays) * cosine)]
 
 
-SETTINGS = FilterSettings(
-    "one_euro",
+SETTINGS = OneEuroSettings(
     minimum_cutoff=1.2,
     speed_coefficient=30.0,
     rotation_minimum_cutoff=0.8,
@@ -109,7 +108,7 @@ def test_behind_a_uniform_motion_by_the_stated_lag(rate, speed, turning):
 @pytest.mark.parametrize("rate", [30.0, 500.0])
 @pytest.mark.parametrize("frequency", [0.25, 1.0, 3.0])
 def test_behind_a_sway_by_the_stated_lag(rate, frequency):
-    one_euro = OneEuro(FilterSettings("one_euro", minimum_cutoff=3.0, speed_coefficient=0.0))
+    one_euro = OneEuro(OneEuroSettings(minimum_cutoff=3.0, speed_coefficient=0.0))
     times = np.arange(round(12 * rate)) / rate
     poses = [Pose([0.01 * math.sin(2 * math.pi * frequency * t), 0, 0]) for t in times]
     out = np.array([p.position[0] for p in run(one_euro, times, poses)])
@@ -125,14 +124,14 @@ def test_at_rest_noise_shrinks_as_that_of_exponential_smoothing():
     rng = np.random.default_rng(3)
     times = np.arange(20_000) / 100.0
     noise = rng.normal(0, 1e-4, len(times))
-    one_euro = OneEuro(FilterSettings("one_euro", minimum_cutoff=2.0, speed_coefficient=0.0))
+    one_euro = OneEuro(OneEuroSettings(minimum_cutoff=2.0, speed_coefficient=0.0))
     out = np.array([p.position[0] for p in run(one_euro, times, [Pose([n, 0, 0]) for n in noise])])
     share = 1 / (1 + 100 / (2 * np.pi * 2.0))
     assert out[100:].var() / noise.var() == pytest.approx(share / (2 - share), rel=0.05)
 
 
 def test_a_sweep_is_hardly_delayed_with_the_defaults():
-    one_euro = OneEuro(FilterSettings("one_euro"))
+    one_euro = OneEuro(OneEuroSettings())
     assert one_euro.lag == pytest.approx(0.106, abs=1e-3)  # at rest: 1 / (2 pi 1.5 Hz)
     for k in range(300):
         one_euro.update(Measurement(k * 10_000_000, Pose([0.1 * 0.01 * k, 0, 0])))

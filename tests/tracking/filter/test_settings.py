@@ -5,17 +5,16 @@ import pytest
 from us_sim.errors import TrackingError
 from us_sim.tracking.filter.kalman import ConstantVelocityKalman
 from us_sim.tracking.filter.one_euro import OneEuro
-from us_sim.tracking.filter.pose_filter import Unfiltered, make_filter
-from us_sim.tracking.filter.settings import FilterSettings, GateSettings
+from us_sim.tracking.filter.pose_filter import Unfiltered, create_filter
+from us_sim.tracking.filter.settings import GateSettings, KalmanSettings, OneEuroSettings
 
 
 @pytest.mark.parametrize(
     ("settings", "values", "words"),
     [
-        (FilterSettings, {"method": "median"}, "filter.method: 'median' is not one of none"),
-        (FilterSettings, {"minimum_cutoff": 0.0}, "filter.minimum_cutoff: 0 Hz is outside"),
-        (FilterSettings, {"minimum_cutoff": "2 mm"}, "its units are Hz, kHz"),
-        (FilterSettings, {"acceleration": float("nan")}, "filter.acceleration: nan is not finite"),
+        (OneEuroSettings, {"minimum_cutoff": 0.0}, "filter.minimum_cutoff: 0 Hz is outside"),
+        (OneEuroSettings, {"minimum_cutoff": "2 mm"}, "its units are Hz, kHz"),
+        (KalmanSettings, {"acceleration": float("nan")}, "filter.acceleration: nan is not finite"),
         (GateSettings, {"maximum_speed": -1.0}, "gate.maximum_speed: -1 m/s is outside"),
         (GateSettings, {"accept_after": 2.5}, "gate.accept_after: 2.5 is not a whole number"),
         (GateSettings, {"confidence": 1.0}, "gate.confidence: 1 is outside"),
@@ -37,4 +36,6 @@ def test_units_are_understood():
 def test_each_method_is_its_filter():
     kinds = {"none": Unfiltered, "one_euro": OneEuro, "kalman": ConstantVelocityKalman}
     for method, kind in kinds.items():
-        assert type(make_filter(FilterSettings(method))) is kind
+        assert type(create_filter(method)) is kind
+    with pytest.raises(TrackingError, match="filter 'median' is not one of none, one_euro"):
+        create_filter("median")

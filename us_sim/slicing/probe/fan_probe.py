@@ -32,8 +32,6 @@ from us_sim.slicing.probe.probe import (
 
 __all__ = ["ConvexProbe", "SectorProbe"]
 
-_ANGLE = Quantity("angle", math.radians(1), math.radians(150))
-
 
 @dataclass(frozen=True)
 class ConvexProbe(Probe):
@@ -47,7 +45,9 @@ class ConvexProbe(Probe):
     """
 
     radius: float = setting(Quantity("length", 3e-3, 0.3), "of the face's curvature")
-    opening_angle: float = setting(_ANGLE, "between the outermost beams")
+    opening_angle: float = setting(
+        Quantity("angle", math.radians(1), math.pi), "between the outermost beams"
+    )
     depth: float = image_depth()
     columns: int = 512
     rows: int = 512
@@ -91,7 +91,9 @@ class SectorProbe(Probe):
     """
 
     aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
-    opening_angle: float = setting(_ANGLE, "between the outermost beams")
+    opening_angle: float = setting(
+        Quantity("angle", math.radians(1), math.radians(150)), "between the outermost beams"
+    )
     depth: float = image_depth()
     columns: int = 512
     rows: int = 512

@@ -3,10 +3,10 @@
 >>> from us_sim.tracking.haptic.settings import HapticSettings
 >>> HapticSettings(scale=2, ramp="500 ms").ramp
 0.5
->>> HapticSettings(force_limit=1000)
+>>> HapticSettings(model_reach=3)
 Traceback (most recent call last):
 ...
-us_sim.errors.TrackingError: haptic.force_limit: 1000 is outside 0 to 50
+us_sim.errors.TrackingError: haptic.model_reach: 3 m is outside 0.0001 to 1 m; did you mean '3 cm'?
 """
 
 from __future__ import annotations
