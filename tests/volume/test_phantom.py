@@ -149,10 +149,10 @@ def test_muscle_behind_a_vein_is_brighter_than_beside_it():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"seed": -1}, "seed of a phantom must not be negative, not -1"),
-        ({"voxel_size": 0.1e-3}, "0.2 mm to 5 mm, not 0.1 mm"),
-        ({"voxel_size": 0.01}, "not 10 mm"),
-        ({"voxel_size": float("nan")}, "not nan mm"),
+        ({"seed": -1}, "seed of a phantom: -1 is outside"),
+        ({"voxel_size": 0.1e-3}, "0.0001 m is outside 0.0002 to 0.005 m"),
+        ({"voxel_size": 0.01}, "0.01 m is outside"),
+        ({"voxel_size": float("nan")}, "nan is not finite"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):

@@ -124,12 +124,12 @@ def test_labels_and_map_must_be_what_they_say(labels, index):
 @pytest.mark.parametrize(
     ("modulus", "ratio", "density", "words"),
     [
-        (0.0, 0.4, 1000.0, "young_modulus is 0.0"),
-        (np.nan, 0.4, 1000.0, "young_modulus is nan"),
-        (1e4, 0.5, 1000.0, "poisson_ratio is 0.5"),
-        (1e4, -1.0, 1000.0, "poisson_ratio is -1.0"),
-        (1e4, np.nan, 1000.0, "poisson_ratio is nan"),
-        (1e4, 0.4, -1.0, "density is -1.0"),
+        (0.0, 0.4, 1000.0, "material.young_modulus: 0 Pa is outside"),
+        (np.nan, 0.4, 1000.0, "young_modulus: nan is not finite"),
+        (1e4, 0.5, 1000.0, "poisson_ratio: 0.5 is outside"),
+        (1e4, -1.0, 1000.0, "poisson_ratio: -1 is outside"),
+        (1e4, np.nan, 1000.0, "poisson_ratio: nan is not finite"),
+        (1e4, 0.4, -1.0, "density: -1 kg/m3 is outside"),
     ],
 )
 def test_unphysical_constants_are_refused(modulus, ratio, density, words):

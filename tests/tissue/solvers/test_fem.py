@@ -237,8 +237,8 @@ def test_tissue_that_is_all_held_does_not_move():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"contact": "glued"}, "fem.contact is 'glued': name one of frictionless, coulomb"),
-        ({"friction": -0.1}, "fem.friction is -0.1: give a number above 0"),
+        ({"contact": "glued"}, "fem.contact: 'glued' is not one of frictionless, coulomb"),
+        ({"friction": -0.1}, "fem.friction: -0.1 is outside 1e-09 to 10"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, words):

@@ -217,14 +217,14 @@ def test_a_held_node_is_passed_by():
         ("iterations", True),
         ("contact_updates", 0),
         ("tolerance", 0.0),
-        ("tolerance", 1.0),
-        ("tolerance", "1e-6"),
+        ("tolerance", 1.5),
+        ("tolerance", "tiny"),
         ("tolerance", float("nan")),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value):
-    with pytest.raises(SolverError, match=f"fem_cg.{setting} is "):
-        FemCg(block((3, 3, 3)), FemCgSettings(**{setting: value}))
+    with pytest.raises(SolverError, match=f"fem_cg.{setting}: "):
+        FemCgSettings(**{setting: value})
 
 
 def test_a_free_tissue_is_refused():

@@ -160,7 +160,7 @@ def test_a_turning_probe_is_followed():
         ("steps", 0),
         ("maximum_substeps", -1),
         ("time_step", 0.0),
-        ("time_step", "10 ms"),
+        ("time_step", "10 mm"),
         ("stiffness_factor", -0.002),
         ("damping_factor", -0.1),
         ("damping_factor", float("inf")),
@@ -171,8 +171,8 @@ def test_a_turning_probe_is_followed():
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value):
-    with pytest.raises(SolverError, match=f"msds.{setting} is "):
-        Msds(block((3, 3, 3)), MsdsSettings(**{setting: value}))
+    with pytest.raises(SolverError, match=f"msds.{setting}: "):
+        MsdsSettings(**{setting: value})
 
 
 def test_too_many_substeps_are_refused():

@@ -1,6 +1,7 @@
 """Switching between solvers, and comparing two on the same poses."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.solvers.switching import SwitchableTissue, difference
+from us_sim.tissue.solvers.fem_cg import FemCgSettings
+from us_sim.tissue.solvers.switching import Plan, SwitchableTissue, difference
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))
 
@@ -76,9 +78,25 @@ def test_the_solver_beside_can_take_the_lead(model):
     assert (tissue.name, tissue.compared) == ("fem", "")
 
 
-def test_settings_reach_their_solver(model):
-    with pytest.raises(SolverError, match="iterations"):
-        SwitchableTissue(model, "fem_cg", {"fem_cg": {"iterations": 0}})
+def test_settings_reach_their_solver_and_may_change_while_it_runs(model):
+    few, many = FemCgSettings(iterations=1), FemCgSettings(iterations=200)
+    tissue = SwitchableTissue(model, "fem_cg", {"fem_cg": few})
+    loose = tissue.deform(PRESSED).residual
+    prepared = tissue.make(Plan("fem_cg", settings={"fem_cg": many}))
+    assert tissue.deform(PRESSED).residual > 1e-3  # as before, until it is adopted
+    tissue.adopt(prepared)
+    assert tissue.deform(PRESSED).residual < 1e-5 < loose
+
+
+def test_another_material_takes_over_where_the_tissue_is(model):
+    tissue = SwitchableTissue(model, "fem")
+    before = tissue.deform(PRESSED)
+    twice = replace(model, materials=uniform_material(model.mesh, Material(20e3, 0.45)))
+    tissue.adopt(tissue.make(Plan("fem", model=lambda: twice)))
+    after = tissue.deform(PRESSED)
+    modulus = model.materials.young_modulus[0]
+    np.testing.assert_allclose(after.force, 20e3 / modulus * before.force, rtol=1e-6)
+    np.testing.assert_allclose(after.nodes, before.nodes, atol=1e-9)
 
 
 def test_a_solver_is_not_compared_with_itself_nor_with_an_unknown_one(model):
