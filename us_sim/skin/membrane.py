@@ -32,11 +32,12 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
 from us_sim.skin.contact import push_out
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces
-from us_sim.skin.surface import TriangleSurface, vertex_normals
+from us_sim.skin.surface import TriangleSurface
 
 __all__ = ["CONTACT_TOLERANCE", "SkinDeformation", "SkinMembrane"]
 
