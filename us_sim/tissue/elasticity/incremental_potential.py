@@ -34,7 +34,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.tissue.elasticity.springs import SpringNetwork
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors
+from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors, push_corners
 
 __all__ = ["IncrementalPotential"]
 
@@ -184,18 +184,7 @@ def _add_volume_forces(
         if len(mean) > 0:
             push -= 0.25 * nodal[t] * (mean[a] + mean[b] + mean[c] + mean[d])
         push /= 6.0
-        force[a, 0] -= push * (px + qx + rx)
-        force[a, 1] -= push * (py + qy + ry)
-        force[a, 2] -= push * (pz + qz + rz)
-        force[b, 0] += push * px
-        force[b, 1] += push * py
-        force[b, 2] += push * pz
-        force[c, 0] += push * qx
-        force[c, 1] += push * qy
-        force[c, 2] += push * qz
-        force[d, 0] += push * rx
-        force[d, 1] += push * ry
-        force[d, 2] += push * rz
+        push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force)
     return energy
 
 

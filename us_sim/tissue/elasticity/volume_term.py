@@ -44,7 +44,7 @@ _YIELD = 1.5
 # Part of the shear modulus below which what is left for the nodes is rounding.
 _ROUNDING = 1e-9
 
-__all__ = ["VolumeTerm", "add_volume_forces", "area_vectors", "volume_term"]
+__all__ = ["VolumeTerm", "add_volume_forces", "area_vectors", "push_corners", "volume_term"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +189,24 @@ def area_vectors(x, tetrahedra, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force):
+    """Adds to force (N, 3) a push (Pa) on tetrahedron t along its `area_vectors` p, q and r."""
+    a, b, c, d = tetrahedra[t, 0], tetrahedra[t, 1], tetrahedra[t, 2], tetrahedra[t, 3]
+    force[a, 0] -= push * (px + qx + rx)
+    force[a, 1] -= push * (py + qy + ry)
+    force[a, 2] -= push * (pz + qz + rz)
+    force[b, 0] += push * px
+    force[b, 1] += push * py
+    force[b, 2] += push * pz
+    force[c, 0] += push * qx
+    force[c, 1] += push * qy
+    force[c, 2] += push * qz
+    force[d, 0] += push * rx
+    force[d, 1] += push * ry
+    force[d, 2] += push * rz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _yielded(yield_area, px, py, pz, qx, qy, qz, rx, ry, rz):
     """What is left of a tetrahedron's strain, and of its stress."""
     sx, sy, sz = px + qx + rx, py + qy + ry, pz + qz + rz
@@ -250,15 +268,4 @@ def add_volume_forces(
         if len(mean) > 0:
             push -= 0.25 * nodal[t] * (mean[a] + mean[b] + mean[c] + mean[d])
         push *= _yielded(yield_area[t], px, py, pz, qx, qy, qz, rx, ry, rz) / 6.0
-        force[a, 0] -= push * (px + qx + rx)
-        force[a, 1] -= push * (py + qy + ry)
-        force[a, 2] -= push * (pz + qz + rz)
-        force[b, 0] += push * px
-        force[b, 1] += push * py
-        force[b, 2] += push * pz
-        force[c, 0] += push * qx
-        force[c, 1] += push * qy
-        force[c, 2] += push * qz
-        force[d, 0] += push * rx
-        force[d, 1] += push * ry
-        force[d, 2] += push * rz
+        push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force)
