@@ -5,6 +5,7 @@ import pytest
 
 from us_sim.geometry.normals import vertex_normals
 
+
 @pytest.fixture(params=[np.float32, np.float64])
 def dtype(request):
     return request.param

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
 from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
 from us_sim.recording.plus_recording import read_tracker_recording
@@ -36,7 +35,7 @@ from us_sim.volume.sequence_header import frame_fields
 from us_sim.volume.stored_size import metaimage_header
 from us_sim.volume.sweep import Sweep, read_sweep
 
-__all__ = ["poses_of", "read_motion", "read_signal", "seconds_of"]
+__all__ = ["read_motion", "read_signal", "seconds_of"]
 
 
 def read_motion(path: Path, name: str | None) -> ProbePath:
@@ -87,14 +86,6 @@ def read_signal(path: Path, name: str | None, *, images: bool = False) -> Positi
         raise CalibrationError(f"{path}: images are read from recordings of Plus (.igs.mha) only")
     motion = read_motion(path, name)
     return signal_of_positions(seconds_of(motion), motion.positions)
-
-
-def poses_of(motion: ProbePath) -> list[Pose]:
-    """Its poses, one by one."""
-    return [
-        Pose(position, orientation)
-        for position, orientation in zip(motion.positions, motion.orientations, strict=True)
-    ]
 
 
 def seconds_of(motion: ProbePath) -> NDArray[np.float64]:

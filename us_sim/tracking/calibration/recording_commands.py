@@ -15,7 +15,6 @@ from us_sim.tracking.calibration.landmark_file import read_landmarks
 from us_sim.tracking.calibration.landmarks import register_landmarks
 from us_sim.tracking.calibration.pivot import calibrate_pivot
 from us_sim.tracking.calibration.recorded_motion import (
-    poses_of,
     read_motion,
     read_signal,
     seconds_of,
@@ -40,7 +39,7 @@ def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
         UsSimError: the recording cannot be read or does not determine the tip.
     """
     motion = read_motion(recording, name)
-    found = calibrate_pivot(poses_of(motion))
+    found = calibrate_pivot(motion.poses)
     write_transform(
         out,
         Pose(found.tip),
@@ -196,7 +195,7 @@ def _touched(
             f"as `us-sim calibrate pivot` writes it"
         )
     motion = read_motion(recording, name)
-    poses = poses_of(motion)
+    poses = motion.poses
     offset = read_transform(tip).position
     dwells = find_dwells(
         seconds_of(motion),
