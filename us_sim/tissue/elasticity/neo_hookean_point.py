@@ -40,6 +40,7 @@ __all__ = [
     "LOOP",
     "ONE",
     "block",
+    "bulk_slope",
     "cofactor_change",
     "cofactor_slope",
     "crowding",
@@ -48,8 +49,9 @@ __all__ = [
     "largest_stretch",
     "limited",
     "stress",
-    "stress_slope",
+    "stress_rise",
     "volume_change",
+    "volume_slope",
 ]
 
 # How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
@@ -189,7 +191,7 @@ def stress(h, shear, pressure):
 
 
 @njit(**INLINED)
-def stress_slope(h, c, d, shear, k, rise):
+def _stress_slope(h, c, d, shear, k, rise):
     """The change of the stress for a small change d of h.
 
     c is cof(I + h) - I, k = p - mu and rise the change of p.
@@ -206,6 +208,29 @@ def stress_slope(h, c, d, shear, k, rise):
         (shear * d[7] + k * e[7]) + rise * c[7],
         (shear * d[8] + k * e[8]) + (rise * c[8] + rise),
     )
+
+
+@njit(**INLINED)
+def volume_slope(h, d):
+    """The change of J for a small change d of h."""
+    return inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
+
+
+@njit(**INLINED)
+def bulk_slope(h, shear, element):
+    """How fast the pressure rises with J: element, and what keeps from being crushed."""
+    return element + shear * crowding(volume_change(h))[2]
+
+
+@njit(**INLINED)
+def stress_rise(h, d, shear, element, k, nodal):
+    """The change of the stress for a small change d of h, and nodal one of the average pressure.
+
+    k is p - mu.
+    """
+    c = cofactor_change(h)
+    rise = bulk_slope(h, shear, element) * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
+    return _stress_slope(h, c, d, shear, k, rise)
 
 
 @njit(**INLINED)
