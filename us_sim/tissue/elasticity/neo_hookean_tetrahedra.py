@@ -41,6 +41,7 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     volume_change,
     volume_slope,
 )
+from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.elasticity.tetrahedron_lanes import (
     OUT,
     ROWS,
@@ -64,11 +65,8 @@ _GRADIENT, _K, _TANGENT = 0, 9, 10
 """Rows of what the tangent needs: the displacement's gradient, V (p - mu); and how many."""
 
 
-class TetrahedraSums:
-    """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
-
-    ``nodal`` arguments are (N,) sums or pressures of the nodes' share of the bulk stiffness.
-    """
+class TetrahedraSums(NodalSums):
+    """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
 
     def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
         count = len(mesh.tetrahedra)
@@ -85,39 +83,31 @@ class TetrahedraSums:
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
 
     def energy(self, displacement: NDArray) -> float:
-        """J, of the tetrahedra's own share."""
         return _energy(displacement, self._nodes, self._constants, self._lanes)
 
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        """The smallest volume over rest volume, and how many are not above zero."""
         return _volume_ratios(displacement, self._nodes, self._constants, self._lanes)
 
     def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        """J, at each node the sum over its tetrahedra of their nodal weight times J - 1."""
         _volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
 
     def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, the energy's slope, given the nodes' mean volume change."""
         _forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
 
     def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
         _linearise(
             displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
         )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        """J, how much `volume_changes` changes with the displacement."""
         _volume_slopes(change, self._nodes, self._constants, self._tangent, self._lanes, nodal)
 
     def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, how much the forces change, given the change of the nodes' mean."""
         _tangent_product(
             change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
         )
 
     def diagonal_blocks(self, out: NDArray) -> None:
-        """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' share."""
         _diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
 
 
