@@ -1,18 +1,9 @@
 """How the surface that a probe can touch, and the whole tissue below it, yields to forces.
 
 >>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.linear_algebra.compliance import surface_compliance
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
->>> across, deep = uniform_planes(-0.05, 0.05, 5), uniform_planes(0.0, 0.1, 5)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block(nodes=(5, 5, 5))
 >>> compliance = surface_compliance(model)
 >>> forces = np.zeros((25, 3))
 >>> forces[12, 2] = 1.0  # N, downwards in the middle of the top

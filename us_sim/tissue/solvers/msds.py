@@ -1,19 +1,9 @@
 """The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.msds import Msds
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> solver = Msds(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> solver = Msds(TissueModel.block())
 >>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
 masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 """
