@@ -11,7 +11,6 @@ import csv
 import math
 import multiprocessing
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -203,8 +202,6 @@ def _tried(task: _Task, trial: Trial) -> Tried:
 def _prepare(cache: str) -> None:
     """In a new process: one thread for BLAS, and what is kept on disk goes to ``cache``."""
     os.environ["US_SIM_CACHE"] = cache
-    # Progress bars of single solvers would overwrite the one of the run.
-    sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     threadpool_limits(1)
 
 

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.cache import Form, kept
-from us_sim.progress import Progress
 from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure, averaged_pressure
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.linear_algebra.condensation import Field, condense
@@ -83,11 +82,17 @@ class SurfaceCompliance:
             _add_rows(self.fields, rows, weights, self.free, displacement)
 
 
-def surface_compliance(model: TissueModel) -> SurfaceCompliance:
+def surface_compliance(
+    model: TissueModel, progress: Callable[[float, str], None] | None = None
+) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
     What takes long is kept in the user's cache folder, under a hash of mesh, materials, fixed and
     contact nodes.
+
+    Args:
+        model: the tissue.
+        progress: told the fraction done and what is being done, where it takes a second or more.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -96,26 +101,19 @@ def surface_compliance(model: TissueModel) -> SurfaceCompliance:
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
     if 9 * touched * free < _KEPT:
         return _made(model, None)
-    bar: list[Progress] = []
 
-    def show(fraction: float, text: str = "") -> None:
-        if not bar:
-            bar.append(Progress("solving for the tissue's compliance", 100, "%"))
-        bar[0].update(100 * fraction, text)
+    def waiting() -> None:
+        if progress is not None:
+            progress(0.0, "waiting for another process that computes it")
 
-    try:
-        return kept(
-            _key(model),
-            _FORM,
-            lambda: _made(model, show),
-            lambda: show(0.0, "waiting for another process that does"),
-        )
-    finally:
-        for shown in bar:
-            shown.__exit__(None, None, None)
+    return kept(_key(model), _FORM, lambda: _made(model, progress), waiting)
 
 
-def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
+def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> SurfaceCompliance:
+    def show(fraction: float) -> None:
+        if progress is not None:
+            progress(fraction, "compliance of the surface")
+
     nodes = model.movable_contact_nodes
     count = int((~model.fixed).sum())
     system = averaged_pressure(model.mesh, model.materials)
@@ -128,7 +126,7 @@ def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
             model.fixed,
             nodes,
             np.float64 if size < _INTEGER else np.float32,
-            report=show and (lambda done: show(0.6 * done)),
+            report=lambda done: show(0.6 * done),
         )
         precision = np.float64 if size < _DOUBLE else np.float32
         fields = np.empty((3 * len(nodes), 3, count), precision if size < _INTEGER else np.int16)
@@ -145,8 +143,7 @@ def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
             fields[:, :, place] = moved
             done += len(block)
             order.append(block)
-            if show:
-                show(0.6 + 0.4 * done / count)
+            show(0.6 + 0.4 * done / count)
     free = np.concatenate(order).astype(np.int32) if order else np.empty(0, np.int32)
     made = SurfaceCompliance(
         nodes, free, condensed.compliance, fields, scales, len(model.mesh.nodes), 0.0

@@ -17,6 +17,7 @@ is their sum.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -88,9 +89,14 @@ class Fem(TissueSolver):
 
     Settings = FemSettings
 
-    def __init__(self, model: TissueModel, settings: FemSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or FemSettings()
-        self._compliance = surface_compliance(model)
+        self._compliance = surface_compliance(model, progress)
         self._reached = self._compliance.nodes
         surface = (
             model.collider,
@@ -106,7 +112,7 @@ class Fem(TissueSolver):
         imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._displacement = np.zeros_like(model.mesh.nodes)
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
 
     @property
     def state(self) -> TissueState:

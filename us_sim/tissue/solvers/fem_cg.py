@@ -18,6 +18,7 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -80,10 +81,15 @@ class FemCg(TissueSolver):
 
     Settings = FemCgSettings
 
-    def __init__(self, model: TissueModel, settings: FemCgSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemCgSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         require_held(model.mesh, model.fixed)
         settings = settings or FemCgSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._tolerance = settings.tolerance
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))

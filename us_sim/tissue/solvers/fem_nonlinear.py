@@ -22,6 +22,7 @@ the energy.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -127,10 +128,15 @@ class FemNonlinear(TissueSolver):
 
     Settings = FemNonlinearSettings
 
-    def __init__(self, model: TissueModel, settings: FemNonlinearSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemNonlinearSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         require_held(model.mesh, model.fixed)
         settings = settings or FemNonlinearSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._iterations = settings.iterations
         most = settings.most_iterations
         if most is None:
@@ -145,7 +151,7 @@ class FemNonlinear(TissueSolver):
         self._newton = Newton(model)
         self._correction = CarriedCorrection(model.mesh)
         if len(self._surface):
-            self._compliance = surface_compliance(model)
+            self._compliance = surface_compliance(model, progress)
         self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
         self._restore(self.state)
 

@@ -11,6 +11,7 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -83,9 +84,14 @@ class Msds(TissueSolver):
 
     Settings = MsdsSettings
 
-    def __init__(self, model: TissueModel, settings: MsdsSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: MsdsSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or MsdsSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor

@@ -18,6 +18,7 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -112,9 +113,14 @@ class MsdsImplicit(TissueSolver):
 
     Settings = MsdsImplicitSettings
 
-    def __init__(self, model: TissueModel, settings: MsdsImplicitSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: MsdsImplicitSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or MsdsImplicitSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
         self._tolerance = settings.tolerance
@@ -131,7 +137,9 @@ class MsdsImplicit(TissueSolver):
         self._contact = ActiveSet(
             model.collider, model.mesh.nodes[self._touchable], model.contact_spacing
         )
-        self._preconditioner = self._factored(springs, term, 1.0 + damping / settings.time_step)
+        self._preconditioner = self._factored(
+            springs, term, 1.0 + damping / settings.time_step, progress
+        )
         self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
         self._tangling = Tangling(model)
         self._positions = model.mesh.nodes.copy()
@@ -139,7 +147,11 @@ class MsdsImplicit(TissueSolver):
         self._restore(self.state)
 
     def _factored(
-        self, springs: SpringNetwork, term: VolumeTerm, stiffening: float
+        self,
+        springs: SpringNetwork,
+        term: VolumeTerm,
+        stiffening: float,
+        progress: Callable[[float, str], None] | None,
     ) -> ScalarPreconditioner:
         mesh = self.model.mesh
         ends, weights = [springs.edges], [_SPRING_WEIGHT * springs.stiffness]
@@ -155,7 +167,9 @@ class MsdsImplicit(TissueSolver):
         stiffest = np.zeros(len(mesh.nodes))
         np.add.at(stiffest, edges, np.abs(weight)[:, None])
         inertia = np.maximum(self.mass / self._time_step**2, _LEAST_INERTIA * stiffest)
-        return ScalarPreconditioner(edges, weight, inertia, ~self.model.fixed, self._touchable)
+        return ScalarPreconditioner(
+            edges, weight, inertia, ~self.model.fixed, self._touchable, progress
+        )
 
     @property
     def state(self) -> TissueState:

@@ -13,6 +13,7 @@ True
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -63,11 +64,17 @@ class TissueSolver(ABC):
 
     name: ClassVar[str]
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
-    """What can be set of this method; an instance of it is made with the model and one of these."""
+    """What can be set of this method. A solver is made with the model, one of these, and a callback
+    that is told the fraction of the making that is done and what that is, or None."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
 
-    def __init__(self, model: TissueModel, settings: SolverSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: SolverSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,  # noqa: ARG002
+    ) -> None:
         self.model = model
         self.settings = settings if settings is not None else self.Settings()
         self._pose: Pose | None = None
@@ -207,7 +214,11 @@ class TissueSolver(ABC):
 
 
 def create_solver(
-    name: str, model: TissueModel, settings: SolverSettings | None = None, **values: Any
+    name: str,
+    model: TissueModel,
+    settings: SolverSettings | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    **values: Any,
 ) -> TissueSolver:
     """A solver by the name that scenes and reports use.
 
@@ -215,6 +226,7 @@ def create_solver(
         name: one of `SOLVERS`.
         model: the tissue.
         settings: of the solver's own class.
+        progress: told the fraction of what takes long in making it that is done, and what that is.
         values: or some of those settings by name.
 
     Raises:
@@ -223,7 +235,7 @@ def create_solver(
     solver = SOLVERS.load(name)
     if settings is None:
         settings = Reader(f"solver {name}", error=SolverError).read(solver.Settings, values)
-    made: TissueSolver = solver(model, settings)
+    made: TissueSolver = solver(model, settings, progress)
     return made
 
 

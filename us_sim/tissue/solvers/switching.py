@@ -79,9 +79,14 @@ class SwitchableTissue:
     """
 
     def __init__(
-        self, model: TissueModel, name: str, settings: Mapping[str, SolverSettings] | None = None
+        self,
+        model: TissueModel,
+        name: str,
+        settings: Mapping[str, SolverSettings] | None = None,
+        progress: Callable[[float, str], None] | None = None,
     ) -> None:
         self._model = model
+        self._progress = progress
         self._solvers: dict[str, TissueSolver] = {}
         self._plan = Plan(name, settings=dict(settings or {}))
         self._solvers = self.make(self._plan).solvers
@@ -124,7 +129,7 @@ class SwitchableTissue:
             made = self._solvers.get(name)
             settings = plan.settings.get(name)
             if made is None or made.model is not model or settings not in (None, made.settings):
-                made = create_solver(name, model, settings)
+                made = create_solver(name, model, settings, self._progress)
                 made.warm_up()
             solvers[name] = made
         return Prepared(plan, model, solvers)
