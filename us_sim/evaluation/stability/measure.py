@@ -37,15 +37,13 @@ __all__ = ["COLUMNS", "Tried", "evaluate_stability", "write_rows"]
 _SAMPLES = {True: 64, False: 2048}  # by quick
 _STEP_LIMITS = {True: 24, False: 200}
 
-# Cases that a process is handed at a time.
 _CHUNK = 12
+"""Cases that a process is handed at a time."""
 
-# Predicted and observed step limit agree within this.
-_STEP_LIMIT_ERROR = 0.02
+_STEP_LIMIT_ERROR = 0.02  # predicted and observed step limit agree within this
 
 _VARIED = [field.name for field in fields(StabilityCase) if field.name != "case"]
 
-#: Of stability.csv.
 COLUMNS = [
     "method",
     "case",
@@ -61,9 +59,9 @@ COLUMNS = [
     "truthful",
     "action",
 ]
+"""Of stability.csv."""
 
-# What a method without it leaves empty.
-_OF_SPRINGS = ("time_step", "damping", "springs")
+_OF_SPRINGS = ("time_step", "damping", "springs")  # what a method without it leaves empty
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["LARGEST_MESH", "LOCKING", "MESHES", "SCENES", "Scene"]
 
-#: Nodes along x, y and z: the paper's four (section VI).
 MESHES = ((20, 10, 10), (24, 12, 12), (28, 14, 14), (32, 16, 16))
+"""Nodes along x, y and z: the paper's four (section VI)."""
 LARGEST_MESH = (64, 32, 32)
 
 _EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
@@ -130,5 +130,5 @@ SCENES = {
     )
 }
 
-#: Where linear tetrahedra lock: the same press of ever less compressible tissue.
 LOCKING = ("press_12mm", *(name for name in SCENES if name.startswith("press_12mm_nu")))
+"""Where linear tetrahedra lock: the same press of ever less compressible tissue."""

@@ -54,28 +54,27 @@ __all__ = [
     "volume_slope",
 ]
 
-# How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
 LOOP: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "nsz"},
 }
-INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
+"""How loops are compiled: with fused multiply-adds, but NaN stays NaN."""
 
-# Exact in any precision, and they do not turn single precision into double, as literals would.
+INLINED: dict[str, Any] = {**LOOP, "forceinline": True}  # and what they call
+
 ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+"""Numbers that are exact in any precision. Literals would turn single precision into double."""
 
-# Parts of its volume: where a tetrahedron begins to resist being crushed, and where it is crushed.
 _CROWDED, _CRUSHED = np.float32(0.25), np.float32(1 / 64)
+"""Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed."""
 
-# Below 1 over the root of 2.
-_LESS = np.float32(0.7)
+_LESS = np.float32(0.7)  # just below 1 / √2
 
-# Keeps quotients finite where nothing is strained.
-_TINY = np.float32(1e-30)
-_SMALL = np.float32(1e-3)
+_TINY = np.float32(1e-30)  # keeps quotients finite where nothing is strained
+_SMALL = np.float32(1e-3)  # least cosine from which Newton's method starts
 
 
 @njit(**INLINED)

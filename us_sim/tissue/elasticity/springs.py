@@ -27,8 +27,8 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["SpringArrays", "SpringNetwork", "fitted_springs", "spring_forces", "springs_of"]
 
-# The six edges of a tetrahedron.
 _CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+"""The six edges of a tetrahedron."""
 
 
 class SpringArrays(NamedTuple):

@@ -39,11 +39,11 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-# How many times its rest value the sum of a tetrahedron's squared faces is when it yields.
 _YIELD = 1.5
+"""Sum of a tetrahedron's squared faces over that at rest, from which on it yields."""
 
-# Part of the shear modulus below which what is left for the nodes is rounding.
 _ROUNDING = 1e-9
+"""Part of the shear modulus below which what is left for the nodes is rounding."""
 
 __all__ = [
     "VolumeArrays",

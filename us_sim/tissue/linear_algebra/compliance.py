@@ -33,22 +33,23 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["SurfaceCompliance", "surface_compliance"]
 
-# Counts as part of the cache's key: raise it when the bytes change.
 _VERSION = 3
+"""Counts as part of the cache's key: raise it when the bytes change."""
 
-# Numbers in the fields. With fewer, single precision would save no time worth its rounding.
 _DOUBLE = 4_000_000
+"""Numbers in the fields. With fewer, single precision would save no time worth its rounding."""
 
-# Numbers in the fields from which on making them takes a second, and keeping them pays.
 _KEPT = 12_000_000
+"""Numbers in the fields from which on making them takes a second, and keeping them pays."""
 
-# Numbers in the fields from which on they are kept as 16-bit integers, a scale for each block of
-# nodes: what is read in a frame, and not the arithmetic, takes the time then.
 _INTEGER = 400_000_000
-_BLOCK = 1024
+"""Numbers in the fields from which on they are kept as 16-bit integers, a scale for each block of
+nodes: what is read in a frame, and not the arithmetic, takes the time then."""
 
-# Forces by which the rounding of the fields is measured.
+_BLOCK = 1024  # nodes
+
 _SAMPLES = 24
+"""Forces by which the rounding of the fields is measured."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,7 @@ from scipy.sparse.linalg import splu
 
 __all__ = ["ScalarPreconditioner"]
 
-# Right-hand sides at a time.
-_BLOCK = 64
+_BLOCK = 64  # right-hand sides at a time
 
 
 class ScalarPreconditioner:

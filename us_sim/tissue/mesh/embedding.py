@@ -26,12 +26,12 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["EmbeddedSurface"]
 
-# A vertex may lie this far outside the mesh, in longest edges of the nearest tetrahedron: what
-# carries it on is that tetrahedron's own deformation.
 _REACH = 0.5
+"""Distance that a vertex may lie outside the mesh, in longest edges of the nearest tetrahedron,
+whose deformation carries it."""
 
-# m; so near to the mesh is in it.
 _ROUNDING = 1e-6
+"""Distance from the mesh up to which a vertex is in it, m."""
 
 
 class EmbeddedSurface:

@@ -39,14 +39,13 @@ from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 __all__ = ["CONTACTS", "Fem", "FemSettings"]
 
-#: What holds between the probe and the surface.
-CONTACTS = ("frictionless", "coulomb", "sticking")
+CONTACTS = ("frictionless", "coulomb", "sticking")  # what holds between the probe and the surface
 
-# From here on what rounding leaves is computed in every frame.
 _ROUNDING = 1e-5
+"""Rounding, over the force, from which on what it leaves is computed in every frame."""
 
-# How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
+"""How often nodes that were overlooked, because they were far from the probe, are added."""
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ from us_sim.tissue.solvers.solver import (
 
 __all__ = ["FemCg", "FemCgSettings"]
 
-# How far the residual must fall before touched nodes that slid a little are corrected again.
 _REFINEMENT = 1e-2
+"""How far the residual must fall before touched nodes that slid a little are corrected again."""
 
 
 @dataclass(frozen=True)

@@ -51,29 +51,29 @@ from us_sim.tissue.solvers.sub_steps import between, motion
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
-# One prediction carries the tissue this part of its smallest extent: 5 mm of 0.1 m.
 _STRIDE = 0.05
+"""Part of its smallest extent by which one prediction carries the tissue: 5 mm of 0.1 m."""
 
-# A prediction takes the time of so many iterations.
 _PREDICTION = 3
+"""Iterations that take the time of a prediction."""
 
-# Conjugate-gradient iterations of a frame that may take 33 ms at 10,000 nodes, and of any frame.
 _BUDGET, _LEAST_BUDGET = 30, 12
+"""Conjugate-gradient iterations of a frame of 33 ms at 10,000 nodes, and at least of any frame."""
 
-# Of one Newton step: solved further, a step after a large change overshoots.
 _NEWTON = 6
+"""Iterations of one Newton step: solved further, a step after a large change overshoots."""
 
-# Iterations of a sub-step that others follow, and the residual with which they may.
 _PASSING, _PASSABLE = 4, 0.1
+"""Iterations of a sub-step that others follow, and the residual with which they may."""
 
-# A sub-step is halved so often, if need be in later frames, before it is tried in full again.
 _HALVINGS = 4
+"""Times that a sub-step is halved, in later frames too, before it is tried in full again."""
 
-# Of a prediction that turns tetrahedra inside out, what is tried instead.
 _SHARES = (0.5, 0.0)
+"""Fractions of the prediction to try when all of it would invert tetrahedra."""
 
-# m. On taking over, a node this near the probe is taken to be pushed.
 _NEAR = 1e-4
+"""A node this near the probe counts as pushed when another solver's state is taken over, m."""
 
 
 @dataclass(frozen=True)

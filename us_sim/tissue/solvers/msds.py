@@ -33,11 +33,11 @@ from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMoti
 
 __all__ = ["Msds", "MsdsSettings"]
 
-# s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
+"""Time for which motion is watched at least before the tissue counts as settled, s."""
 
-# m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
+"""Distance from its rest state at which a released, settled tissue is put there, m."""
 
 
 @dataclass(frozen=True)

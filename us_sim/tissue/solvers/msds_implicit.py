@@ -54,24 +54,23 @@ from us_sim.tissue.solvers.spring_tissue import (
 
 __all__ = ["MsdsImplicit", "MsdsImplicitSettings"]
 
-# s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
+"""Time for which motion is watched at least before the tissue counts as settled, s."""
 
-# m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
+"""Distance from its rest state at which a released, settled tissue is put there, m."""
 
-# How the preconditioner weighs springs and volumes, which resist in all directions alike there:
-# between what they resist to shear and to compression (found by trial).
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
+"""How the preconditioner weighs springs and volumes, which resist in all directions alike there:
+between what they resist to shear and to compression (found by trial)."""
 
-# Part of a node's own stiffness that its inertia counts for at least in the preconditioner.
 _LEAST_INERTIA = 1e-9
+"""Least inertia of a node in the preconditioner, over its own stiffness."""
 
-# How often a step that does not lower the function is halved.
 _HALVINGS = 20
+"""Times that a step which does not lower the function is halved."""
 
-# Relative, of the function that is minimised.
-_ROUNDING = 1e-13
+_ROUNDING = 1e-13  # relative, of the function that is minimised
 
 
 @dataclass(frozen=True)
