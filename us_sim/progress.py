@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
+from collections.abc import Callable
 from types import TracebackType
 
 from tqdm import tqdm
 
-__all__ = ["Progress"]
+__all__ = ["Progress", "late_progress"]
+
+_PATIENCE = 1.0  # s, for which work goes on without a bar
 
 
 class Progress:
@@ -55,3 +59,27 @@ class Progress:
         traceback: TracebackType | None,
     ) -> None:
         self._bar.close()
+
+
+def late_progress(description: str) -> Callable[[float, str], None]:
+    """A callback for work that is mostly short: it draws a bar once a second has passed.
+
+    It takes the fraction done and what is being done; at 1 the bar is finished, and the next call
+    begins another.
+    """
+    begun: float | None = None
+    bar: Progress | None = None
+
+    def show(fraction: float, text: str) -> None:
+        nonlocal begun, bar
+        begun = time.monotonic() if begun is None else begun
+        if bar is None and fraction < 1.0 and time.monotonic() - begun > _PATIENCE:
+            bar = Progress(description, 100, "%")
+        if bar is not None:
+            bar.update(100 * fraction, text)
+        if fraction >= 1.0:
+            if bar is not None:
+                bar.__exit__(None, None, None)
+            begun = bar = None
+
+    return show

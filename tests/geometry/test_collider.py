@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
@@ -127,6 +128,37 @@ def test_distance_to_a_convex_array_is_that_to_the_nearest_of_its_points(collide
     nearest = np.sqrt((where[0] - x) ** 2 + (where[2] - z) ** 2 + aside**2).min()
     if nearest > 1e-4:
         assert distance(collider, where)[0] == pytest.approx(nearest - rounding, abs=1e-6)
+
+
+@pytest.mark.parametrize("collider", [BENT, MICRO])
+def test_inside_its_core_a_convex_array_is_as_deep_as_the_nearest_side_of_it(collider):
+    """Against 30,000 points on the core's outline in the image plane, and its two sides."""
+    half_x, half_y, half_z, rounding, curvature = collider.offset_box
+    back = -2 * half_z - rounding
+    x = np.linspace(-half_x, half_x, 10001)
+    front = np.sqrt(1 / curvature**2 - x**2) - 1 / curvature - rounding
+    beside = np.linspace(back, front[0], 5001)
+    outline = np.concatenate(
+        [
+            np.column_stack([x, front]),
+            np.column_stack([x, np.full_like(x, back)]),
+            np.column_stack([np.full_like(beside, -half_x), beside]),
+            np.column_stack([np.full_like(beside, half_x), beside]),
+        ]
+    )
+    random = np.random.default_rng(5).random((20_000, 3))
+    points = (2 * random - 1) * [half_x, half_y, 0.0]
+    points[:, 2] = back + random[:, 2] * (np.interp(points[:, 0], x, front) - back)
+    in_plane, which = cKDTree(outline).query(points[:, [0, 2]])
+    across = half_y - np.abs(points[:, 1])
+    found, normal = signed_distance(collider, Pose(), points)
+    # The outline's points are at most 6 µm apart.
+    np.testing.assert_allclose(found, -np.minimum(in_plane, across) - rounding, atol=6e-6)
+    # Where one side is clearly the nearest, the normal points to the nearest point of it.
+    clear = (across > in_plane + 1e-5) & (in_plane > 1e-3)
+    straight = (outline[which] - points[:, [0, 2]])[clear] / in_plane[clear, None]
+    agrees = np.einsum("ij,ij->i", straight, normal[clear][:, [0, 2]])
+    assert np.mean(agrees > 0.9999) > 0.99  # but for ties
 
 
 @settings(deadline=None, max_examples=60)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from us_sim.errors import MeshError
+from us_sim.geometry.normals import vertex_normals
 from us_sim.skin.surface import (
     TriangleSurface,
     bent_surface,
     plane_surface,
     read_surface,
-    vertex_normals,
 )
 
 
@@ -39,18 +39,6 @@ def test_normals_of_a_sphere_point_away_from_its_centre():
     normals = vertex_normals(ball.vertices, ball.triangles)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
     assert np.einsum("ij,ij->i", normals, ball.vertices / 0.05).min() > np.cos(np.radians(1.0))
-
-
-def test_normals_are_weighted_by_area():
-    """Two right triangles share a vertex: 0.5 m² facing z, and 2 m² facing x."""
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 2]], dtype=float)
-    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
-    np.testing.assert_allclose(normals[0], np.array([4, 0, 1]) / np.sqrt(17))
-
-
-def test_normals_that_cancel_are_zero():
-    vertices = np.eye(3)
-    np.testing.assert_array_equal(vertex_normals(vertices, [[0, 1, 2], [0, 2, 1]]), 0)
 
 
 def test_vertex_areas_add_up_to_the_surface():

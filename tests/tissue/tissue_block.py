@@ -1,12 +1,11 @@
 """The block of tissue that the solvers' tests press: 0.2 x 0.1 x 0.1 m, held at the bottom."""
 
-import numpy as np
+from dataclasses import replace
 
-from us_sim.geometry.collider import Collider, Sphere
+from us_sim.geometry.collider import Collider
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
 SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
@@ -14,11 +13,7 @@ SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 
 def block_mesh(nodes: tuple[int, int, int]) -> TetrahedralMesh:
     """Of so many nodes along x, y and z."""
-    return box_mesh(
-        uniform_planes(-0.1, 0.1, nodes[0]),
-        uniform_planes(-0.05, 0.05, nodes[1]),
-        uniform_planes(0.0, 0.1, nodes[2]),
-    )
+    return block(nodes).mesh
 
 
 def block(
@@ -28,14 +23,5 @@ def block(
     materials: TissueMaterials | None = None,
 ) -> TissueModel:
     """The block under a sphere of 30 mm radius, unless another collider is given."""
-    mesh = block_mesh(nodes)
-    fixed = np.zeros(len(mesh.nodes), dtype=bool)
-    for face in held:
-        fixed[face_nodes(mesh, face)] = True
-    return TissueModel(
-        mesh=mesh,
-        materials=materials or uniform_material(mesh, SOFT),
-        fixed=fixed,
-        collider=collider or Sphere(0.03),
-        contact_nodes=face_nodes(mesh, "top"),
-    )
+    model = TissueModel.block((0.2, 0.1, 0.1), nodes, material=SOFT, collider=collider, held=held)
+    return model if materials is None else replace(model, materials=materials)

@@ -177,6 +177,7 @@ def _quantity(quantity: Quantity) -> Callable[[str], float]:
 
 
 def _camera(args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
     from us_sim.tracking.calibration.board import Board
     from us_sim.tracking.calibration.camera_command import calibrate_photos
 
@@ -193,7 +194,8 @@ def _camera(args: argparse.Namespace) -> int:
         args.dictionary or ("" if args.board == "chessboard" else "4X4_50"),
         args.legacy,
     )
-    print(calibrate_photos(args.photos, board, _new(args.out), args.name))
+    progress = late_progress("looking for the board")
+    print(calibrate_photos(args.photos, board, _new(args.out), args.name, progress))
     return 0
 
 
@@ -240,11 +242,23 @@ def _probe(args: argparse.Namespace) -> int:
 
 
 def _time(args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
     from us_sim.tracking.calibration.recording_commands import calibrate_clock
 
     names = (args.pose, args.fixed_pose or args.pose)
     out = _new(args.out)
-    print(calibrate_clock(args.moving, args.fixed, names, args.largest, out, images=args.images))
+    progress = late_progress("reading images")
+    print(
+        calibrate_clock(
+            args.moving,
+            args.fixed,
+            names,
+            args.largest,
+            out,
+            images=args.images,
+            progress=progress,
+        )
+    )
     return 0
 
 

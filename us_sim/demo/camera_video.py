@@ -112,10 +112,7 @@ def _pose_at(path: ProbePath, moment: float) -> Pose:
     """Between the two poses around a moment (s); at the ends it rests."""
     times = (path.log_times - path.log_times[0]) * 1e-9
     after = int(np.clip(np.searchsorted(times, moment, side="right"), 1, max(1, len(times) - 1)))
-    first, last = (
-        Pose(path.positions[i], path.orientations[i])
-        for i in (after - 1, min(after, len(times) - 1))
-    )
+    first, last = (path.pose(i) for i in (after - 1, min(after, len(times) - 1)))
     span = float(times[min(after, len(times) - 1)] - times[after - 1])
     part = (moment - float(times[after - 1])) / span if span > 0 else 0.0
     return interpolate(first, last, float(np.clip(part, 0.0, 1.0)))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 __all__ = ["FACES", "MOST_NODES", "boundary_faces", "boundary_triangles", "face_order"]
 
-#: The four outward faces of a positively oriented tetrahedron.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""The four outward faces of a positively oriented tetrahedron."""
 
-#: So many nodes at most, so that the three of a face fit into one 64-bit number.
 MOST_NODES = 2**21
+"""So many nodes at most, so that the three of a face fit into one 64-bit number."""
 
 
 def face_order(

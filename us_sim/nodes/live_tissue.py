@@ -11,6 +11,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import TissueDeformerSettings
+from us_sim.progress import late_progress
 from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.deformation import Deformation
@@ -61,7 +62,9 @@ class LiveTissue:
             f"preparing {values[OWN].solver} for {len(model.mesh.nodes)} nodes, "
             f"{len(model.mesh.tetrahedra)} tetrahedra"
         )
-        self.tissue = SwitchableTissue(model, values[OWN].solver, _settings(values))
+        self.tissue = SwitchableTissue(
+            model, values[OWN].solver, _settings(values), late_progress("preparing the tissue")
+        )
         if values[OWN].compare_with:
             self.tissue.compare_with(values[OWN].compare_with)
         self._current = dict(values)  # what the tissue is deformed by

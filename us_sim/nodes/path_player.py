@@ -14,7 +14,6 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
-from us_sim.geometry.pose import Pose
 from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.health import Health
@@ -109,7 +108,7 @@ class PathPlayer(Node):
 
     def _send(self) -> None:
         i = self._next
-        pose = Pose(self._path.positions[i], self._path.orientations[i])
+        pose = self._path.pose(i)
         restamp = self._restamp and not self._lockstep
         stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._stamps[i]))
         self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))

@@ -40,7 +40,6 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of compression name
 
-# What the parsers raise when the bytes are not what they should be.
 _DAMAGE = (
     McapError,
     zstandard.ZstdError,
@@ -51,6 +50,7 @@ _DAMAGE = (
     StopIteration,
     MemoryError,
 )
+"""What the parsers raise when the bytes are not what they should be."""
 
 
 class _Run(NamedTuple):

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError
+from us_sim.geometry.pose import Pose
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.schemas import jazzy_definitions
@@ -64,6 +65,15 @@ class ProbePath:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def pose(self, index: int) -> Pose:
+        """The pose at a place in the path, its quaternion normalised."""
+        return Pose(self.positions[index], self.orientations[index])
+
+    @property
+    def poses(self) -> list[Pose]:
+        """All of them, as `pose` gives them."""
+        return [self.pose(index) for index in range(len(self))]
 
     @property
     def duration(self) -> float:

@@ -22,14 +22,16 @@ __all__ = ["press_and_slide"]
 
 _EPOCH = 1_700_000_000 * 10**9  # ns
 
-# Key poses, each a time in s of the ten and a value, between which the probe moves.
 _KEYED_DURATION = 10.0
+"""Length of the path in the key poses below, s. Each is a time and a value; between them the probe
+moves smoothly."""
+
 _SLIDE = np.array([[5.0, 0.0], [6.25, 0.008], [7.5, 0.0]])  # m along y, the vessels
 _ROCK = np.array([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]])  # degrees about x
-# Share of the hover height where negative, above the skin, and of the depth where positive.
 _PRESS = np.array(
     [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]],
 )
+"""Fractions: of the hover height above the skin where negative, of the depth where positive."""
 
 
 def press_and_slide(

@@ -26,7 +26,6 @@ __all__ = ["INFINITE", "QosProfile", "qos_from_yaml", "qos_to_yaml"]
 
 INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
 
-# Position is the number that rmw/types.h gives the policy; rosbag2 before Jazzy wrote numbers.
 _POLICIES = {
     "history": ("system_default", "keep_last", "keep_all", "unknown"),
     "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
@@ -40,6 +39,8 @@ _POLICIES = {
         "best_available",
     ),
 }
+"""Policies in the order of their numbers in rmw/types.h, which rosbag2 before Jazzy wrote."""
+
 _DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 

@@ -32,11 +32,11 @@ _RULE = "=" * 80
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
-# A field starts with its type; a constant or comment never names a message type.
 _FIELD_TYPE = re.compile(r"^\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.MULTILINE)
+"""A field starts with its type; a constant or comment never names a message type."""
+
 _TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)")
 
-# rosbags keeps no default values, and this is the one message of common_interfaces with any.
 _DEFAULTS = {
     "geometry_msgs/msg/Quaternion": {
         "float64 x": "float64 x 0",
@@ -45,6 +45,7 @@ _DEFAULTS = {
         "float64 w": "float64 w 1",
     }
 }
+"""rosbags keeps no default values, and this is the one message of common_interfaces with any."""
 
 
 def normalized_type(name: str) -> str:

@@ -32,27 +32,32 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import signed_distance
+from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
 from us_sim.skin.contact import push_out
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces
-from us_sim.skin.surface import TriangleSurface, vertex_normals
+from us_sim.skin.surface import TriangleSurface
 
 __all__ = ["CONTACT_TOLERANCE", "SkinDeformation", "SkinMembrane"]
 
 CONTACT_TOLERANCE = 1e-9
-"""m: no vertex is deeper inside the collider than this."""
+"""No vertex is deeper inside the collider than this, m."""
 
-# Share of the linear system's greatest stable step that is used. Near the whole of it, folded skin
-# with hardly any damping was seen to gain energy from frame to frame.
 _SAFETY = 0.7
-# m: a frame that moves no vertex farther than this leaves the membrane settled.
+"""Fraction of the linear system's greatest stable step that is used. Near 1, folded skin with
+hardly any damping was seen to gain energy from frame to frame."""
+
 _SETTLED = 1e-7
-# m: a settled membrane without contact that is this close to its rest shape is put there.
+"""A frame that moves no vertex farther than this leaves the membrane settled, m."""
+
 _AT_REST = 1e-6
-# m: a probe that moves farther than this between frames was lifted and set down elsewhere.
+"""A settled membrane without contact that is this close to its rest shape is put there, m."""
+
 _JUMP = 0.03
-_MOST_STEPS = 400
+"""A probe that moves farther than this between frames was lifted and set down elsewhere, m."""
+
+_MOST_STEPS = 400  # in a frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
-"""Triangle surfaces of the skin: sheets made here, or read from a file, and their normals.
+"""Triangle surfaces of the skin: sheets made here, or read from a file.
 
->>> from us_sim.skin.surface import bent_surface, vertex_normals
+>>> from us_sim.geometry.normals import vertex_normals
+>>> from us_sim.skin.surface import bent_surface
 >>> arm = bent_surface((0.1, 0.05), 0.005, flat_width=0.04, radius=0.05)
 >>> len(arm.vertices), len(arm.triangles)
 (231, 400)
@@ -18,13 +19,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.skin.wavefront import parse_wavefront
 
-__all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface", "vertex_normals"]
+__all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,22 +177,6 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
         raise MeshError(f"{path}: {error}") from error
 
 
-def vertex_normals(
-    vertices: NDArray[np.float64], triangles: NDArray[np.int32]
-) -> NDArray[np.float64]:
-    """(N, 3) unit normals, the sum of the adjacent triangles' normals weighted by area.
-
-    Where those cancel, the normal is zero.
-
-    Args:
-        vertices: (N, 3). triangles: (T, 3).
-    """
-    return _vertex_normals(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(triangles, dtype=np.int32),
-    )
-
-
 def _read_with_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points (N, 3) and triangles (T, 3) of a file."""
     try:
@@ -254,33 +238,3 @@ def _sheet(profile: NDArray[np.float64], y: NDArray[np.float64]) -> TriangleSurf
     second = np.where(even, np.stack([a, d, c], -1), np.stack([b, d, c], -1))
     triangles = np.stack([first, second], axis=2).reshape(-1, 3)
     return TriangleSurface(vertices.reshape(-1, 3), triangles.astype(np.int32))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _vertex_normals(vertices, triangles):
-    """(N, 3) area-weighted unit normals of vertices (N, 3) with triangles (T, 3)."""
-    normals = np.zeros_like(vertices)
-    for t in range(len(triangles)):
-        i = triangles[t, 0]
-        j = triangles[t, 1]
-        k = triangles[t, 2]
-        ax = vertices[j, 0] - vertices[i, 0]
-        ay = vertices[j, 1] - vertices[i, 1]
-        az = vertices[j, 2] - vertices[i, 2]
-        bx = vertices[k, 0] - vertices[i, 0]
-        by = vertices[k, 1] - vertices[i, 1]
-        bz = vertices[k, 2] - vertices[i, 2]
-        x = ay * bz - az * by
-        y = az * bx - ax * bz
-        z = ax * by - ay * bx
-        for v in (i, j, k):
-            normals[v, 0] += x
-            normals[v, 1] += y
-            normals[v, 2] += z
-    for v in range(len(normals)):
-        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
-        if length > 0.0:
-            normals[v, 0] /= length
-            normals[v, 1] /= length
-            normals[v, 2] /= length
-    return normals

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BMode"]
 
-# Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward.
 _BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+"""Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward."""
 
 
 class BMode:

@@ -1,22 +1,16 @@
 """What every tissue solver is given: mesh, materials, what is held, and what the probe can touch.
 
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> held = np.zeros(len(mesh.nodes), dtype=bool)
->>> held[face_nodes(mesh, "bottom")] = True
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, held, Sphere(0.03), face_nodes(mesh, "top"))
+>>> from us_sim.tissue.model import TissueModel
+>>> model = TissueModel.block()
+>>> len(model.mesh.nodes), len(model.contact_nodes)
+(216, 36)
 >>> f"{model.lumped_mass.sum():.3f} kg"
 '1.000 kg'
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,11 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.collider import Collider
-from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.geometry.collider import Collider, Sphere
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.mesh.node_selection import face_nodes
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 __all__ = ["TissueModel"]
+
+_SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +44,37 @@ class TissueModel:
     fixed: NDArray[np.bool_]  # (N,), held at rest
     collider: Collider
     contact_nodes: NDArray[np.int32]  # (C,), which the probe can touch
+
+    @classmethod
+    def block(
+        cls,
+        size: tuple[float, float, float] = (0.1, 0.1, 0.1),
+        nodes: tuple[int, int, int] = (6, 6, 6),
+        *,
+        material: Material = _SOFT,
+        collider: Collider | None = None,
+        held: Sequence[str] = ("bottom",),
+    ) -> TissueModel:
+        """A box of one material with its top around the origin, for examples and tests.
+
+        Args:
+            size: m, along x, y and z.
+            nodes: of its mesh, along x, y and z.
+            material: soft tissue, when not given.
+            collider: a sphere of 30 mm radius, when not given.
+            held: names of the faces that are fixed, as `face_nodes` takes them. The probe can
+                touch the top.
+        """
+        mesh = box_mesh(
+            uniform_planes(-size[0] / 2, size[0] / 2, nodes[0]),
+            uniform_planes(-size[1] / 2, size[1] / 2, nodes[1]),
+            uniform_planes(0.0, size[2], nodes[2]),
+        )
+        fixed = np.zeros(len(mesh.nodes), dtype=bool)
+        for face in held:
+            fixed[face_nodes(mesh, face)] = True
+        materials = uniform_material(mesh, material)
+        return cls(mesh, materials, fixed, collider or Sphere(0.03), face_nodes(mesh, "top"))
 
     def __post_init__(self) -> None:
         count = len(self.mesh.nodes)

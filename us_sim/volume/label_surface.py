@@ -25,15 +25,17 @@ from us_sim.volume.volume import Volume
 
 __all__ = ["label_surface", "spacing_for"]
 
-# Standard deviation of the smoothing, in grid steps: the least that hides the voxels' stairs.
 _SMOOTHING = 0.7
-_PADDING = 4
+"""Standard deviation of the smoothing, in grid steps: the least that hides the voxels' stairs."""
 
-# Marching cubes makes two triangles for each square of the grid that a surface's steps show.
+_PADDING = 4  # grid steps
+
 _TRIANGLES_PER_FACE = 2.0
+"""Marching cubes makes two triangles for each square of the grid that a surface's steps show."""
 
-# What is smoothed shrinks where it is round, so the surface is drawn at a level below one half.
 _LEVELS = (0.5, 0.4)
+"""Levels between which the surface is drawn: at or below one half, as smoothing shrinks it."""
+
 _LOWEST_LEVEL = 0.2
 
 

@@ -27,9 +27,9 @@ __all__ = ["cached_phantom", "upper_arm"]
 
 Progress = Callable[[float, str], None]
 
-# Raised whenever a change here, or in what this calls, changes a phantom's bytes: it is part of
-# the cache's key.
 _GENERATOR = 1
+"""Raised whenever a change here, or in what this calls, changes a phantom's bytes: it is part of
+the cache's key."""
 
 _NOISE_FLOOR = -68.0  # dB at the skin
 _NOISE_GAIN = 160.0  # dB/m, as the time gain amplifies noise too

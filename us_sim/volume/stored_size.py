@@ -27,7 +27,6 @@ from us_sim.errors import VolumeError
 
 __all__ = ["check_stored_size", "metaimage_header"]
 
-# MetaImage's element types and their bytes (MetaIO, metaTypes.h).
 _ELEMENT_BYTES = {
     "MET_CHAR": 1,
     "MET_UCHAR": 1,
@@ -42,6 +41,8 @@ _ELEMENT_BYTES = {
     "MET_FLOAT": 4,
     "MET_DOUBLE": 8,
 }
+"""MetaImage's element types and their bytes (MetaIO, metaTypes.h)."""
+
 _CHUNK = 1 << 20
 
 

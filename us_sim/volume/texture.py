@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 __all__ = ["SmoothNoise", "sheets"]
 
-# The mean over a cell of the sum of squared cubic B-spline weights: the variance that
-# interpolation leaves along an axis.
 _SPLINE_VARIANCE = 151.0 / 315.0
+"""The mean over a cell of the sum of squared cubic B-spline weights: the variance that
+interpolation leaves along an axis."""
 
 
 class SmoothNoise:

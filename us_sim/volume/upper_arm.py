@@ -27,11 +27,11 @@ from us_sim.volume.tube import Tube
 
 __all__ = ["UPPER_ARM_BLOCK", "UPPER_ARM_LABELS", "ArmSection", "UpperArm"]
 
-# Lower and upper corner of the block in frame ``patient``, m.
 UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
+"""Lower and upper corner of the block in frame ``patient``, m."""
 
-# Texture goes on this far beyond the block, m, whose edges' echoes come from there too.
 _MARGIN = np.array([[-5e-3], [5e-3]])
+"""Texture goes on this far beyond the block, m: echoes at its edges come from there too."""
 
 UPPER_ARM_LABELS = {
     "skin": 1,
@@ -43,9 +43,10 @@ UPPER_ARM_LABELS = {
     "nerve": 7,
 }
 
-# Attenuation there and back at 8 MHz, dB/m by label: twice 0.15 (blood) to 1 (skin) dB/cm/MHz;
-# bone's leaves nothing. The scanner's time gain gives back a little less than muscle takes.
 _ATTENUATION = np.array([0.0, 1600.0, 800.0, 950.0, 6000.0, 250.0, 250.0, 950.0])
+"""Attenuation there and back at 8 MHz, dB/m by label: twice 0.15 (blood) to 1 (skin) dB/cm/MHz;
+bone's leaves nothing. The scanner's time gain gives back a little less than muscle takes."""
+
 _TIME_GAIN = 820.0
 _SIDE_LOBES = -27.0  # dB
 

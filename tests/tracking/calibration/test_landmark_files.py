@@ -8,7 +8,7 @@ from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.dwell import find_dwells
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_wires
 from us_sim.tracking.calibration.landmarks import register_landmarks
-from us_sim.tracking.calibration.recorded_motion import poses_of, read_motion, seconds_of
+from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
 
 PLUS = """<PlusConfiguration><PhantomDefinition><Geometry>
 <Pattern Type="NWire"><Wire Name="G1" EndPointFront="30 0 20" EndPointBack="30 40 20"/></Pattern>
@@ -106,7 +106,7 @@ def test_plus_recording_of_eight_landmarks_gives_plus_registration(shared_data):
     motion = read_motion(
         folder / "EightLandmarkPointsTrackedForPhantomRegistration.igs.mha", "StylusToReference"
     )
-    poses = poses_of(motion)
+    poses = motion.poses
     # The tip that Plus' own test of this recording is configured with
     # (PlusDeviceSet_fCal_Sim_RecordPhantomLandmarks.xml).
     tip = np.array([0.108565, 0.00777385, 0.0025389])

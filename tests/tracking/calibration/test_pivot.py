@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import curve_fit
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
@@ -54,6 +55,25 @@ def test_errors_are_as_large_as_the_deviations_say():
         assert found.rms == pytest.approx(noise * np.sqrt(3), rel=0.4)
     # 360 normal deviates: their root mean square is 1 with a standard deviation of 0.04.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.13)
+
+
+@pytest.mark.parametrize("count", [10, 12, 30])
+def test_deviations_are_those_of_a_fit_with_six_unknowns(count):
+    """Three numbers a pose, less the six that are fitted, as scipy's fit counts them."""
+    rng = np.random.default_rng(count)
+    exact = pivoting(tilts(rng, count))
+    poses = [Pose(p.position + 2e-4 * rng.uniform(-1, 1, 3), p.orientation) for p in exact]
+    found = calibrate_pivot(poses)
+    assert found.rejected == 0
+    rotations = np.concatenate([pose.rotation for pose in poses])
+
+    def positions(_, *unknown):
+        return np.tile(unknown[3:], count) - rotations @ unknown[:3]
+
+    seen = np.concatenate([pose.position for pose in poses])
+    best, covariance = curve_fit(positions, None, seen, np.append(TIP, HOLE))
+    np.testing.assert_allclose(found.tip, best[:3], atol=1e-9)
+    np.testing.assert_allclose(found.deviations, np.sqrt(np.diag(covariance))[:3], rtol=1e-4)
 
 
 def test_a_third_of_wrong_poses_is_left_out_and_counted():

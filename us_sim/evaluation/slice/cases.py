@@ -41,10 +41,9 @@ __all__ = [
     "speckle",
 ]
 
-#: Columns, and rows, of an image.
-SIZES = (256, 512, 1024)
-#: m, by which the block is pressed.
+SIZES = (256, 512, 1024)  # columns, and rows, of an image
 DEPTHS = {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03}
+"""m, by which the block is pressed."""
 
 _EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
 _BEYOND = 5e-3  # m of volume around the block, which does not deform
@@ -122,8 +121,7 @@ class Case:
         return found
 
 
-#: The case by which methods are compared.
-MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")
+MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")  # the case by which methods are compared
 
 
 def cases(quick: bool) -> list[Case]:

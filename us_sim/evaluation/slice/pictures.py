@@ -20,12 +20,12 @@ from us_sim.volume.volume import Volume
 
 __all__ = ["SHOWN", "draw_differences"]
 
-#: What the picture has, a row each.
 SHOWN = (
     MAIN,
     replace(MAIN, deformation="pressed_30mm", plane="oblique"),
     replace(MAIN, deformation="pressed_30mm", plane="corner"),
 )
+"""What the picture has, a row each."""
 _LEAST, _MOST = 1e-13, 1e-2  # voxels, at the ends of the colours
 _RIGHT = 1e-14  # voxels, drawn for what is exact to the last bit
 _WRONG = "#00e5ff"

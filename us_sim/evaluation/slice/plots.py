@@ -15,13 +15,13 @@ from us_sim.evaluation.slice.points import Point
 
 __all__ = ["STYLES", "plot_errors", "plot_meshes", "plot_pixels"]
 
-#: A colour and a mark for each method, told apart in every common colour blindness.
 STYLES = {
     "scan_conversion": ("#D55E00", "D"),
     "row_subdivision": ("#0072B2", "o"),
     "per_pixel": ("#009E73", "s"),
     "vtk": ("#CC79A7", "^"),
 }
+"""A colour and a mark for each method, told apart in every common colour blindness."""
 _FRAME = 1000.0 / 60.0  # ms, at 60 images a second
 _TENTH = 0.1  # voxels
 _SMALLEST = 1e-14  # voxels, drawn where a method is exact to the last bit

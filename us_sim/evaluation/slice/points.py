@@ -29,8 +29,8 @@ _AGAIN = 5  # images in a turn of a method that takes less than _SHORT
 _SHORT = 8.0  # ms
 _FEWEST = 3  # turns of each method that takes less than _SLOW
 _SLOW = 150.0  # ms
-# Voxels by which tissue must have moved before taking it for the rigid volume can be told.
 _MOVED = 0.01
+"""Voxels by which tissue must have moved before taking it for the rigid volume can be told."""
 _ROUNDED = 0.5 + 1e-6  # grey levels
 
 
@@ -73,8 +73,8 @@ class Point:
         return [_cell(value) for value in values]
 
 
-#: Of slice.csv, in order.
 COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
+"""Of slice.csv, in order."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ __all__ = [
 ]
 
 _METHOD = "scan_conversion"
-#: Voxels a side, of the volume whose memory is asked for.
 LARGE_VOLUME = 512
+"""Voxels a side, of the volume whose memory is asked for."""
 
 
 def main_points(points: Sequence[Point]) -> list[Point]:

@@ -34,7 +34,6 @@ __all__ = [
     "sampled_cases",
 ]
 
-#: Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are.
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),
     "needle": Sphere(0.001),
@@ -43,14 +42,13 @@ COLLIDERS: dict[str, Collider] = {
     "plate": RoundedBox(0.05, 0.02, 0.03, 0.002),
     "pebble": RoundedBox(0.06, 0.05, 0.05, 0.025),
 }
+"""Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are."""
 
-#: Where a mesh is stiffer by the contrast.
-LAYOUTS = ("inclusion", "skin", "half", "scattered")
+LAYOUTS = ("inclusion", "skin", "half", "scattered")  # where a mesh is stiffer by the contrast
 
-#: Spring constants of methods that have springs, and whether tetrahedra keep their volumes.
 SPRINGS = ("algorithm_1", "fitted", "fitted with volume")
+"""Spring constants of methods that have springs, and whether tetrahedra keep their volumes."""
 
-#: Motions of the probe; see `us_sim.evaluation.stability.motions`.
 MOTIONS = (
     "press",
     "jump",
@@ -63,6 +61,7 @@ MOTIONS = (
     "scribble",
     "flicker",
 )
+"""Motions of the probe; see `us_sim.evaluation.stability.motions`."""
 
 _STIFFEST = 12.0  # lg Pa
 _GREATEST_CONTRAST = 9.0  # lg

@@ -11,7 +11,6 @@ import csv
 import math
 import multiprocessing
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -38,15 +37,13 @@ __all__ = ["COLUMNS", "Tried", "evaluate_stability", "write_rows"]
 _SAMPLES = {True: 64, False: 2048}  # by quick
 _STEP_LIMITS = {True: 24, False: 200}
 
-# Cases that a process is handed at a time.
 _CHUNK = 12
+"""Cases that a process is handed at a time."""
 
-# Predicted and observed step limit agree within this.
-_STEP_LIMIT_ERROR = 0.02
+_STEP_LIMIT_ERROR = 0.02  # predicted and observed step limit agree within this
 
 _VARIED = [field.name for field in fields(StabilityCase) if field.name != "case"]
 
-#: Of stability.csv.
 COLUMNS = [
     "method",
     "case",
@@ -62,9 +59,9 @@ COLUMNS = [
     "truthful",
     "action",
 ]
+"""Of stability.csv."""
 
-# What a method without it leaves empty.
-_OF_SPRINGS = ("time_step", "damping", "springs")
+_OF_SPRINGS = ("time_step", "damping", "springs")  # what a method without it leaves empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +200,6 @@ def _tried(task: _Task, trial: Trial) -> Tried:
 def _prepare(cache: str) -> None:
     """In a new process: one thread for BLAS, and what is kept on disk goes to ``cache``."""
     os.environ["US_SIM_CACHE"] = cache
-    # Progress bars of single solvers would overwrite the one of the run.
-    sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     threadpool_limits(1)
 
 

@@ -21,11 +21,11 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, unifo
 
 __all__ = ["MESHES", "SUPPORTS", "fixed_nodes", "mesh_named", "parts"]
 
-#: How a tissue can be held.
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
+"""How a tissue can be held."""
 
-# Tetrahedra flatter than this (volume over longest edge cubed) are left out of Delaunay's.
 _FLATTEST = 1e-7
+"""Tetrahedra flatter than this (volume over longest edge cubed) are left out of Delaunay's."""
 
 
 @lru_cache
@@ -144,7 +144,6 @@ def _slab() -> TetrahedralMesh:
     return box_mesh(across, across, uniform_planes(0.0, 0.002, 3))
 
 
-#: The tissues by name.
 MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
     "box": lambda: _box(4, 4, 4),
     "fine": lambda: _box(6, 5, 5),
@@ -158,3 +157,4 @@ MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
     "millimetre": lambda: _box(4, 4, 4, 0.01),
     "ten metres": lambda: _box(4, 4, 4, 100.0),
 }
+"""The tissues by name."""

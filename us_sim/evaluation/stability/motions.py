@@ -15,11 +15,10 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["LIFTED", "poses_of"]
 
-# Hz, and the rate of frames at which it is seen: no small multiple, so that no phase repeats.
 _TREMOR, _FRAMES_A_SECOND = 1000.0, 2718.0
+"""Hz, and the rate of frames at which it is seen: no small multiple, so that no phase repeats."""
 
-#: A probe far from any tissue.
-LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))
+LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # a probe far from any tissue
 
 
 def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:

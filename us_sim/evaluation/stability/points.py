@@ -52,20 +52,20 @@ __all__ = [
     "try_case",
 ]
 
-#: Methods without masses: a part that is not held has no position of rest, and is refused.
 QUASI_STATIC = ("fem", "fem_nonlinear", "fem_cg")
+"""Methods without masses: a part that is not held has no position of rest, and is refused."""
 
-#: What a solver says of a frame that failed, and of one after which it kept the last good state.
 FAILED, KEPT = "came out not finite or far away", "so the last good state was kept"
+"""What a solver says of a frame that failed, and of one after which it kept the last good state."""
 
-# Residuals below this are the same, and above it they agree within this factor.
 _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
+"""Residuals below this are the same, and above it they agree within this factor."""
 
-# Frames after the release that a quasi-static and a dynamic method are given.
 _FRAMES_OF_RELEASE = {True: 40, False: 150}
+"""Frames after the release that a quasi-static and a dynamic method are given."""
 
-# Of the thickness: a tissue that is so near its rest has come back.
 _RECOVERED = 1e-4
+"""Of the thickness: a tissue that is so near its rest has come back."""
 
 
 @dataclass(eq=False)

@@ -106,7 +106,6 @@ def _state(method: str, displacement: float, count: int = 64) -> None:
     solver.take_over(state)
 
 
-#: What is given, by name.
 REFUSALS: dict[str, Callable[[str], None]] = {
     "a node is not a number": lambda m: _moved_node(m, 5, [np.nan, 0.0, 0.0]),
     "a node is at infinity": lambda m: _moved_node(m, 5, [0.0, np.inf, 0.0]),
@@ -134,3 +133,4 @@ REFUSALS: dict[str, Callable[[str], None]] = {
     "a state that is not a number": lambda m: _state(m, np.nan),
     "a state of another mesh": lambda m: _state(m, 0.0, 9),
 }
+"""What is given, by name."""

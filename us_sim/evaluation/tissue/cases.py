@@ -20,15 +20,12 @@ from numpy.typing import NDArray
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["LARGEST_MESH", "LOCKING", "MESHES", "SCENES", "Scene"]
 
-#: Nodes along x, y and z: the paper's four (section VI).
 MESHES = ((20, 10, 10), (24, 12, 12), (28, 14, 14), (32, 16, 16))
+"""Nodes along x, y and z: the paper's four (section VI)."""
 LARGEST_MESH = (64, 32, 32)
 
 _EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
@@ -55,15 +52,9 @@ class Scene:
 
     def model(self, counts: tuple[int, int, int]) -> TissueModel:
         """The block on a uniform mesh of so many nodes along each axis."""
-        planes = (
-            uniform_planes(low, high, count)
-            for (low, high), count in zip(_EXTENT, counts, strict=True)
+        return TissueModel.block(
+            (0.2, 0.1, 0.1), counts, material=self.material, collider=self.collider
         )
-        mesh = box_mesh(*planes)
-        fixed = np.zeros(len(mesh.nodes), dtype=bool)
-        fixed[face_nodes(mesh, "bottom")] = True
-        materials = uniform_material(mesh, self.material)
-        return TissueModel(mesh, materials, fixed, self.collider, face_nodes(mesh, "top"))
 
     def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
@@ -139,5 +130,5 @@ SCENES = {
     )
 }
 
-#: Where linear tetrahedra lock: the same press of ever less compressible tissue.
 LOCKING = ("press_12mm", *(name for name in SCENES if name.startswith("press_12mm_nu")))
+"""Where linear tetrahedra lock: the same press of ever less compressible tissue."""

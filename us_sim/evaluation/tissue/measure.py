@@ -34,7 +34,6 @@ from us_sim.tissue.solvers.solver import SOLVERS, create_solver
 
 __all__ = ["evaluate_tissue", "plan", "settings_of"]
 
-# What is tried besides each method's own defaults.
 _SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
     "fem": (),
     "fem_nonlinear": (
@@ -58,12 +57,12 @@ _SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
         {"stiffness": "algorithm_1", "volume": False},
     ),
 }
+"""What is tried besides each method's own defaults."""
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
 _QUICK_SETTINGS = 2
 _SIZES, _QUICK_SIZES = (0.01, 0.005, 0.00325), (0.01, 0.0065)  # m, of the reference's elements
 
-#: The scene that is pressed on every mesh.
-MAIN_SCENE = "press_25mm"
+MAIN_SCENE = "press_25mm"  # the scene that is pressed on every mesh
 
 
 @dataclass(frozen=True)

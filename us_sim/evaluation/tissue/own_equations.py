@@ -17,7 +17,6 @@ from us_sim.tissue.solvers.solver import create_solver
 
 __all__ = ["EFFORT", "converged", "equations", "solved_independently"]
 
-#: Settings that say how hard a method tries, and not what it solves.
 EFFORT = (
     "iterations",
     "steps",
@@ -28,8 +27,8 @@ EFFORT = (
     "most_iterations",
     "time_step",
 )
+"""Settings that say how hard a method tries, and not what it solves."""
 
-# What each method is given to converge; a setting that it has not is left out.
 _PATIENT: dict[str, dict[str, Any]] = {
     "fem_nonlinear": {
         "iterations": 60,
@@ -41,6 +40,7 @@ _PATIENT: dict[str, dict[str, Any]] = {
     "msds": {"steps": 100, "rest_tolerance": 1e-8},
     "msds_implicit": {"iterations": 50, "tolerance": 1e-8, "rest_tolerance": 1e-8},
 }
+"""What each method is given to converge; a setting that it has not is left out."""
 _FRAMES = 400
 _LONGEST = 10.0  # s
 

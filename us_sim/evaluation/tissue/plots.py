@@ -15,7 +15,6 @@ from us_sim.evaluation.tissue.points import Point
 
 __all__ = ["exponent", "plot_errors", "plot_sizes"]
 
-#: A colour and a mark for each method, told apart in every common colour blindness.
 STYLES = {
     "fem": ("#0072B2", "o"),
     "fem_nonlinear": ("#D55E00", "D"),
@@ -23,15 +22,16 @@ STYLES = {
     "msds": ("#009E73", "^"),
     "msds_implicit": ("#CC79A7", "v"),
 }
-# Where a name may stand beside its point: right, above, below, left, and the corners.
+"""A colour and a mark for each method, told apart in every common colour blindness."""
 _PLACES = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-# Settings that change the equations, in a plot.
+"""Where a name may stand beside its point: right, above, below, left, and the corners."""
 _WORDS = {
     "stiffness=fitted": "fitted",
     "stiffness=algorithm_1": "Algorithm 1",
     "volume=True": "volume term",
     "volume=False": "no volume term",
 }
+"""Settings that change the equations, in a plot."""
 _FRAME = 1000.0 / 30.0  # ms, of the paper's 30 frames a second
 
 

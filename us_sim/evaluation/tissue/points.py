@@ -75,8 +75,8 @@ class Point:
         return self.reference.startswith("own")
 
 
-#: Of tissue.csv, in order.
 COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
+"""Of tissue.csv, in order."""
 
 
 @dataclass(frozen=True, eq=False)

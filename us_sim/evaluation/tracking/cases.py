@@ -52,11 +52,11 @@ def _pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-#: Webcams of the same field of view from top to bottom, 44°.
 CAMERAS = {
     "640x480": CameraModel(640, 480, _pinhole(600.0, 601.0, 322.3, 238.1), _LENS),
     "1920x1080": CameraModel(1920, 1080, _pinhole(1350.0, 1352.0, 965.2, 536.7), 0.3 * _LENS),
 }
+"""Webcams of the same field of view from top to bottom, 44°."""
 
 CONDITIONS = {
     "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),

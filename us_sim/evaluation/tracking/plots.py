@@ -17,7 +17,6 @@ from us_sim.evaluation.tracking.points import Point
 
 __all__ = ["STYLES", "plot_conditions", "plot_filters", "plot_run_time", "plot_views"]
 
-#: A colour and a mark for each body, told apart in every common colour blindness.
 STYLES = {
     SINGLE: ("#D55E00", "D"),
     "apriltag_40mm": ("#E69F00", "v"),
@@ -25,6 +24,7 @@ STYLES = {
     "grid_board": ("#009E73", "s"),
     RIGID_BODY: ("#CC79A7", "^"),
 }
+"""A colour and a mark for each body, told apart in every common colour blindness."""
 _SMALL = "640x480"
 _DISTANCE = 0.4  # m
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from us_sim.errors import SceneError
-from us_sim.geometry.pose import Pose
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import path_of
 from us_sim.tracking.measurement import Measurement
@@ -74,5 +73,4 @@ class PathInput(TrackerInput):
 
     def _send(self, stamp: int) -> None:
         self._device.health.received += 1
-        pose = Pose(self._path.positions[self._next], self._path.orientations[self._next])
-        self._device.take(Measurement(stamp, pose))
+        self._device.take(Measurement(stamp, self._path.pose(self._next)))

@@ -17,8 +17,8 @@ from numba import njit
 
 __all__ = ["adjugate", "is_solid"]
 
-# Share of its rest volume below which a tetrahedron is flat: it has no interior to show.
 _FLAT = 1e-6
+"""Fraction of its rest volume below which a tetrahedron is flat: it has no interior to show."""
 
 
 @njit(inline="always", error_model="numpy")

@@ -30,12 +30,11 @@ __all__ = ["ON_PLANE", "Clusters"]
 ON_PLANE = 1e-9
 """Pixels that a node may lie off the plane and still be taken as on it: rounding."""
 
-# Tetrahedra of a cluster: few enough to follow the plane, many enough to share their nodes.
 _SIZE = 128
-# Nodes that are looked at together.
-_BLOCK = 256
-# Pixels beyond the image's border at which a tetrahedron may be left out.
+"""Tetrahedra of a cluster: few enough to follow the plane, many enough to share their nodes."""
+_BLOCK = 256  # nodes that are looked at together
 _MARGIN = 1e-3
+"""Pixels beyond the image's border at which a tetrahedron may be left out."""
 
 
 class Clusters:

@@ -34,10 +34,10 @@ __all__ = [
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
 
-# Voxels a pixel beyond which a map is so steep that rounding may lead it out of the volume.
 _STEEP = 1e3
-# Pixels by which a cut may lie outside the image and still be looked at.
+"""Voxels a pixel beyond which a map is so steep that rounding may lead it out of the volume."""
 _MARGIN = 1e-6
+"""Pixels by which a cut may lie outside the image and still be looked at."""
 
 
 class Cuts(NamedTuple):

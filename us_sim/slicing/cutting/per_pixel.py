@@ -42,9 +42,8 @@ if TYPE_CHECKING:
 
 __all__ = ["PerPixel"]
 
-# As for a section: pixels off the plane that count as on it, and a flat share of the rest volume.
-_ON_PLANE = 1e-9
-_FLAT = 1e-6
+_ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section
+_FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
 
 
 class PerPixel(Slicer):

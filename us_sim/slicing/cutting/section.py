@@ -34,8 +34,8 @@ __all__ = ["INSIDE", "RestMesh", "Section", "finite_nodes", "row_span"]
 INSIDE = -1e-9
 """Least barycentric coordinate of a point inside, so that rounding leaves no holes at faces."""
 
-# Pixels that a node may lie off the plane and still be taken as on it: rounding of its position.
 _ON_PLANE = 1e-9
+"""Pixels off the plane within which a node counts as on it: rounding of its position."""
 
 
 class Section(NamedTuple):

@@ -21,9 +21,8 @@ from us_sim.slicing.cutting.trilinear import SLACK
 
 __all__ = ["INNER_MARGIN", "MOST_VOXELS", "MOST_VOXELS_A_SIDE", "fill_elements", "sample_spans"]
 
-# Bits behind the point of a coordinate, and those of them that a blend leaves out.
-_FRACTION = 17
-_DROPPED = 2
+_FRACTION = 17  # bits behind the point of a coordinate
+_DROPPED = 2  # of these bits, how many a blend leaves out
 _ONE = float(1 << _FRACTION)
 
 MOST_VOXELS_A_SIDE = 1 << 31 - _FRACTION
@@ -32,9 +31,8 @@ MOST_VOXELS = 1 << 32
 INNER_MARGIN = 1e-3
 """Voxels from the outermost centres within which coordinates need no care: their rounding."""
 
-# First coordinates of pixels that have not been written yet, and of those without a place at rest.
-_OPEN = -1
-_NOWHERE = -2
+_OPEN = -1  # first coordinate of a pixel that has not been written yet
+_NOWHERE = -2  # first coordinate of a pixel without a place at rest
 
 _COLUMN = (1 << END_SHIFT) - 1
 

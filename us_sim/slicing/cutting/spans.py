@@ -12,12 +12,12 @@ from numba import njit
 
 __all__ = ["CUT_SHIFT", "END_SHIFT", "closed_columns", "convert_cuts", "up_to"]
 
-# A span is one number: its cut, its end and its first column, which are at most 4096.
-CUT_SHIFT = 26
-END_SHIFT = 13
+CUT_SHIFT, END_SHIFT = 26, 13
+"""Bits by which a span's cut and end are shifted in the one number that it is; its first column
+fills the lowest bits. A column is at most 4096."""
 
-# Pixels around an outline that belong to it: rounding of positions.
 _CLOSE = 1e-8
+"""Pixels from an outline within which a place is on it: rounding of positions."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -34,8 +34,10 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 
 __all__ = ["Resolution"]
 
-# The square of a Gaussian, the power of a point, has a standard deviation √2 times less.
 _SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
+"""Standard deviation of an amplitude over the width at half its power: power is the square, and has
+a standard deviation √2 times less."""
+
 _REACH = 3.0  # standard deviations after which the point spread counts as 0
 
 _PULSE_GROWTH = (

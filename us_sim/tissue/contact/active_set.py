@@ -23,21 +23,22 @@ from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out
 
 __all__ = ["ActiveSet"]
 
-# m. When the probe has moved this far off a touched node and off its rest position, it is let go at
-# once, without waiting for its force to change sign: after a jump it would be pulled far up first.
 _CLEARANCE = 1e-3
+"""A touched node is let go at once when the probe is this far from it and from its place at rest,
+m. To wait for its force to change sign would, after a jump, pull it far up first."""
 
-# m. On taking over, a node this near the probe is taken to be pushed.
 _NEAR = 1e-4
+"""A node this near the probe counts as pushed when another solver's state is taken over, m."""
 
-# Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
-# under it again without end. So a touched node stays so until it is this part of the spacing away.
 _SKIRT = 0.25
+"""Part of the spacing by which a touched node must be beside the probe to be let go. Pressed down,
+a node at the rim moves sideways, would come up, and would be under the probe again without end."""
 
-# As a touched node slides along a curved surface, its prescribed displacement and its normal become
-# outdated. Renewing them starts the search anew, so while it goes on small errors wait.
 _DRIFT, _LITTLE_DRIFT = 1e-4, 1e-9  # m
 _TURN, _LITTLE_TURN = 0.05, 1e-7  # rad
+"""Errors of a touched node's prescribed displacement and of its normal, which become outdated as it
+slides along a curved surface: those renewed during the search, and those renewed at its end.
+Renewing starts the search anew."""
 
 
 class ActiveSet:

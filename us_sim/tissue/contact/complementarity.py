@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 
 __all__ = ["pivot", "solve_active", "unilateral"]
 
-# Block pivots that may fail to improve before pivots are made one at a time.
 _PATIENCE = 5
+"""Block pivots that may fail to improve before pivots are made one at a time."""
 
-# Part of the largest distance among the gaps below which a gap counts as closed.
 _ROUNDING = 1e-12
+"""Part of the largest distance among the gaps below which a gap counts as closed."""
 
-# Part of its own compliance that each node yields more: rows that are combinations of others then
-# have a solution, and what the gaps open by is as far below them.
 _GIVE = 1e-12
+"""Part of its own compliance that is added to each node's. Rows that are combinations of others
+then have a solution; the gaps change by no larger part."""
 
 _SINGLE_PIVOTS = 20  # for each unknown, before relaxation takes over
 _SWEEPS = 2000

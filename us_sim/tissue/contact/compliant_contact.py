@@ -32,30 +32,30 @@ from us_sim.tissue.contact.penetration import only_forward, pushing_gap
 
 __all__ = ["CLOSED", "SKIRT", "CompliantContact", "gaps", "gather", "yielded"]
 
-#: m. A gap this small is closed, and so is a node that is in the probe by this much.
 CLOSED = 1e-9
+"""A gap up to this is closed, and so is one of a node this deep in the probe, m."""
 
-# After so many rounds that mixed earlier ones, plain and shorter steps are surer.
-_MIXED = 30
-_ROUNDS = 250
-_SHORT = 0.7
+_MIXED, _ROUNDS = 30, 250
+"""Rounds that mix earlier ones, and rounds in all: the rest are plain and shorter, which is
+surer."""
 
-# Part of the spacing: nodes with wider gaps are not looked at unless they turn out to be entered.
+_SHORT = 0.7  # length of a shorter step
+
 _NEAR = 0.4
+"""Part of the spacing: nodes with wider gaps are left out until the probe enters them."""
 
-# Part of the spacing: open gaps wider than this wait for the next round.
 _AHEAD = 0.25
+"""Part of the spacing: open gaps wider than this wait for the next round."""
 
-# How many earlier rounds are mixed.
-_MEMORY = 4
+_MEMORY = 4  # how many earlier rounds are mixed
 
-# Force along the surface, over the contact force, that is left when the normals have come to rest.
 _SLIDING = 1e-7
+"""Force along the surface over the contact force below which the normals are at rest."""
 
-#: Pressed down, a node at the rim moves sideways, out of the probe's way, and would come up and
-#: under it again without end. So a pushed node counts as under the probe until it is this part of
-#: the spacing beside it, and farther each time that it comes back.
 SKIRT = 0.25
+"""Part of the spacing by which a pushed node must be beside the probe to be let go; it grows each
+time that the node comes back. Pressed down, a node at the rim moves sideways, would come up, and
+would be under the probe again without end."""
 
 
 class CompliantContact:

@@ -40,14 +40,14 @@ __all__ = ["FrictionalContact"]
 _ROUNDS = 30
 _SWEEPS = 100
 
-# m. Sweeps go on until no node moves by more.
 _STILL = 2e-11
+"""Sweeps go on until no node moves by more, m."""
 
-# Steps towards a node's own force, in its turn.
 _LOCAL = 10
+"""Steps towards a node's own force, in its turn."""
 
-# A normal that turns by less has come to rest.
 _TURN = 1e-8
+"""A normal that turns by less has come to rest."""
 
 
 class FrictionalContact(CompliantContact):

@@ -30,12 +30,12 @@ __all__ = [
     "wrench_on_probe",
 ]
 
-#: m. A node this close to the probe's surface lies on it.
 GAP_TOLERANCE = 1e-5
+"""A node this close to the probe's surface lies on it, m."""
 
-# m. A hand holds the probe behind its collider: so far back nodes cannot slip past it, and a sudden
-# jump by more than the collider's thickness still finds them before it.
 _GRIP = 0.1
+"""Length by which a collider goes on behind, m, where a hand holds the probe. Nodes cannot slip
+past it there, and a sudden jump by more than its thickness still finds them before it."""
 
 
 def only_forward(collider: Collider, spacing: float) -> bool:

@@ -23,12 +23,13 @@ from us_sim.tissue.contact.penetration import GAP_TOLERANCE, only_forward, push_
 
 __all__ = ["SlidingContact"]
 
-# A touched node beside a small rounding stays so until it is this part of the spacing away: pressed
-# down it moves out of the probe's way, and would come up and under it again without end.
 _SKIRT = 0.25
+"""Part of the spacing by which a node touched beside a small rounding must be away to be let go.
+Pressed down it moves sideways, would come up, and would be under the probe again without end."""
 
-# m. Where the push direction is not the surface's normal, one projection does not end on it.
 _EXACT, _PROJECTIONS = 1e-9, 4
+"""Distance from the surface, m, and projections that reach it at most: where the push direction is
+not the surface's normal, one does not."""
 
 
 class SlidingContact:

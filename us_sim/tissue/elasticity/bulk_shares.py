@@ -29,8 +29,8 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 
 __all__ = ["BulkShares", "bulk_shares"]
 
-# lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock.
 _ELEMENT_LIMIT = 5.0
+"""lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock."""
 
 
 @dataclass(frozen=True, eq=False)

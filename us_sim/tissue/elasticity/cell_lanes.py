@@ -11,7 +11,8 @@ Buffers are rows of `LANES` numbers, one number a cell. ``grid`` (4,) holds the 
 a cell to the next along x, y and z, and the first number beyond the last cell.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.cell_lanes import LANES, add_out, copy_in
+>>> from us_sim.tissue.elasticity.cell_lanes import add_out, copy_in
+>>> from us_sim.tissue.elasticity.lanes import LANES
 >>> values, grid = np.arange(8.0), np.array([4, 2, 1, 1])  # one cell
 >>> width, lanes, back = np.ones(LANES), np.zeros(8 * LANES), np.zeros(8)
 >>> copy_in(values, grid, 0, -width, lanes, 0, 1)
@@ -26,29 +27,43 @@ from __future__ import annotations
 
 from numba import njit
 
+from us_sim.tissue.elasticity.lanes import LANES, put_six, three
 from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, LOOP
 
 __all__ = [
-    "LANES",
+    "FIELD",
     "OUT",
+    "PER_WIDTH",
+    "PRESSURES",
     "ROWS",
+    "SUMS",
     "add_field",
     "add_out",
     "copy_field",
     "copy_in",
-    "five",
     "gradients",
     "put_forces",
-    "put_one",
     "put_sum",
     "put_volumes",
 ]
 
-# Cells in one buffer: a few vectors of the widest kind, and all its rows stay in the L1 cache.
-LANES = 64
+PER_WIDTH = 0
+"""Row of the constants: one over the width along x (negative where mirrored), then y and z."""
 
-# The row of a buffer from which on is what comes out, and how many rows there are in all.
-OUT, ROWS = 37, 37 + 48
+FIELD = 0
+"""Row of a buffer: the field, 3 corner + axis."""
+
+SUMS = FIELD + 24
+"""Row of a buffer: the nodes' sums, one a corner."""
+
+PRESSURES = SUMS + 8
+"""Row of a buffer: what the nodes' sums make in the five tetrahedra."""
+
+OUT = PRESSURES + 5
+"""Row of a buffer from which on is what comes out: 3 corner + axis, or 6 a corner, or less."""
+
+ROWS = OUT + 48
+"""Rows of a buffer."""
 
 
 @njit(**INLINED)
@@ -67,7 +82,7 @@ def copy_in(values, grid, first, rows, lanes, row, step):
         for w in range(count):
             a = near[w]
             b = far[w]
-            mirrored = rows[w] < 0
+            mirrored = rows[PER_WIDTH * LANES + w] < 0
             low[w] = b if mirrored else a
             high[w] = a if mirrored else b
 
@@ -84,19 +99,19 @@ def add_out(lanes, row, step, grid, first, rows, values):
         for w in range(count):
             a = low[w]
             b = high[w]
-            near[w] += b if rows[w] < 0 else a
+            near[w] += b if rows[PER_WIDTH * LANES + w] < 0 else a
         far = values[start + grid[0] : start + grid[0] + count]
         for w in range(count):
             a = low[w]
             b = high[w]
-            far[w] += a if rows[w] < 0 else b
+            far[w] += a if rows[PER_WIDTH * LANES + w] < 0 else b
 
 
 @njit(**LOOP)
 def copy_field(field, grid, first, rows, lanes):
     """Rows 3 corner + axis of lanes: the field (3, N) at the corners of cells."""
     for axis in range(3):
-        copy_in(field[axis], grid, first, rows, lanes, axis, 3)
+        copy_in(field[axis], grid, first, rows, lanes, FIELD + axis, 3)
 
 
 @njit(**LOOP)
@@ -107,30 +122,17 @@ def add_field(lanes, grid, first, rows, field):
 
 
 @njit(**INLINED)
-def _corners(rows, w):
-    """Three rows of each of the eight corners."""
+def _corners(field, w):
+    """The field at each of the eight corners."""
     return (
-        (rows[w], rows[LANES + w], rows[2 * LANES + w]),
-        (rows[3 * LANES + w], rows[4 * LANES + w], rows[5 * LANES + w]),
-        (rows[6 * LANES + w], rows[7 * LANES + w], rows[8 * LANES + w]),
-        (rows[9 * LANES + w], rows[10 * LANES + w], rows[11 * LANES + w]),
-        (rows[12 * LANES + w], rows[13 * LANES + w], rows[14 * LANES + w]),
-        (rows[15 * LANES + w], rows[16 * LANES + w], rows[17 * LANES + w]),
-        (rows[18 * LANES + w], rows[19 * LANES + w], rows[20 * LANES + w]),
-        (rows[21 * LANES + w], rows[22 * LANES + w], rows[23 * LANES + w]),
-    )
-
-
-@njit(**INLINED)
-def five(rows, row, w):
-    """Five rows from ``row`` on, of the five tetrahedra of a cell."""
-    v = row * LANES + w
-    return (
-        rows[v],
-        rows[v + LANES],
-        rows[v + 2 * LANES],
-        rows[v + 3 * LANES],
-        rows[v + 4 * LANES],
+        three(field, FIELD, w),
+        three(field, FIELD + 3, w),
+        three(field, FIELD + 6, w),
+        three(field, FIELD + 9, w),
+        three(field, FIELD + 12, w),
+        three(field, FIELD + 15, w),
+        three(field, FIELD + 18, w),
+        three(field, FIELD + 21, w),
     )
 
 
@@ -171,7 +173,7 @@ def _middle_gradient(b, c, e, h, g):
 def gradients(field, rows, w):
     """The gradients in the five tetrahedra of a cell."""
     a, b, c, d, e, f, g, h = _corners(field, w)
-    per = (rows[w], rows[LANES + w], rows[2 * LANES + w])
+    per = three(rows, PER_WIDTH, w)
     return (
         _corner_gradient(a, e, a, c, a, b, per),
         _corner_gradient(c, g, e, g, g, h, per),
@@ -218,7 +220,7 @@ def _put_eight(values, lanes, row, step, w):
 @njit(**INLINED)
 def put_forces(p, q, r, s, t, rows, w, lanes):
     """Rows 3 corner + axis from OUT on: the forces of five stresses times volumes."""
-    g = (rows[w], rows[LANES + w], rows[2 * LANES + w])
+    g = three(rows, PER_WIDTH, w)
     x = _corner_forces(
         p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2], s[0], s[1], s[2], t[0], t[1], t[2], g
     )
@@ -243,22 +245,12 @@ def put_volumes(p, q, r, s, t, w, lanes):
 @njit(**INLINED)
 def put_sum(a, b, c, d, lanes, corner, w):
     """Rows of a corner: the sum of four blocks."""
-    row = (OUT + 6 * corner) * LANES + w
-    lanes[row] = (a[0] + b[0]) + (c[0] + d[0])
-    lanes[row + LANES] = (a[1] + b[1]) + (c[1] + d[1])
-    lanes[row + 2 * LANES] = (a[2] + b[2]) + (c[2] + d[2])
-    lanes[row + 3 * LANES] = (a[3] + b[3]) + (c[3] + d[3])
-    lanes[row + 4 * LANES] = (a[4] + b[4]) + (c[4] + d[4])
-    lanes[row + 5 * LANES] = (a[5] + b[5]) + (c[5] + d[5])
-
-
-@njit(**INLINED)
-def put_one(a, lanes, corner, w):
-    """Rows of a corner that one tetrahedron has."""
-    row = (OUT + 6 * corner) * LANES + w
-    lanes[row] = a[0]
-    lanes[row + LANES] = a[1]
-    lanes[row + 2 * LANES] = a[2]
-    lanes[row + 3 * LANES] = a[3]
-    lanes[row + 4 * LANES] = a[4]
-    lanes[row + 5 * LANES] = a[5]
+    total = (
+        (a[0] + b[0]) + (c[0] + d[0]),
+        (a[1] + b[1]) + (c[1] + d[1]),
+        (a[2] + b[2]) + (c[2] + d[2]),
+        (a[3] + b[3]) + (c[3] + d[3]),
+        (a[4] + b[4]) + (c[4] + d[4]),
+        (a[5] + b[5]) + (c[5] + d[5]),
+    )
+    put_six(total, lanes, OUT + 6 * corner, w)

@@ -34,7 +34,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.tissue.elasticity.springs import SpringNetwork
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors
+from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors, push_corners
 
 __all__ = ["IncrementalPotential"]
 
@@ -60,7 +60,7 @@ class IncrementalPotential:
         self._springs = (springs.edges, springs.stiffness)
         self._rest_length = springs.rest_length
         self._volume = volume.arrays
-        self._rest_volume = self._volume[1]
+        self._rest_volume = volume.rest_volume
         self._time_step = time_step
         self._stiffening = 1.0 + damping_factor / time_step
         self._inertia = mass / time_step**2
@@ -76,7 +76,7 @@ class IncrementalPotential:
     def begin(self, positions: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
         """Start a step from positions (N, 3) m and velocity (N, 3) m/s."""
         _aim(
-            *(self._springs[0], self._rest_length, self._volume[0], self._rest_volume),
+            *(self._springs[0], self._rest_length, self._volume.tetrahedra, self._rest_volume),
             *(positions, self._stiffening, self._lengths, self._volumes),
         )
         self._aim = positions + self._time_step * velocity
@@ -101,14 +101,14 @@ class IncrementalPotential:
     ) -> tuple[float, NDArray[np.float64]]:
         force = np.zeros_like(positions)
         value = _add_spring_forces(*self._springs, lengths, positions, force)
-        value += _add_volume_forces(*self._volume, volumes, positions, force)
+        value += _add_volume_forces(self._volume, volumes, positions, force)
         value = stiffening * value + _add_inertia(inertia, self._aim, positions, stiffening, force)
         return value, force
 
     def curvature(self, positions: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
         """J, second derivative along direction (N, 3) m, without what could make it negative."""
         elastic = _spring_curvature(*self._springs, self._lengths, positions, direction)
-        elastic += _volume_curvature(*self._volume, positions, direction)
+        elastic += _volume_curvature(self._volume, positions, direction)
         inertia = float(self._inertia @ np.einsum("ij,ij->i", direction, direction))
         return self._stiffening * elastic + inertia
 
@@ -161,10 +161,10 @@ def _add_spring_forces(edges, stiffness, rest_length, x, force):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_volume_forces(
-    tetrahedra, rest_volume, element, nodal, inverse_weight, mean, aimed_volume, x, force
-):
+def _add_volume_forces(volumes, aimed_volume, x, force):
     """Adds the forces of volumes to force (N, 3), and returns their energy, J."""
+    tetrahedra, rest_volume, element, nodal = volumes[:4]
+    inverse_weight, mean = volumes.inverse_weight, volumes.mean
     energy = 0.0
     mean[:] = 0.0
     for t in range(len(tetrahedra) if len(mean) > 0 else 0):
@@ -184,18 +184,7 @@ def _add_volume_forces(
         if len(mean) > 0:
             push -= 0.25 * nodal[t] * (mean[a] + mean[b] + mean[c] + mean[d])
         push /= 6.0
-        force[a, 0] -= push * (px + qx + rx)
-        force[a, 1] -= push * (py + qy + ry)
-        force[a, 2] -= push * (pz + qz + rz)
-        force[b, 0] += push * px
-        force[b, 1] += push * py
-        force[b, 2] += push * pz
-        force[c, 0] += push * qx
-        force[c, 1] += push * qy
-        force[c, 2] += push * qz
-        force[d, 0] += push * rx
-        force[d, 1] += push * ry
-        force[d, 2] += push * rz
+        push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force)
     return energy
 
 
@@ -220,8 +209,10 @@ def _spring_curvature(edges, stiffness, rest_length, x, direction):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _volume_curvature(tetrahedra, rest_volume, element, nodal, inverse_weight, mean, x, direction):
+def _volume_curvature(volumes, x, direction):
     """J, second derivative of the volumes' energy along direction (N, 3), without their bending."""
+    tetrahedra, rest_volume, element, nodal = volumes[:4]
+    inverse_weight, mean = volumes.inverse_weight, volumes.mean
     total = 0.0
     mean[:] = 0.0
     y = direction

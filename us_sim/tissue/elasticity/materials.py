@@ -32,8 +32,8 @@ __all__ = [
     "uniform_material",
 ]
 
-# Samples of each tetrahedron: a fraction of its volume is known to about one percent.
 _SAMPLES = 1024
+"""Samples of each tetrahedron, which tell a fraction of its volume to about one percent."""
 
 
 @dataclass(frozen=True, eq=False)

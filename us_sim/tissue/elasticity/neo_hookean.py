@@ -35,6 +35,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
+from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["NeoHookean"]
@@ -64,7 +65,7 @@ class NeoHookean:
             raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
         self._count = len(mesh.nodes)
         kind = TetrahedraSums if mesh.planes is None else CellSums
-        self._sums: TetrahedraSums | CellSums = kind(mesh, materials, self.dtype)
+        self._sums: NodalSums = kind(mesh, materials, self.dtype)
         weight = bulk_shares(materials).nodal * mesh.volumes / 4
         total = np.zeros(self._count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])

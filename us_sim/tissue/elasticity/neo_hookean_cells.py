@@ -25,20 +25,22 @@ from numpy.typing import DTypeLike, NDArray
 from us_sim.errors import MeshError
 from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.cell_lanes import (
-    LANES,
+    FIELD,
     OUT,
+    PER_WIDTH,
+    PRESSURES,
     ROWS,
+    SUMS,
     add_field,
     add_out,
     copy_field,
     copy_in,
-    five,
     gradients,
     put_forces,
-    put_one,
     put_sum,
     put_volumes,
 )
+from us_sim.tissue.elasticity.lanes import LANES, five, in_lanes, put_six, three
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
     HALF,
@@ -46,36 +48,31 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     LOOP,
     ONE,
     block,
+    bulk_slope,
     cofactor_change,
     crowding,
     energy_density,
-    inner,
     limited,
     stress,
-    stress_slope,
+    stress_rise,
     volume_change,
+    volume_slope,
 )
+from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["CellSums"]
 
-# Rows of the constants of sixty-four cells: one over the widths along x (negative where mirrored),
-# y and z; then, of each of the five tetrahedra, V mu, V element and V nodal / 4.
-_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = 3, 8, 13, 18
+_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13, PER_WIDTH + 18
+"""Rows of the constants behind the widths: of each of five tetrahedra V mu, V element and V nodal
+/ 4; and how many."""
 
-# Rows of what the tangent needs: the displacement of eight corners, V (p - mu) of five tetrahedra.
-_K, _TANGENT = 24, 29
-
-# Rows of the buffer between the field's at eight corners and what comes out: the nodes' sums at the
-# corners, and what they make in the five tetrahedra.
-_SUM, _SHARE = 24, 32
+_K, _TANGENT = FIELD + 24, FIELD + 29
+"""Rows of what the tangent needs behind the displacement: V (p - mu); and how many."""
 
 
-class CellSums:
+class CellSums(NodalSums):
     """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes.
-
-    ``nodal`` arguments are (N,) sums or means of the nodes' share of the bulk stiffness, or empty
-    where there is none.
 
     Raises:
         MeshError: not a box mesh.
@@ -88,107 +85,83 @@ class CellSums:
         widths = [np.diff(planes) for planes in mesh.planes]
         cells = np.indices([n - 1 for n in shape]).reshape(3, -1)
         number = (cells[0] * shape[1] + cells[1]) * shape[2] + cells[2]
-        chunks = -(-(int(number[-1]) + 1) // LANES)
-        rows = np.zeros((chunks * LANES, _CONSTANTS))
+        rows = np.zeros((number[-1] + 1, _CONSTANTS))
         for axis in range(3):
-            rows[number, axis] = 1 / widths[axis][cells[axis]]
-        rows[number, 0] *= 1 - 2 * (cells.sum(axis=0) % 2)
+            rows[number, PER_WIDTH + axis] = 1 / widths[axis][cells[axis]]
+        rows[number, PER_WIDTH] *= 1 - 2 * (cells.sum(axis=0) % 2)
         shares = bulk_shares(materials)
         rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * shares.shear).reshape(-1, 5)
         rows[number, _ELEMENT:_NODAL] = (mesh.volumes * shares.element).reshape(-1, 5)
         rows[number, _NODAL:] = (mesh.volumes * shares.nodal / 4).reshape(-1, 5)
-        lanes = rows.reshape(chunks, LANES, _CONSTANTS).transpose(0, 2, 1)
-        self._constants = np.ascontiguousarray(lanes.reshape(chunks, -1), dtype=dtype)
+        self._constants = in_lanes(rows).astype(dtype)
         # Nodes from one corner of a cell to the next along x, y and z, and the last cell's number.
         self._grid = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
-        self._tangent = np.zeros((chunks, _TANGENT * LANES), dtype=dtype)
+        self._tangent = np.zeros((len(self._constants), _TANGENT * LANES), dtype=dtype)
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
 
     def energy(self, displacement: NDArray) -> float:
-        """J, of the tetrahedra's own share."""
         return _energy(displacement, self._grid, self._constants, self._lanes)
 
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        """The smallest volume over rest volume, and how many are not above zero."""
         return _volume_ratios(displacement, self._grid, self._constants, self._lanes)
 
     def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        """J, at each node the sum over its tetrahedra of their nodal weight times J - 1."""
         _volume_changes(displacement, self._grid, self._constants, self._lanes, nodal)
 
     def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, the energy's slope, given the nodes' mean volume change."""
         _forces(displacement, nodal, self._grid, self._constants, self._lanes, out)
 
     def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
         _linearise(
             displacement, nodal, self._grid, self._constants, self._lanes, self._tangent, loosest
         )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        """J, how much `volume_changes` changes with the displacement."""
         _volume_slopes(change, self._grid, self._constants, self._tangent, self._lanes, nodal)
 
     def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, how much the forces change, given the change of the nodes' mean."""
         _tangent_product(
             change, nodal, self._grid, self._constants, self._tangent, self._lanes, out
         )
 
     def diagonal_blocks(self, out: NDArray) -> None:
-        """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' share."""
         _diagonal_blocks(self._grid, self._constants, self._tangent, self._lanes, out)
 
 
 @njit(**LOOP)
-def _share_nodal(nodal, grid, first, rows, lanes):
-    """Rows from _SHARE on: each tetrahedron's nodal weight times the sum of its nodes' values."""
-    copy_in(nodal, grid, first, rows, lanes, _SUM, 1)
+def _nodal_pressures(nodal, grid, first, rows, lanes):
+    """Rows from PRESSURES on: each tetrahedron's nodal weight times its nodes' sum."""
+    copy_in(nodal, grid, first, rows, lanes, SUMS, 1)
     for w in range(LANES):
-        v = _SUM * LANES + w
-        one, two = lanes[v + LANES], lanes[v + 2 * LANES]
-        four, seven = lanes[v + 4 * LANES], lanes[v + 7 * LANES]
-        zero, three = lanes[v], lanes[v + 3 * LANES]
-        five, six = lanes[v + 5 * LANES], lanes[v + 6 * LANES]
+        v = SUMS * LANES + w
+        s1, s2 = lanes[v + LANES], lanes[v + 2 * LANES]
+        s4, s7 = lanes[v + 4 * LANES], lanes[v + 7 * LANES]
+        s0, s3 = lanes[v], lanes[v + 3 * LANES]
+        s5, s6 = lanes[v + 5 * LANES], lanes[v + 6 * LANES]
         c = _NODAL * LANES + w
-        share = _SHARE * LANES + w
-        lanes[share] = rows[c] * ((zero + one) + (two + four))
-        lanes[share + LANES] = rows[c + LANES] * ((six + seven) + (two + four))
-        lanes[share + 2 * LANES] = rows[c + 2 * LANES] * ((five + seven) + (one + four))
-        lanes[share + 3 * LANES] = rows[c + 3 * LANES] * ((three + seven) + (one + two))
-        lanes[share + 4 * LANES] = rows[c + 4 * LANES] * ((one + two) + (four + seven))
+        p = PRESSURES * LANES + w
+        lanes[p] = rows[c] * ((s0 + s1) + (s2 + s4))
+        lanes[p + LANES] = rows[c + LANES] * ((s6 + s7) + (s2 + s4))
+        lanes[p + 2 * LANES] = rows[c + 2 * LANES] * ((s5 + s7) + (s1 + s4))
+        lanes[p + 3 * LANES] = rows[c + 3 * LANES] * ((s3 + s7) + (s1 + s2))
+        lanes[p + 4 * LANES] = rows[c + 4 * LANES] * ((s1 + s2) + (s4 + s7))
 
 
 @njit(**INLINED)
-def _tetrahedron_stress(h, shear, element, share):
+def _pressure(h, shear, element, nodal):
+    """V times the slope of all energy but the shear's by J; nodal is what the nodes make of it."""
     change = volume_change(h)
-    return stress(h, shear, element * change + share + shear * crowding(change)[1])
+    return element * change + nodal + shear * crowding(change)[1]
 
 
 @njit(**INLINED)
-def _bulk(h, shear, element):
-    """How fast the pressure rises with the volume."""
-    return element + shear * crowding(volume_change(h))[2]
+def _tetrahedron_stress(h, shear, element, nodal):
+    return stress(h, shear, _pressure(h, shear, element, nodal))
 
 
 @njit(**INLINED)
-def _tetrahedron_slope(h, d, shear, element, k, share):
-    c = cofactor_change(h)
-    rise = _bulk(h, shear, element) * (inner(c, d) + (d[0] + d[4] + d[8])) + share
-    return stress_slope(h, c, d, shear, k, rise)
-
-
-@njit(**INLINED)
-def _tetrahedron_k(h, shear, element, share, loosest):
-    change = volume_change(h)
-    pressure = element * change + share + shear * crowding(change)[1]
-    return limited(h, shear, pressure - shear, loosest)
-
-
-@njit(**INLINED)
-def _volume_slope(h, d):
-    return inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
+def _tetrahedron_k(h, shear, element, nodal, loosest):
+    return limited(h, shear, _pressure(h, shear, element, nodal) - shear, loosest)
 
 
 @njit(**LOOP)
@@ -241,7 +214,7 @@ def _volume_ratios(displacement, grid, constants, lanes):
             )
         for w in range(min(LANES, grid[3] - first)):
             least = lanes[OUT * LANES + w]
-            if rows[w] != 0 and (least < smallest or np.isnan(least)):
+            if rows[PER_WIDTH * LANES + w] != 0 and (least < smallest or np.isnan(least)):
                 smallest = least
             inverted += int(lanes[(OUT + 1) * LANES + w])
     return smallest, inverted
@@ -276,19 +249,19 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
         rows = constants[chunk]
         first = chunk * LANES
         if len(nodal):
-            _share_nodal(nodal, grid, first, rows, lanes)
+            _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
             element = five(rows, _ELEMENT, w)
-            share = five(lanes, _SHARE, w)
+            mean = five(lanes, PRESSURES, w)
             put_forces(
-                _tetrahedron_stress(p, shear[0], element[0], share[0]),
-                _tetrahedron_stress(q, shear[1], element[1], share[1]),
-                _tetrahedron_stress(r, shear[2], element[2], share[2]),
-                _tetrahedron_stress(s, shear[3], element[3], share[3]),
-                _tetrahedron_stress(t, shear[4], element[4], share[4]),
+                _tetrahedron_stress(p, shear[0], element[0], mean[0]),
+                _tetrahedron_stress(q, shear[1], element[1], mean[1]),
+                _tetrahedron_stress(r, shear[2], element[2], mean[2]),
+                _tetrahedron_stress(s, shear[3], element[3], mean[3]),
+                _tetrahedron_stress(t, shear[4], element[4], mean[4]),
                 rows,
                 w,
                 lanes,
@@ -303,18 +276,18 @@ def _linearise(displacement, nodal, grid, constants, lanes, tangent, loosest):
         first = chunk * LANES
         kept = tangent[chunk]
         if len(nodal):
-            _share_nodal(nodal, grid, first, rows, lanes)
+            _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, kept)
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
             element = five(rows, _ELEMENT, w)
-            share = five(lanes, _SHARE, w)
-            kept[_K * LANES + w] = _tetrahedron_k(p, shear[0], element[0], share[0], loosest)
-            kept[(_K + 1) * LANES + w] = _tetrahedron_k(q, shear[1], element[1], share[1], loosest)
-            kept[(_K + 2) * LANES + w] = _tetrahedron_k(r, shear[2], element[2], share[2], loosest)
-            kept[(_K + 3) * LANES + w] = _tetrahedron_k(s, shear[3], element[3], share[3], loosest)
-            kept[(_K + 4) * LANES + w] = _tetrahedron_k(t, shear[4], element[4], share[4], loosest)
+            mean = five(lanes, PRESSURES, w)
+            kept[_K * LANES + w] = _tetrahedron_k(p, shear[0], element[0], mean[0], loosest)
+            kept[(_K + 1) * LANES + w] = _tetrahedron_k(q, shear[1], element[1], mean[1], loosest)
+            kept[(_K + 2) * LANES + w] = _tetrahedron_k(r, shear[2], element[2], mean[2], loosest)
+            kept[(_K + 3) * LANES + w] = _tetrahedron_k(s, shear[3], element[3], mean[3], loosest)
+            kept[(_K + 4) * LANES + w] = _tetrahedron_k(t, shear[4], element[4], mean[4], loosest)
 
 
 @njit(**LOOP)
@@ -330,11 +303,11 @@ def _volume_slopes(change, grid, constants, tangent, lanes, nodal):
             weight = five(rows, _NODAL, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_volumes(
-                weight[0] * _volume_slope(p, dp),
-                weight[1] * _volume_slope(q, dq),
-                weight[2] * _volume_slope(r, dr),
-                weight[3] * _volume_slope(s, ds),
-                weight[4] * _volume_slope(t, dt),
+                weight[0] * volume_slope(p, dp),
+                weight[1] * volume_slope(q, dq),
+                weight[2] * volume_slope(r, dr),
+                weight[3] * volume_slope(s, ds),
+                weight[4] * volume_slope(t, dt),
                 w,
                 lanes,
             )
@@ -348,7 +321,7 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
         rows = constants[chunk]
         first = chunk * LANES
         if len(nodal):
-            _share_nodal(nodal, grid, first, rows, lanes)
+            _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(change, grid, first, rows, lanes)
         kept = tangent[chunk]
         for w in range(LANES):
@@ -356,14 +329,14 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
             shear = five(rows, _SHEAR, w)
             element = five(rows, _ELEMENT, w)
             k = five(kept, _K, w)
-            share = five(lanes, _SHARE, w)
+            mean = five(lanes, PRESSURES, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_forces(
-                _tetrahedron_slope(p, dp, shear[0], element[0], k[0], share[0]),
-                _tetrahedron_slope(q, dq, shear[1], element[1], k[1], share[1]),
-                _tetrahedron_slope(r, dr, shear[2], element[2], k[2], share[2]),
-                _tetrahedron_slope(s, ds, shear[3], element[3], k[3], share[3]),
-                _tetrahedron_slope(t, dt, shear[4], element[4], k[4], share[4]),
+                stress_rise(p, dp, shear[0], element[0], k[0], mean[0]),
+                stress_rise(q, dq, shear[1], element[1], k[1], mean[1]),
+                stress_rise(r, dr, shear[2], element[2], k[2], mean[2]),
+                stress_rise(s, ds, shear[3], element[3], k[3], mean[3]),
+                stress_rise(t, dt, shear[4], element[4], k[4], mean[4]),
                 rows,
                 w,
                 lanes,
@@ -378,7 +351,7 @@ def _corner_blocks(h, i, j, k, shear, element):
     i, j and k are the shape gradient of its corner.
     """
     c = cofactor_change(h)
-    bulk = _bulk(h, shear, element)
+    bulk = bulk_slope(h, shear, element)
     none = ONE - ONE
     return (
         block((i, j, k), c, shear, bulk),
@@ -398,20 +371,20 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
             element = five(rows, _ELEMENT, w)
-            i, j, k = rows[w], rows[LANES + w], rows[2 * LANES + w]
+            i, j, k = three(rows, PER_WIDTH, w)
             p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], element[0])
             q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], element[1])
             r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], element[2])
             s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], element[3])
             i, j, k = HALF * i, HALF * j, HALF * k
-            c, bulk = cofactor_change(t), _bulk(t, shear[4], element[4])
-            put_one(p0, lanes, 0, w)
+            c, bulk = cofactor_change(t), bulk_slope(t, shear[4], element[4])
+            put_six(p0, lanes, OUT, w)
             put_sum(block((-i, -j, k), c, shear[4], bulk), pz, rx, sy, lanes, 1, w)
             put_sum(block((-i, j, -k), c, shear[4], bulk), py, qx, sz, lanes, 2, w)
-            put_one(s0, lanes, 3, w)
+            put_six(s0, lanes, OUT + 18, w)
             put_sum(block((i, -j, -k), c, shear[4], bulk), px, qy, rz, lanes, 4, w)
-            put_one(r0, lanes, 5, w)
-            put_one(q0, lanes, 6, w)
+            put_six(r0, lanes, OUT + 30, w)
+            put_six(q0, lanes, OUT + 36, w)
             put_sum(block((i, j, k), c, shear[4], bulk), qz, ry, sx, lanes, 7, w)
         for entry in range(6):
             add_out(lanes, OUT + entry, 6, grid, chunk * LANES, rows, blocks[entry])

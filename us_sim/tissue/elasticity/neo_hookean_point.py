@@ -40,6 +40,7 @@ __all__ = [
     "LOOP",
     "ONE",
     "block",
+    "bulk_slope",
     "cofactor_change",
     "cofactor_slope",
     "crowding",
@@ -48,32 +49,32 @@ __all__ = [
     "largest_stretch",
     "limited",
     "stress",
-    "stress_slope",
+    "stress_rise",
     "volume_change",
+    "volume_slope",
 ]
 
-# How the loops are compiled: with fused multiply-adds, but NaN stays NaN; and what they call.
 LOOP: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "nsz"},
 }
-INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
+"""How loops are compiled: with fused multiply-adds, but NaN stays NaN."""
 
-# Exact in any precision, and they do not turn single precision into double, as literals would.
+INLINED: dict[str, Any] = {**LOOP, "forceinline": True}  # and what they call
+
 ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+"""Numbers that are exact in any precision. Literals would turn single precision into double."""
 
-# Parts of its volume: where a tetrahedron begins to resist being crushed, and where it is crushed.
 _CROWDED, _CRUSHED = np.float32(0.25), np.float32(1 / 64)
+"""Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed."""
 
-# Below 1 over the root of 2.
-_LESS = np.float32(0.7)
+_LESS = np.float32(0.7)  # just below 1 / √2
 
-# Keeps quotients finite where nothing is strained.
-_TINY = np.float32(1e-30)
-_SMALL = np.float32(1e-3)
+_TINY = np.float32(1e-30)  # keeps quotients finite where nothing is strained
+_SMALL = np.float32(1e-3)  # least cosine from which Newton's method starts
 
 
 @njit(**INLINED)
@@ -189,7 +190,7 @@ def stress(h, shear, pressure):
 
 
 @njit(**INLINED)
-def stress_slope(h, c, d, shear, k, rise):
+def _stress_slope(h, c, d, shear, k, rise):
     """The change of the stress for a small change d of h.
 
     c is cof(I + h) - I, k = p - mu and rise the change of p.
@@ -206,6 +207,29 @@ def stress_slope(h, c, d, shear, k, rise):
         (shear * d[7] + k * e[7]) + rise * c[7],
         (shear * d[8] + k * e[8]) + (rise * c[8] + rise),
     )
+
+
+@njit(**INLINED)
+def volume_slope(h, d):
+    """The change of J for a small change d of h."""
+    return inner(cofactor_change(h), d) + (d[0] + d[4] + d[8])
+
+
+@njit(**INLINED)
+def bulk_slope(h, shear, element):
+    """How fast the pressure rises with J: element, and what keeps from being crushed."""
+    return element + shear * crowding(volume_change(h))[2]
+
+
+@njit(**INLINED)
+def stress_rise(h, d, shear, element, k, nodal):
+    """The change of the stress for a small change d of h, and nodal one of the average pressure.
+
+    k is p - mu.
+    """
+    c = cofactor_change(h)
+    rise = bulk_slope(h, shear, element) * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
+    return _stress_slope(h, c, d, shear, k, rise)
 
 
 @njit(**INLINED)

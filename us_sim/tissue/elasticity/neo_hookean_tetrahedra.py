@@ -23,6 +23,7 @@ from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from us_sim.tissue.elasticity.bulk_shares import bulk_shares
+from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
@@ -30,52 +31,48 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     LOOP,
     ONE,
     block,
+    bulk_slope,
     cofactor_change,
     crowding,
     energy_density,
-    inner,
     limited,
     stress,
-    stress_slope,
+    stress_rise,
     volume_change,
+    volume_slope,
 )
+from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.elasticity.tetrahedron_lanes import (
-    LANES,
     OUT,
     ROWS,
+    SHAPE,
+    SUMS,
     gather,
     gather_scalar,
     gradient,
-    in_lanes,
-    keep,
-    put_block,
     put_forces,
     scatter,
     scatter_scalar,
-    stored,
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TetrahedraSums"]
 
-# Rows of the constants of sixty-four tetrahedra: three gradients, then V mu, V element, V nodal/4.
-_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = 9, 10, 11, 12
+_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = SHAPE + 9, SHAPE + 10, SHAPE + 11, SHAPE + 12
+"""Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and how many."""
 
-# Rows of what the tangent needs: gradient of the displacement, and V (p - mu).
-_K, _TANGENT = 9, 10
+_GRADIENT, _K, _TANGENT = 0, 9, 10
+"""Rows of what the tangent needs: the displacement's gradient, V (p - mu); and how many."""
 
 
-class TetrahedraSums:
-    """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
-
-    ``nodal`` arguments are (N,) sums or pressures of the nodes' share of the bulk stiffness.
-    """
+class TetrahedraSums(NodalSums):
+    """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
 
     def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
         count = len(mesh.tetrahedra)
         shares = bulk_shares(materials)
         rows = np.empty((count, _CONSTANTS))
-        rows[:, :9] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
+        rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
         rows[:, _SHEAR] = mesh.volumes * shares.shear
         rows[:, _ELEMENT] = mesh.volumes * shares.element
         rows[:, _NODAL] = mesh.volumes * shares.nodal / 4
@@ -86,47 +83,39 @@ class TetrahedraSums:
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
 
     def energy(self, displacement: NDArray) -> float:
-        """J, of the tetrahedra's own share."""
         return _energy(displacement, self._nodes, self._constants, self._lanes)
 
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        """The smallest volume over rest volume, and how many are not above zero."""
         return _volume_ratios(displacement, self._nodes, self._constants, self._lanes)
 
     def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        """J, at each node the sum over its tetrahedra of their nodal weight times J - 1."""
         _volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
 
     def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, the energy's slope, given the nodes' mean volume change."""
         _forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
 
     def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        """Keep what the slopes at this displacement need, ``loosest`` being that of `limited`."""
         _linearise(
             displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
         )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        """J, how much `volume_changes` changes with the displacement."""
         _volume_slopes(change, self._nodes, self._constants, self._tangent, self._lanes, nodal)
 
     def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, how much the forces change, given the change of the nodes' mean."""
         _tangent_product(
             change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
         )
 
     def diagonal_blocks(self, out: NDArray) -> None:
-        """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' share."""
         _diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
 
 
 @njit(**INLINED)
-def _nodal_sum(lanes, constants, w):
+def _nodal_pressure(lanes, constants, w):
     """The nodal weight times the sum of the nodes' values that `gather_scalar` has made."""
-    first = lanes[12 * LANES + w] + lanes[13 * LANES + w]
-    second = lanes[14 * LANES + w] + lanes[15 * LANES + w]
+    v = SUMS * LANES + w
+    first, second = lanes[v] + lanes[v + LANES], lanes[v + 2 * LANES] + lanes[v + 3 * LANES]
     return constants[_NODAL * LANES + w] * (first + second)
 
 
@@ -135,7 +124,7 @@ def _pressure(h, shear, lanes, rows, w):
     """V times the slope of all energy but the shear's by J."""
     change = volume_change(h)
     own = rows[_ELEMENT * LANES + w] * change + shear * crowding(change)[1]
-    return own + _nodal_sum(lanes, rows, w)
+    return own + _nodal_pressure(lanes, rows, w)
 
 
 @njit(**LOOP)
@@ -210,7 +199,7 @@ def _linearise(displacement, nodal, nodes, constants, lanes, tangent, loosest):
         kept = tangent[chunk]
         for w in range(LANES):
             h = gradient(lanes, rows, w)
-            keep(h, kept, w)
+            put_nine(h, kept, _GRADIENT, w)
             shear = rows[_SHEAR * LANES + w]
             pressure = _pressure(h, shear, lanes, rows, w)
             kept[_K * LANES + w] = limited(h, shear, pressure - shear, loosest)
@@ -225,8 +214,8 @@ def _volume_slopes(change, nodes, constants, tangent, lanes, nodal):
         kept = tangent[chunk]
         for w in range(LANES):
             d = gradient(lanes, rows, w)
-            c = cofactor_change(stored(kept, w))
-            lanes[OUT * LANES + w] = rows[_NODAL * LANES + w] * (inner(c, d) + (d[0] + d[4] + d[8]))
+            h = nine(kept, _GRADIENT, w)
+            lanes[OUT * LANES + w] = rows[_NODAL * LANES + w] * volume_slope(h, d)
         scatter_scalar(lanes, nodes[chunk], nodal)
 
 
@@ -241,13 +230,10 @@ def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
         kept = tangent[chunk]
         for w in range(LANES):
             d = gradient(lanes, rows, w)
-            h = stored(kept, w)
-            c = cofactor_change(h)
-            shear = rows[_SHEAR * LANES + w]
-            bulk = rows[_ELEMENT * LANES + w] + shear * crowding(volume_change(h))[2]
-            rise = bulk * (inner(c, d) + (d[0] + d[4] + d[8])) + _nodal_sum(lanes, rows, w)
-            slope = stress_slope(h, c, d, shear, kept[_K * LANES + w], rise)
-            put_forces(slope, rows, w, lanes)
+            h = nine(kept, _GRADIENT, w)
+            shear, element = rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w]
+            k, nodal_rise = kept[_K * LANES + w], _nodal_pressure(lanes, rows, w)
+            put_forces(stress_rise(h, d, shear, element, k, nodal_rise), rows, w, lanes)
         scatter(lanes, nodes[chunk], product)
 
 
@@ -258,18 +244,16 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
         rows = constants[chunk]
         kept = tangent[chunk]
         for w in range(LANES):
-            h = stored(kept, w)
+            h = nine(kept, _GRADIENT, w)
             c = cofactor_change(h)
             shear = rows[_SHEAR * LANES + w]
-            element = rows[_ELEMENT * LANES + w] + shear * crowding(volume_change(h))[2]
-            x = (rows[w], rows[LANES + w], rows[2 * LANES + w])
-            y = (rows[3 * LANES + w], rows[4 * LANES + w], rows[5 * LANES + w])
-            z = (rows[6 * LANES + w], rows[7 * LANES + w], rows[8 * LANES + w])
+            bulk = bulk_slope(h, shear, rows[_ELEMENT * LANES + w])
+            x, y, z = three(rows, SHAPE, w), three(rows, SHAPE + 3, w), three(rows, SHAPE + 6, w)
             o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
-            put_block(block(o, c, shear, element), lanes, 0, w)
-            put_block(block(x, c, shear, element), lanes, 1, w)
-            put_block(block(y, c, shear, element), lanes, 2, w)
-            put_block(block(z, c, shear, element), lanes, 3, w)
+            put_six(block(o, c, shear, bulk), lanes, OUT, w)
+            put_six(block(x, c, shear, bulk), lanes, OUT + 6, w)
+            put_six(block(y, c, shear, bulk), lanes, OUT + 12, w)
+            put_six(block(z, c, shear, bulk), lanes, OUT + 18, w)
         for corner in range(4):
             at = nodes[chunk, corner * LANES : (corner + 1) * LANES]
             for entry in range(6):

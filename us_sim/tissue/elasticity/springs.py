@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,10 +25,19 @@ from scipy.sparse import csr_array
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["SpringNetwork", "fitted_springs", "spring_forces", "springs_of"]
+__all__ = ["SpringArrays", "SpringNetwork", "fitted_springs", "spring_forces", "springs_of"]
 
-# The six edges of a tetrahedron.
 _CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+"""The six edges of a tetrahedron."""
+
+
+class SpringArrays(NamedTuple):
+    """The arrays of a `SpringNetwork` that kernels take."""
+
+    edges: NDArray[np.int32]  # (E, 2)
+    stiffness: NDArray[np.float64]  # (E,), N/m
+    damping: NDArray[np.float64]  # (E,), N s/m
+    rest_length: NDArray[np.float64]  # (E,), m
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +51,18 @@ class SpringNetwork:
     # (M,), Pa, lambda and mu that those of each tetrahedron amount to; empty when of no mesh
     lame_constant: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
+    @property
+    def arrays(self) -> SpringArrays:
+        """What kernels take."""
+        return SpringArrays(self.edges, self.stiffness, self.damping, self.rest_length)
+
     def forces(
         self, positions: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
         force = np.empty_like(positions)
         spring_forces(
-            self.edges,
-            self.stiffness,
-            self.damping,
-            self.rest_length,
-            np.ascontiguousarray(positions),
-            np.ascontiguousarray(velocity),
-            force,
+            self.arrays, np.ascontiguousarray(positions), np.ascontiguousarray(velocity), force
         )
         return force
 
@@ -162,11 +171,12 @@ def _lengths(edges, nodes, length):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def spring_forces(edges, stiffness, damping, rest_length, positions, velocity, force):
+def spring_forces(springs, positions, velocity, force):
     """Fills force (N, 3) with the paper's eq. (1), along each spring, on both its nodes.
 
     Edges in the order of their first nodes are quick: that node's numbers then stay in registers.
     """
+    edges, stiffness, damping, rest_length = springs
     force[:] = 0.0
     e = 0
     while e < len(edges):

@@ -31,11 +31,10 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["highest_frequency", "node_stiffness", "stabilised", "step_limit"]
 
-# Masses and sub-steps stay this far from the bound on stability.
 _MARGIN = 1.05
+"""Factor by which masses and sub-steps stay away from the bound on stability."""
 
-# Relative, of the square of the highest frequency.
-_TOLERANCE = 1e-4
+_TOLERANCE = 1e-4  # relative, of the square of the highest frequency
 
 
 def step_limit(frequency: float, damping_factor: float) -> float:

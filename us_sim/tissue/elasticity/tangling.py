@@ -23,8 +23,8 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["Tangling", "count_inverted"]
 
-# Frames that a released tissue is given to untangle by itself.
 _PATIENCE = 10
+"""Frames that a released tissue is given to untangle by itself."""
 
 
 class Tangling:

@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -38,13 +39,34 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-# How many times its rest value the sum of a tetrahedron's squared faces is when it yields.
 _YIELD = 1.5
+"""Sum of a tetrahedron's squared faces over that at rest, from which on it yields."""
 
-# Part of the shear modulus below which what is left for the nodes is rounding.
 _ROUNDING = 1e-9
+"""Part of the shear modulus below which what is left for the nodes is rounding."""
 
-__all__ = ["VolumeTerm", "add_volume_forces", "area_vectors", "volume_term"]
+__all__ = [
+    "VolumeArrays",
+    "VolumeTerm",
+    "add_volume_forces",
+    "area_vectors",
+    "push_corners",
+    "volume_term",
+]
+
+
+class VolumeArrays(NamedTuple):
+    """The arrays of a `VolumeTerm` that kernels take, of M tetrahedra and N nodes."""
+
+    tetrahedra: NDArray[np.int32]  # (M, 4)
+    rest_volume: NDArray[np.float64]  # (M,), m3
+    element: NDArray[np.float64]  # (M,), Pa
+    nodal: NDArray[np.float64]  # (M,), Pa
+    inverse_weight: NDArray[np.float64]  # (N,), 1/(N m), 0 where a node has no weight
+    yield_area: NDArray[np.float64]  # (M,), m4
+    damping_time: float  # s
+    mean: NDArray[np.float64]  # (N,), or empty where no node has weight; kernels write on it
+    change: NDArray[np.float64]  # (M,), m3; kernels write on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +94,20 @@ class VolumeTerm:
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
 
     @cached_property
-    def arrays(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
-        """What the kernels take first; the last one, (N,), is theirs to write on."""
+    def arrays(self) -> VolumeArrays:
+        """What kernels take."""
         inverse = np.zeros_like(self.node_weight)
         np.divide(1.0, self.node_weight, out=inverse, where=self.node_weight > 0)
-        return (
+        return VolumeArrays(
             self.tetrahedra,
             self.rest_volume,
             self.element,
             self.nodal,
             inverse,
-            np.zeros_like(inverse) if self.nodal.any() else np.zeros(0),
+            self.yield_area,
+            self.damping_time,
+            mean=np.zeros_like(inverse) if self.nodal.any() else np.zeros(0),
+            change=np.zeros_like(self.rest_volume),
         )
 
     def forces(
@@ -91,13 +116,7 @@ class VolumeTerm:
         """(N, 3) N on the nodes, for positions (N, 3) m and velocities (N, 3) m/s."""
         force = np.zeros_like(positions)
         add_volume_forces(
-            *self.arrays,
-            np.empty_like(self.rest_volume),
-            self.yield_area,
-            self.damping_time,
-            np.ascontiguousarray(positions),
-            np.ascontiguousarray(velocity),
-            force,
+            self.arrays, np.ascontiguousarray(positions), np.ascontiguousarray(velocity), force
         )
         return force
 
@@ -189,6 +208,24 @@ def area_vectors(x, tetrahedra, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force):
+    """Adds to force (N, 3) a push (Pa) on tetrahedron t along its `area_vectors` p, q and r."""
+    a, b, c, d = tetrahedra[t, 0], tetrahedra[t, 1], tetrahedra[t, 2], tetrahedra[t, 3]
+    force[a, 0] -= push * (px + qx + rx)
+    force[a, 1] -= push * (py + qy + ry)
+    force[a, 2] -= push * (pz + qz + rz)
+    force[b, 0] += push * px
+    force[b, 1] += push * py
+    force[b, 2] += push * pz
+    force[c, 0] += push * qx
+    force[c, 1] += push * qy
+    force[c, 2] += push * qz
+    force[d, 0] += push * rx
+    force[d, 1] += push * ry
+    force[d, 2] += push * rz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _yielded(yield_area, px, py, pz, qx, qy, qz, rx, ry, rz):
     """What is left of a tetrahedron's strain, and of its stress."""
     sx, sy, sz = px + qx + rx, py + qy + ry, pz + qz + rz
@@ -205,24 +242,13 @@ def _measure(tetrahedra, nodes, volume):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_volume_forces(
-    tetrahedra,
-    rest_volume,
-    element,
-    nodal,
-    inverse_weight,
-    mean,
-    change,
-    yield_area,
-    damping_time,
-    positions,
-    velocity,
-    force,
-):
+def add_volume_forces(volumes, positions, velocity, force):
     """Adds to force (N, 3) what the volume term does at positions and velocity (N, 3).
 
-    Change (M,) is written on: volumes above those at rest, as if moved on for the damping time.
+    Its `change` is left with volumes above those at rest, as if moved on for the damping time.
     """
+    tetrahedra, rest_volume, element, nodal = volumes[:4]
+    inverse_weight, yield_area, damping_time, mean, change = volumes[4:]
     mean[:] = 0.0
     y = velocity
     for t in range(len(tetrahedra)):
@@ -250,15 +276,4 @@ def add_volume_forces(
         if len(mean) > 0:
             push -= 0.25 * nodal[t] * (mean[a] + mean[b] + mean[c] + mean[d])
         push *= _yielded(yield_area[t], px, py, pz, qx, qy, qz, rx, ry, rz) / 6.0
-        force[a, 0] -= push * (px + qx + rx)
-        force[a, 1] -= push * (py + qy + ry)
-        force[a, 2] -= push * (pz + qz + rz)
-        force[b, 0] += push * px
-        force[b, 1] += push * py
-        force[b, 2] += push * pz
-        force[c, 0] += push * qx
-        force[c, 1] += push * qy
-        force[c, 2] += push * qz
-        force[d, 0] += push * rx
-        force[d, 1] += push * ry
-        force[d, 2] += push * rz
+        push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force)

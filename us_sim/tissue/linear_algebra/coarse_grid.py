@@ -35,18 +35,19 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["CoarseGrid"]
 
-# Of a grid around the whole bounding box: a dense product with 1,200 unknowns takes 0.2 ms.
 _MOST_NODES = 400
+"""Nodes at most of a grid around the bounding box: a dense product of 1,200 unknowns takes 0.2
+ms."""
 
-# Fewer nodes of the mesh than this for each of the grid's leave nothing to gain.
 _SPARSEST = 8
+"""Nodes of the mesh for each of the grid: with fewer there is nothing to gain."""
 
-# Combinations of grid functions this much softer than the grid's stiffest are not independent.
 _INDEPENDENT = 1e-7
+"""Combinations of grid functions this much softer than the grid's stiffest are not independent."""
 
-# How stiffly, against a touched node's own stiffness, the grid keeps off the probe: what the grid
-# leaves to the local preconditioner need not be exact.
 _YIELD = 3.0
+"""How stiffly, against a touched node's own stiffness, the grid keeps off the probe: what the grid
+leaves to the local preconditioner need not be exact."""
 
 
 class CoarseGrid:

@@ -1,18 +1,9 @@
 """How the surface that a probe can touch, and the whole tissue below it, yields to forces.
 
 >>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.linear_algebra.compliance import surface_compliance
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
->>> across, deep = uniform_planes(-0.05, 0.05, 5), uniform_planes(0.0, 0.1, 5)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block(nodes=(5, 5, 5))
 >>> compliance = surface_compliance(model)
 >>> forces = np.zeros((25, 3))
 >>> forces[12, 2] = 1.0  # N, downwards in the middle of the top
@@ -25,7 +16,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,7 +26,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.cache import Form, kept
-from us_sim.progress import Progress
 from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure, averaged_pressure
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.linear_algebra.condensation import Field, condense
@@ -43,22 +33,23 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["SurfaceCompliance", "surface_compliance"]
 
-# Counts as part of the cache's key: raise it when the bytes change.
 _VERSION = 3
+"""Counts as part of the cache's key: raise it when the bytes change."""
 
-# Numbers in the fields. With fewer, single precision would save no time worth its rounding.
 _DOUBLE = 4_000_000
+"""Numbers in the fields. With fewer, single precision would save no time worth its rounding."""
 
-# Numbers in the fields from which on making them takes a second, and keeping them pays.
 _KEPT = 12_000_000
+"""Numbers in the fields from which on making them takes a second, and keeping them pays."""
 
-# Numbers in the fields from which on they are kept as 16-bit integers, a scale for each block of
-# nodes: what is read in a frame, and not the arithmetic, takes the time then.
 _INTEGER = 400_000_000
-_BLOCK = 1024
+"""Numbers in the fields from which on they are kept as 16-bit integers, a scale for each block of
+nodes: what is read in a frame, and not the arithmetic, takes the time then."""
 
-# Forces by which the rounding of the fields is measured.
+_BLOCK = 1024  # nodes
+
 _SAMPLES = 24
+"""Forces by which the rounding of the fields is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +83,17 @@ class SurfaceCompliance:
             _add_rows(self.fields, rows, weights, self.free, displacement)
 
 
-def surface_compliance(model: TissueModel) -> SurfaceCompliance:
+def surface_compliance(
+    model: TissueModel, progress: Callable[[float, str], None] | None = None
+) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
     What takes long is kept in the user's cache folder, under a hash of mesh, materials, fixed and
     contact nodes.
+
+    Args:
+        model: the tissue.
+        progress: told the fraction done and what is being done, where it takes a second or more.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -105,26 +102,19 @@ def surface_compliance(model: TissueModel) -> SurfaceCompliance:
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
     if 9 * touched * free < _KEPT:
         return _made(model, None)
-    bar: list[Progress] = []
 
-    def show(fraction: float, text: str = "") -> None:
-        if not bar:
-            bar.append(Progress("solving for the tissue's compliance", 100, "%"))
-        bar[0].update(100 * fraction, text)
+    def waiting() -> None:
+        if progress is not None:
+            progress(0.0, "waiting for another process that computes it")
 
-    try:
-        return kept(
-            _key(model),
-            _FORM,
-            lambda: _made(model, show),
-            lambda: show(0.0, "waiting for another process that does"),
-        )
-    finally:
-        for shown in bar:
-            shown.__exit__(None, None, None)
+    return kept(_key(model), _FORM, lambda: _made(model, progress), waiting)
 
 
-def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
+def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> SurfaceCompliance:
+    def show(fraction: float) -> None:
+        if progress is not None:
+            progress(fraction, "compliance of the surface")
+
     nodes = model.movable_contact_nodes
     count = int((~model.fixed).sum())
     system = averaged_pressure(model.mesh, model.materials)
@@ -137,7 +127,7 @@ def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
             model.fixed,
             nodes,
             np.float64 if size < _INTEGER else np.float32,
-            report=show and (lambda done: show(0.6 * done)),
+            report=lambda done: show(0.6 * done),
         )
         precision = np.float64 if size < _DOUBLE else np.float32
         fields = np.empty((3 * len(nodes), 3, count), precision if size < _INTEGER else np.int16)
@@ -154,8 +144,7 @@ def _made(model: TissueModel, show: Any) -> SurfaceCompliance:
             fields[:, :, place] = moved
             done += len(block)
             order.append(block)
-            if show:
-                show(0.6 + 0.4 * done / count)
+            show(0.6 + 0.4 * done / count)
     free = np.concatenate(order).astype(np.int32) if order else np.empty(0, np.int32)
     made = SurfaceCompliance(
         nodes, free, condensed.compliance, fields, scales, len(model.mesh.nodes), 0.0

@@ -45,8 +45,9 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["Condensed", "Field", "condense"]
 
-#: Free nodes (F,), and their displacements (3F, 3K) m/N.
 Field = tuple[NDArray[np.int64], NDArray[np.floating]]
+"""Free nodes (F,), and their displacements (3F, 3K) m/N."""
+
 _Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
 
 

@@ -21,8 +21,7 @@ are confined to planes are corrected for by the compliance of the surface.
 
 from __future__ import annotations
 
-import time
-from contextlib import ExitStack
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +29,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from us_sim.progress import Progress
-
 __all__ = ["ScalarPreconditioner"]
 
-# Right-hand sides at a time.
-_BLOCK = 64
-
-# s, after which a bar shows how far it is.
-_PATIENCE = 2.0
+_BLOCK = 64  # right-hand sides at a time
 
 
 class ScalarPreconditioner:
@@ -50,6 +43,7 @@ class ScalarPreconditioner:
         diagonal: (N,) N/m.
         free: (N,), the others do not move.
         surface: (C,) free nodes that can be confined.
+        progress: told the fraction of the surface's solutions done, and what they are.
     """
 
     def __init__(
@@ -59,6 +53,7 @@ class ScalarPreconditioner:
         diagonal: NDArray[np.float64],
         free: NDArray[np.bool_],
         surface: NDArray[np.integer],
+        progress: Callable[[float, str], None] | None = None,
     ) -> None:
         count = len(diagonal)
         i, j = edges.T
@@ -76,21 +71,14 @@ class ScalarPreconditioner:
         # (C, N) m/N, what a push at each surface node moves; rounding is put right where used.
         self._response = np.zeros((len(surface), count), dtype=np.float32)
         number = np.cumsum(free) - 1
-        begun = time.monotonic()
-        with ExitStack() as bar:
-            shown: Progress | None = None
-            for start in range(0, len(surface), _BLOCK):
-                some = number[surface[start : start + _BLOCK]]
-                unit = np.zeros((len(self._free), len(some)))
-                unit[some, np.arange(len(some))] = 1.0
-                end = start + len(some)
-                self._response[start:end, self._free] = self._factor.solve(unit).T
-                if shown is None and time.monotonic() - begun > _PATIENCE:
-                    shown = bar.enter_context(
-                        Progress("solving for the springs' surface", len(surface), "nodes")
-                    )
-                if shown is not None:
-                    shown.update(end)
+        for start in range(0, len(surface), _BLOCK):
+            some = number[surface[start : start + _BLOCK]]
+            unit = np.zeros((len(self._free), len(some)))
+            unit[some, np.arange(len(some))] = 1.0
+            end = start + len(some)
+            self._response[start:end, self._free] = self._factor.solve(unit).T
+            if progress is not None:
+                progress(end / len(surface), "responses of the springs' surface")
         self._compliance = self._response[:, surface].astype(np.float64)
         self.confine(np.zeros(0, dtype=np.intp), np.zeros((0, 3)))
 

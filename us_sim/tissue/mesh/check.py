@@ -24,14 +24,13 @@ from us_sim.geometry.mesh_faces import FACES, MOST_NODES, face_order
 
 __all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
 
-#: The six edges of a tetrahedron.
-EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # the six edges of a tetrahedron
 
-# m, beyond which no body is, and volumes would overflow.
 _FARTHEST = 1e6
+"""Coordinate beyond which no body is, m; volumes would overflow."""
 
-# Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise.
 _SMALLEST_VOLUME = 1e-9
+"""Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise."""
 
 
 def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:

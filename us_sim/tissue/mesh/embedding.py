@@ -20,17 +20,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.geometry.normals import vertex_normals
 from us_sim.tissue.mesh.point_location import Location, locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["EmbeddedSurface"]
 
-# A vertex may lie this far outside the mesh, in longest edges of the nearest tetrahedron: what
-# carries it on is that tetrahedron's own deformation.
 _REACH = 0.5
+"""Distance that a vertex may lie outside the mesh, in longest edges of the nearest tetrahedron,
+whose deformation carries it."""
 
-# m; so near to the mesh is in it.
 _ROUNDING = 1e-6
+"""Distance from the mesh up to which a vertex is in it, m."""
 
 
 class EmbeddedSurface:
@@ -109,13 +110,14 @@ class EmbeddedSurface:
         """Where the surface is when the mesh's nodes are at ``nodes`` (N, 3), m.
 
         Returns:
-            (V, 3) m vertices and (V, 3) unit normals, as `normals` says.
+            (V, 3) m vertices and (V, 3) unit normals, as
+            `us_sim.geometry.normals.vertex_normals` says.
 
         Raises:
             MeshError: there are more or fewer nodes than in the mesh.
         """
         vertices = self.carry(nodes)
-        return vertices, self.normals(vertices)
+        return vertices, vertex_normals(vertices, self.triangles)
 
     def carry(self, nodes: NDArray[np.floating]) -> NDArray[np.float32]:
         """(V, 3) m, the vertices alone.
@@ -135,19 +137,6 @@ class EmbeddedSurface:
         vertices = np.empty_like(self.vertices)
         _carry(self.vertices, self._nodes, self._weights, moved, vertices)
         return vertices
-
-    def normals(self, vertices: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(V, 3) unit normals, those of the adjacent triangles weighted by their area.
-
-        They point where the triangles, seen from there, turn anticlockwise; zero where they cancel.
-
-        Args:
-            vertices: (V, 3) m, as `carry` returns them.
-        """
-        normals = np.zeros_like(vertices)
-        _sum_normals(vertices, self.triangles, normals)
-        _normalise(normals)
-        return normals
 
 
 def _checked(
@@ -201,41 +190,3 @@ def _carry(rest, nodes, weights, moved, vertices):
                 (weights[v, 0] * moved[i, x] + weights[v, 1] * moved[j, x])
                 + (weights[v, 2] * moved[k, x] + weights[v, 3] * moved[m, x])
             )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sum_normals(vertices, triangles, normals):
-    """Adds twice each triangle's area times its normal to its vertices' normals (V, 3)."""
-    for t in range(len(triangles)):
-        i = triangles[t, 0]
-        j = triangles[t, 1]
-        k = triangles[t, 2]
-        ax = vertices[j, 0] - vertices[i, 0]
-        ay = vertices[j, 1] - vertices[i, 1]
-        az = vertices[j, 2] - vertices[i, 2]
-        bx = vertices[k, 0] - vertices[i, 0]
-        by = vertices[k, 1] - vertices[i, 1]
-        bz = vertices[k, 2] - vertices[i, 2]
-        x = ay * bz - az * by
-        y = az * bx - ax * bz
-        z = ax * by - ay * bx
-        normals[i, 0] += x
-        normals[i, 1] += y
-        normals[i, 2] += z
-        normals[j, 0] += x
-        normals[j, 1] += y
-        normals[j, 2] += z
-        normals[k, 0] += x
-        normals[k, 1] += y
-        normals[k, 2] += z
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _normalise(normals):
-    """Gives each of normals (V, 3) unit length, unless it is zero."""
-    for v in range(len(normals)):
-        square = normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2
-        length = np.sqrt(square) if square > 0.0 else np.float32(1.0)
-        normals[v, 0] /= length
-        normals[v, 1] /= length
-        normals[v, 2] /= length

@@ -30,11 +30,11 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["read_mesh"]
 
-# A body smaller or larger than that, m, was given in the wrong unit.
 _SIZES = (1e-3, 10.0)
+"""Sizes of bodies, m: a smaller or larger one is in the wrong unit."""
 
-# What a volume mesh may hold beside tetrahedra: their corners, edges and faces.
 _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
+"""What a volume mesh may hold beside tetrahedra: their corners, edges and faces."""
 
 
 def read_mesh(

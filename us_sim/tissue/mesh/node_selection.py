@@ -18,8 +18,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["FACES", "face_nodes", "facing_nodes", "nodes_in_label"]
 
-#: Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue,
-#: so that the skin is the face of smallest z.
 FACES = {
     "top": ((2, False),),
     "bottom": ((2, True),),
@@ -29,13 +27,16 @@ FACES = {
     "back": ((1, True),),
     "sides": ((0, False), (0, True), (1, False), (1, True)),
 }
+"""Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
+that the skin is the face of smallest z."""
 
 
-# Of a mesh that is no box: so near to its bounding box, as a fraction of the size, is at its face.
 _MARGIN = 0.05
+"""Distance from the bounding box, over its size, up to which nodes of other meshes are on its
+face."""
 
-# The cosine to -z below which a probe that comes along +z would only graze the surface.
 _GRAZING = 0.1
+"""The cosine to -z below which a probe that comes along +z would only graze the surface."""
 
 
 def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) -> NDArray[np.int32]:

@@ -26,8 +26,8 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["Location", "locate"]
 
-# A barycentric coordinate this far below zero is rounding.
 _ROUNDING = 1e-9
+"""A barycentric coordinate this far below zero is rounding."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,6 @@ from us_sim.tissue.mesh.check import EDGES, check_mesh, signed_volumes
 
 __all__ = ["TetrahedralMesh", "box_mesh", "uniform_planes"]
 
-# Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between.
 _FIVE = np.array(
     [
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -36,6 +35,7 @@ _FIVE = np.array(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]],
     ]
 )
+"""Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,20 +5,10 @@ tissue is computed once (`us_sim.tissue.linear_algebra.compliance`); in a frame 
 there, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and the field
 is their sum.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem import Fem
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> solver = Fem(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> solver = Fem(TissueModel.block())
 >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> deformation.residual < 1e-6, bool(deformation.force[2] < 0)
 (True, True)
@@ -27,6 +17,7 @@ is their sum.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -48,14 +39,13 @@ from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 __all__ = ["CONTACTS", "Fem", "FemSettings"]
 
-#: What holds between the probe and the surface.
-CONTACTS = ("frictionless", "coulomb", "sticking")
+CONTACTS = ("frictionless", "coulomb", "sticking")  # what holds between the probe and the surface
 
-# From here on what rounding leaves is computed in every frame.
 _ROUNDING = 1e-5
+"""Rounding, over the force, from which on what it leaves is computed in every frame."""
 
-# How often nodes that were overlooked, because they were far from the probe, are added.
 _EXTENSIONS = 10
+"""How often nodes that were overlooked, because they were far from the probe, are added."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +88,14 @@ class Fem(TissueSolver):
 
     Settings = FemSettings
 
-    def __init__(self, model: TissueModel, settings: FemSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or FemSettings()
-        self._compliance = surface_compliance(model)
+        self._compliance = surface_compliance(model, progress)
         self._reached = self._compliance.nodes
         surface = (
             model.collider,
@@ -116,7 +111,7 @@ class Fem(TissueSolver):
         imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._displacement = np.zeros_like(model.mesh.nodes)
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
 
     @property
     def state(self) -> TissueState:

@@ -5,20 +5,10 @@ load is a frictionless probe that may push and not pull. The nodes it pushes lie
 their displacement along the normal is prescribed and projected out of the search space, as in
 D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section 5.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem_cg import FemCg
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> solver = FemCg(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> solver = FemCg(TissueModel.block())
 >>> for _ in range(20):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> deformation.residual < 1e-6, bool(deformation.nodes[:, 2].min() > -0.01)
@@ -28,6 +18,7 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -51,8 +42,8 @@ from us_sim.tissue.solvers.solver import (
 
 __all__ = ["FemCg", "FemCgSettings"]
 
-# How far the residual must fall before touched nodes that slid a little are corrected again.
 _REFINEMENT = 1e-2
+"""How far the residual must fall before touched nodes that slid a little are corrected again."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +81,15 @@ class FemCg(TissueSolver):
 
     Settings = FemCgSettings
 
-    def __init__(self, model: TissueModel, settings: FemCgSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemCgSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         require_held(model.mesh, model.fixed)
         settings = settings or FemCgSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._tolerance = settings.tolerance
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))

@@ -8,20 +8,10 @@ it. Motion too large for one prediction is cut into sub-steps, which may go on i
 step is taken that turns a tetrahedron inside out, or that lowers neither the unbalanced forces nor
 the energy.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block()
 >>> solver = FemNonlinear(model)
 >>> for _ in range(20):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
@@ -32,6 +22,7 @@ the energy.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -60,29 +51,29 @@ from us_sim.tissue.solvers.sub_steps import between, motion
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
-# One prediction carries the tissue this part of its smallest extent: 5 mm of 0.1 m.
 _STRIDE = 0.05
+"""Part of its smallest extent by which one prediction carries the tissue: 5 mm of 0.1 m."""
 
-# A prediction takes the time of so many iterations.
 _PREDICTION = 3
+"""Iterations that take the time of a prediction."""
 
-# Conjugate-gradient iterations of a frame that may take 33 ms at 10,000 nodes, and of any frame.
 _BUDGET, _LEAST_BUDGET = 30, 12
+"""Conjugate-gradient iterations of a frame of 33 ms at 10,000 nodes, and at least of any frame."""
 
-# Of one Newton step: solved further, a step after a large change overshoots.
 _NEWTON = 6
+"""Iterations of one Newton step: solved further, a step after a large change overshoots."""
 
-# Iterations of a sub-step that others follow, and the residual with which they may.
 _PASSING, _PASSABLE = 4, 0.1
+"""Iterations of a sub-step that others follow, and the residual with which they may."""
 
-# A sub-step is halved so often, if need be in later frames, before it is tried in full again.
 _HALVINGS = 4
+"""Times that a sub-step is halved, in later frames too, before it is tried in full again."""
 
-# Of a prediction that turns tetrahedra inside out, what is tried instead.
 _SHARES = (0.5, 0.0)
+"""Fractions of the prediction to try when all of it would invert tetrahedra."""
 
-# m. On taking over, a node this near the probe is taken to be pushed.
 _NEAR = 1e-4
+"""A node this near the probe counts as pushed when another solver's state is taken over, m."""
 
 
 @dataclass(frozen=True)
@@ -137,10 +128,15 @@ class FemNonlinear(TissueSolver):
 
     Settings = FemNonlinearSettings
 
-    def __init__(self, model: TissueModel, settings: FemNonlinearSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: FemNonlinearSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         require_held(model.mesh, model.fixed)
         settings = settings or FemNonlinearSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._iterations = settings.iterations
         most = settings.most_iterations
         if most is None:
@@ -155,7 +151,7 @@ class FemNonlinear(TissueSolver):
         self._newton = Newton(model)
         self._correction = CarriedCorrection(model.mesh)
         if len(self._surface):
-            self._compliance = surface_compliance(model)
+            self._compliance = surface_compliance(model, progress)
         self._field = np.zeros((3, len(model.mesh.nodes)), np.float32)
         self._restore(self.state)
 

@@ -1,19 +1,9 @@
 """The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.msds import Msds
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> solver = Msds(TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top")))
+>>> solver = Msds(TissueModel.block())
 >>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
 masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 """
@@ -21,6 +11,7 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,15 +29,15 @@ from us_sim.tissue.elasticity.tangling import Tangling
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import COUNT, TissueSolver
 from us_sim.tissue.solvers.spring_tissue import SpringSettings, spring_tissue
-from us_sim.tissue.solvers.symplectic_euler import advance_frame
+from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMotion, advance_frame
 
 __all__ = ["Msds", "MsdsSettings"]
 
-# s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
+"""Time for which motion is watched at least before the tissue counts as settled, s."""
 
-# m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
+"""Distance from its rest state at which a released, settled tissue is put there, m."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +84,18 @@ class Msds(TissueSolver):
 
     Settings = MsdsSettings
 
-    def __init__(self, model: TissueModel, settings: MsdsSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: MsdsSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or MsdsSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
         self._springs, self._volume = spring_tissue(model, settings, yielding=True)
-        self._volume_arrays = (
-            *self._volume.arrays,
-            np.empty_like(self._volume.rest_volume),
-            self._volume.yield_area,
-        )
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
         self.mass, self._substeps, self._action = stabilised(
             model,
@@ -122,8 +113,10 @@ class Msds(TissueSolver):
 
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
-        self._force = np.zeros_like(self._positions)
-        self._normal = np.zeros((len(model.movable_contact_nodes), 3))
+        self._particles = Particles(
+            self._inverse_mass, self._positions, self._velocity, np.zeros_like(self._positions)
+        )
+        self._contact = Contact.at(model.movable_contact_nodes)
         self._restore(self.state)
 
     @property
@@ -143,12 +136,12 @@ class Msds(TissueSolver):
         self._positions[:] = self.model.mesh.nodes + state.displacement
         self._velocity[:] = state.velocity
         self._velocity[self.model.fixed] = 0.0
-        self._touched = np.zeros(len(self._normal), dtype=bool)
+        self._contact.touched[:] = False
         self._balance.forget()
         self._tangling.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
-        if self._settled and not self._touched.any() and not self._entered(pose):
+        if self._settled and not self._contact.touched.any() and not self._entered(pose):
             return Deformation(
                 self._positions.copy(),
                 np.empty(0, np.int32),
@@ -157,33 +150,20 @@ class Msds(TissueSolver):
                 self._last.residual,
                 self._action,
             )
-        rotations, origins = self._path(pose)
-        wrench = np.zeros((2, 3))
-        self._touched[:] = False
+        probe = ProbeMotion(self.model.collider.offset_box, self._forward, *self._path(pose))
+        self._contact.touched[:] = False
+        self._contact.wrench[:] = 0.0
         advance_frame(
-            self._springs.edges,
-            self._springs.stiffness,
-            self._springs.damping,
-            self._springs.rest_length,
-            self._inverse_mass,
-            self._positions,
-            self._velocity,
-            self._force,
+            self._springs.arrays,
+            self._volume.arrays,
+            self._particles,
+            probe,
+            self._contact,
             self._time_step,
             self._substeps,
             self._steps,
-            self.model.collider.offset_box,
-            self._forward,
-            rotations,
-            origins,
-            self.model.movable_contact_nodes,
-            self._touched,
-            self._normal,
-            wrench,
-            self._volume_arrays,
-            self._damping_factor,
         )
-        return self._outcome(pose, wrench[0], wrench[1])
+        return self._outcome(pose, *self._contact.wrench.copy())
 
     def _gap(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return push_out(
@@ -225,8 +205,8 @@ class Msds(TissueSolver):
         elastic = self._springs.forces(self._positions, still)
         elastic += self._volume.forces(self._positions, still)
         elastic[self.model.fixed] = 0.0
-        touched = self.model.movable_contact_nodes[self._touched]
-        normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._touched]
+        touched = self.model.movable_contact_nodes[self._contact.touched]
+        normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
         residual = self._balance.residual(-elastic, touched, normal)
 
         frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
@@ -242,7 +222,11 @@ class Msds(TissueSolver):
         if self._settled:
             self._velocity[:] = 0.0
             displaced = np.abs(self._positions - self.model.mesh.nodes).max()
-            if not self._touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
+            if (
+                not self._contact.touched.any()
+                and self.model.fixed.any()
+                and displaced < _NEARLY_RESTING
+            ):
                 self._positions[:] = self.model.mesh.nodes
                 self._balance.forget()
                 residual = 0.0
@@ -250,7 +234,7 @@ class Msds(TissueSolver):
 
     def _put_back_if_tangled(self) -> str:
         """What was done about tetrahedra turned inside out, after what was done for stability."""
-        words, hopeless = self._tangling.judge(self._positions, bool(self._touched.any()))
+        words, hopeless = self._tangling.judge(self._positions, bool(self._contact.touched.any()))
         if hopeless:
             self._positions[:] = self.model.mesh.nodes
             self._velocity[:] = 0.0

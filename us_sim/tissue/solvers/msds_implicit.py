@@ -5,20 +5,10 @@ conjugate gradients with the constant factored matrix of
 `us_sim.tissue.linear_algebra.scalar_preconditioner`; each of their steps lowers the function, so
 that no energy comes from nowhere and no time step is too long.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block()
 >>> solver = MsdsImplicit(model)
 >>> for _ in range(40):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.01]))
@@ -28,6 +18,7 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -63,24 +54,23 @@ from us_sim.tissue.solvers.spring_tissue import (
 
 __all__ = ["MsdsImplicit", "MsdsImplicitSettings"]
 
-# s. Motion is watched for at least as long before the tissue counts as settled.
 _REST_TIME = 0.2
+"""Time for which motion is watched at least before the tissue counts as settled, s."""
 
-# m. A released tissue that has settled this near its rest state is put there.
 _NEARLY_RESTING = 1e-4
+"""Distance from its rest state at which a released, settled tissue is put there, m."""
 
-# How the preconditioner weighs springs and volumes, which resist in all directions alike there:
-# between what they resist to shear and to compression (found by trial).
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
+"""How the preconditioner weighs springs and volumes, which resist in all directions alike there:
+between what they resist to shear and to compression (found by trial)."""
 
-# Part of a node's own stiffness that its inertia counts for at least in the preconditioner.
 _LEAST_INERTIA = 1e-9
+"""Least inertia of a node in the preconditioner, over its own stiffness."""
 
-# How often a step that does not lower the function is halved.
 _HALVINGS = 20
+"""Times that a step which does not lower the function is halved."""
 
-# Relative, of the function that is minimised.
-_ROUNDING = 1e-13
+_ROUNDING = 1e-13  # relative, of the function that is minimised
 
 
 @dataclass(frozen=True)
@@ -122,9 +112,14 @@ class MsdsImplicit(TissueSolver):
 
     Settings = MsdsImplicitSettings
 
-    def __init__(self, model: TissueModel, settings: MsdsImplicitSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: MsdsImplicitSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> None:
         settings = settings or MsdsImplicitSettings()
-        super().__init__(model, settings)
+        super().__init__(model, settings, progress)
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
         self._tolerance = settings.tolerance
@@ -141,7 +136,9 @@ class MsdsImplicit(TissueSolver):
         self._contact = ActiveSet(
             model.collider, model.mesh.nodes[self._touchable], model.contact_spacing
         )
-        self._preconditioner = self._factored(springs, term, 1.0 + damping / settings.time_step)
+        self._preconditioner = self._factored(
+            springs, term, 1.0 + damping / settings.time_step, progress
+        )
         self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
         self._tangling = Tangling(model)
         self._positions = model.mesh.nodes.copy()
@@ -149,7 +146,11 @@ class MsdsImplicit(TissueSolver):
         self._restore(self.state)
 
     def _factored(
-        self, springs: SpringNetwork, term: VolumeTerm, stiffening: float
+        self,
+        springs: SpringNetwork,
+        term: VolumeTerm,
+        stiffening: float,
+        progress: Callable[[float, str], None] | None,
     ) -> ScalarPreconditioner:
         mesh = self.model.mesh
         ends, weights = [springs.edges], [_SPRING_WEIGHT * springs.stiffness]
@@ -165,7 +166,9 @@ class MsdsImplicit(TissueSolver):
         stiffest = np.zeros(len(mesh.nodes))
         np.add.at(stiffest, edges, np.abs(weight)[:, None])
         inertia = np.maximum(self.mass / self._time_step**2, _LEAST_INERTIA * stiffest)
-        return ScalarPreconditioner(edges, weight, inertia, ~self.model.fixed, self._touchable)
+        return ScalarPreconditioner(
+            edges, weight, inertia, ~self.model.fixed, self._touchable, progress
+        )
 
     @property
     def state(self) -> TissueState:

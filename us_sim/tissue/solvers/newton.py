@@ -42,28 +42,29 @@ from us_sim.tissue.model import TissueModel
 
 __all__ = ["Newton"]
 
-# Young's moduli further apart than this leave nothing of the softer forces in single precision.
 _SINGLE_CONTRAST = 1e4
+"""Young's moduli further apart than this leave nothing of the softer forces in single precision."""
 
-# And the same for the resistance to a change of volume over that to one of shape.
 _SINGLE_BULK = 1e3
+"""Bulk over shear modulus above which single precision leaves nothing of the shear's forces."""
 
-# A step is halved so often before it is given up.
 _BACKTRACKS = 6
+"""Times that a step is halved before it is given up."""
 
-# With a tetrahedron pressed to this part of its volume, steps along the exact tangent overshoot;
-# with none, those along one without negative eigenvalues fall short.
 _CROWDED = 0.2
+"""With a tetrahedron pressed to this part of its volume, steps along the exact tangent overshoot;
+with none, those along one without negative eigenvalues fall short."""
 
-# Each step ends when its preconditioned residual has fallen to this part: the next one sees the
-# true slope again.
 _FORCING = 1e-2
+"""Part to which the preconditioned residual falls in a step: the next one has the true slope
+again."""
 
-# Over the largest eigenvalue of the locally preconditioned stiffness at rest: 1 to 6 tried.
 _LOCAL_SHARE = 4.0
+"""Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
+stiffness at rest; 1 to 6 were tried."""
 
-# Power iterations towards the largest eigenvalue of the locally preconditioned stiffness.
 _POWER = 20
+"""Power iterations towards the largest eigenvalue of the locally preconditioned stiffness."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,19 +1,9 @@
 """The interface of all tissue solvers, and how one is made by its name.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.solver import create_solver
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.45, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block()
 >>> solver = create_solver("fem_cg", model)
 >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
 >>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
@@ -23,6 +13,7 @@ True
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -73,11 +64,17 @@ class TissueSolver(ABC):
 
     name: ClassVar[str]
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
-    """What can be set of this method; an instance of it is made with the model and one of these."""
+    """What can be set of this method. A solver is made with the model, one of these, and a callback
+    that is told the fraction of the making that is done and what that is, or None."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
 
-    def __init__(self, model: TissueModel, settings: SolverSettings | None = None) -> None:
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: SolverSettings | None = None,
+        progress: Callable[[float, str], None] | None = None,  # noqa: ARG002
+    ) -> None:
         self.model = model
         self.settings = settings if settings is not None else self.Settings()
         self._pose: Pose | None = None
@@ -217,7 +214,11 @@ class TissueSolver(ABC):
 
 
 def create_solver(
-    name: str, model: TissueModel, settings: SolverSettings | None = None, **values: Any
+    name: str,
+    model: TissueModel,
+    settings: SolverSettings | None = None,
+    progress: Callable[[float, str], None] | None = None,
+    **values: Any,
 ) -> TissueSolver:
     """A solver by the name that scenes and reports use.
 
@@ -225,6 +226,7 @@ def create_solver(
         name: one of `SOLVERS`.
         model: the tissue.
         settings: of the solver's own class.
+        progress: told the fraction of what takes long in making it that is done, and what that is.
         values: or some of those settings by name.
 
     Raises:
@@ -233,7 +235,7 @@ def create_solver(
     solver = SOLVERS.load(name)
     if settings is None:
         settings = Reader(f"solver {name}", error=SolverError).read(solver.Settings, values)
-    made: TissueSolver = solver(model, settings)
+    made: TissueSolver = solver(model, settings, progress)
     return made
 
 

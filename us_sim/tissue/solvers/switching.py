@@ -1,19 +1,10 @@
 """One tissue, the solver that deforms it, and a second one beside it for comparison.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.switching import SwitchableTissue
->>> across, deep = uniform_planes(-0.05, 0.05, 6), uniform_planes(0.0, 0.1, 6)
->>> mesh = box_mesh(across, across, deep)
->>> fixed = np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom"))
->>> materials = uniform_material(mesh, Material(10e3, 0.3, 1000.0))
->>> model = TissueModel(mesh, materials, fixed, Sphere(0.03), face_nodes(mesh, "top"))
+>>> model = TissueModel.block(material=Material(10e3, 0.3, 1000.0))
 >>> tissue = SwitchableTissue(model, "fem_cg")
 >>> tissue.compare_with("fem")
 >>> for _ in range(20):
@@ -88,9 +79,14 @@ class SwitchableTissue:
     """
 
     def __init__(
-        self, model: TissueModel, name: str, settings: Mapping[str, SolverSettings] | None = None
+        self,
+        model: TissueModel,
+        name: str,
+        settings: Mapping[str, SolverSettings] | None = None,
+        progress: Callable[[float, str], None] | None = None,
     ) -> None:
         self._model = model
+        self._progress = progress
         self._solvers: dict[str, TissueSolver] = {}
         self._plan = Plan(name, settings=dict(settings or {}))
         self._solvers = self.make(self._plan).solvers
@@ -133,7 +129,7 @@ class SwitchableTissue:
             made = self._solvers.get(name)
             settings = plan.settings.get(name)
             if made is None or made.model is not model or settings not in (None, made.settings):
-                made = create_solver(name, model, settings)
+                made = create_solver(name, model, settings, self._progress)
                 made.warm_up()
             solvers[name] = made
         return Prepared(plan, model, solvers)

@@ -5,81 +5,88 @@ drifts on at the speed it was given.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
->>> from us_sim.tissue.solvers.symplectic_euler import advance_frame
+>>> from us_sim.tissue.elasticity.springs import SpringArrays
 >>> from us_sim.tissue.elasticity.volume_term import VolumeTerm
->>> edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
->>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
->>> advance_frame(
-...     edges, 100.0 * one, 0.1 * one, one, np.ones(2), positions, velocity, np.zeros((2, 3)),
-...     0.01, 1, 20, Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)),
-...     np.empty(0, np.int32), np.empty(0, bool), np.empty((0, 3)), np.zeros((2, 3)),
-...     (*VolumeTerm.nothing(2).arrays, np.empty(0), np.empty(0)), 0.0,
+>>> from us_sim.tissue.solvers.symplectic_euler import (
+...     Contact, Particles, ProbeMotion, advance_frame,
 ... )
+>>> edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
+>>> springs = SpringArrays(edges, 100.0 * one, 0.1 * one, one)
+>>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
+>>> particles = Particles(np.ones(2), positions, velocity, np.zeros((2, 3)))
+>>> away = ProbeMotion(Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)))
+>>> volumes, contact = VolumeTerm.nothing(2).arrays, Contact.at(np.empty(0, np.int32))
+>>> advance_frame(springs, volumes, particles, away, contact, 0.01, 1, 20)
 >>> positions.round(6).tolist()
 [[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from us_sim.tissue.contact.penetration import pushing_gap
 from us_sim.tissue.elasticity.springs import spring_forces
 from us_sim.tissue.elasticity.volume_term import add_volume_forces
 
-__all__ = ["advance_frame"]
+__all__ = ["Contact", "Particles", "ProbeMotion", "advance_frame"]
+
+
+class Particles(NamedTuple):
+    """Masses, where they are and how fast they move; kernels write on all but the masses."""
+
+    inverse_mass: NDArray[np.float64]  # (N,), 1/kg, 0 where a particle is fixed
+    positions: NDArray[np.float64]  # (N, 3), m
+    velocity: NDArray[np.float64]  # (N, 3), m/s
+    force: NDArray[np.float64]  # (N, 3), N
+
+
+class ProbeMotion(NamedTuple):
+    """The probe's shape, and where it is in each step; in S = 0 steps when there is no probe."""
+
+    box: NDArray[np.float64]  # the collider's `offset_box`
+    forward: bool  # see `us_sim.tissue.contact.penetration.only_forward`
+    rotations: NDArray[np.float64]  # (S, 3, 3), probe to patient
+    origins: NDArray[np.float64]  # (S, 3), m
+
+
+class Contact(NamedTuple):
+    """Which particles the probe can touch, and what kernels find out about them."""
+
+    reachable: NDArray[np.int32]  # (C,), the particles
+    touched: NDArray[np.bool_]  # (C,), in the last sub-step
+    normal: NDArray[np.float64]  # (C, 3), where the probe pushes them
+    wrench: NDArray[np.float64]  # (2, 3), N and N m on the probe in its frame, mean of the frame
+
+    @classmethod
+    def at(cls, reachable: NDArray[np.int32]) -> Contact:
+        """Nothing is touched."""
+        count = len(reachable)
+        return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_frame(
-    edges,
-    stiffness,
-    damping,
-    rest_length,
-    inverse_mass,
-    positions,
-    velocity,
-    force,
-    time_step,
-    substeps,
-    steps,
-    box,
-    forward,
-    rotations,
-    origins,
-    reachable,
-    touched,
-    normal,
-    wrench,
-    volume,
-    damping_factor,
-):
-    """Moves positions and velocity (N, 3) by ``steps`` of ``substeps`` each, symplectic Euler.
+def advance_frame(springs, volumes, particles, probe, contact, time_step, substeps, steps):
+    """Moves the particles by ``steps`` of ``substeps`` of ``time_step`` (s) each, symplectic Euler.
 
-    The probe is at rotations (steps, 3, 3) and origins (steps, 3), or nowhere when these are empty.
-    Fills touched (C,) and normal (C, 3) of the reachable (C,) nodes as they are in the last
-    sub-step, and wrench (2, 3) with the mean force and torque on the probe in its frame. A volume
-    term is given by its `VolumeTerm.arrays`, an array (M,) to write on, and its yield_area.
+    Args:
+        springs: their `SpringArrays`.
+        volumes: their `VolumeArrays`.
+        particles: `Particles`, moved here.
+        probe: `ProbeMotion` of S = ``steps`` steps, or of none.
+        contact: `Contact`, filled in here as it is in the last sub-step; to its wrench is added.
     """
-    tetrahedra, rest_volume, element, nodal, inverse_weight, mean, change, yield_area = volume
+    inverse_mass, positions, velocity, force = particles
+    duration = time_step * steps * substeps
     for step in range(steps):
         for _sub in range(substeps):
-            spring_forces(edges, stiffness, damping, rest_length, positions, velocity, force)
-            if len(tetrahedra) > 0:
-                add_volume_forces(
-                    tetrahedra,
-                    rest_volume,
-                    element,
-                    nodal,
-                    inverse_weight,
-                    mean,
-                    change,
-                    yield_area,
-                    damping_factor,
-                    positions,
-                    velocity,
-                    force,
-                )
+            spring_forces(springs, positions, velocity, force)
+            if len(volumes.tetrahedra) > 0:
+                add_volume_forces(volumes, positions, velocity, force)
             for i in range(len(positions)):
                 for axis in range(3):
                     v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]
@@ -88,44 +95,20 @@ def advance_frame(
             for i in range(len(positions)):
                 for axis in range(3):
                     positions[i, axis] += time_step * velocity[i, axis]
-            if len(origins) > 0:
-                touched[:] = False
-                _stop_at_probe(
-                    inverse_mass,
-                    positions,
-                    velocity,
-                    time_step * steps * substeps,
-                    box,
-                    forward,
-                    rotations[step],
-                    origins[step],
-                    reachable,
-                    touched,
-                    normal,
-                    wrench,
-                )
+            if len(probe.origins) > 0:
+                contact.touched[:] = False
+                _stop_at_probe(particles, probe, step, contact, duration)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _stop_at_probe(
-    inverse_mass,
-    positions,
-    velocity,
-    duration,
-    box,
-    forward,
-    rotation,
-    origin,
-    reachable,
-    touched,
-    normal,
-    wrench,
-):
-    """Puts nodes that have entered the probe onto it and takes away their velocity towards it.
+def _stop_at_probe(particles, probe, step, contact, duration):
+    """Puts particles that have entered the probe onto it; they lose their velocity towards it.
 
-    The impulses on the probe, over ``duration``, are added to wrench (2, 3).
+    The impulses on the probe, over ``duration`` (s), are added to the wrench.
     """
-    r = rotation
+    inverse_mass, positions, velocity, _ = particles
+    reachable, touched, normal, wrench = contact
+    r, origin = probe.rotations[step], probe.origins[step]
     for k in range(len(reachable)):
         i = reachable[k]
         a = positions[i, 0] - origin[0]
@@ -134,7 +117,7 @@ def _stop_at_probe(
         x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
-        gap, u, v, w = pushing_gap(box, forward, 0.0, x, y, z)
+        gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
         nx = r[0, 0] * u + r[0, 1] * v + r[0, 2] * w

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.progress import Progress
 from us_sim.tracking.calibration.board import Board, BoardView
 from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
 from us_sim.tracking.calibration.report_picture import draw_coverage
@@ -23,7 +22,13 @@ __all__ = ["calibrate_photos", "find_photos"]
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -> str:
+def calibrate_photos(
+    given: Sequence[str],
+    board: Board,
+    out: Path,
+    name: str,
+    progress: Callable[[float, str], None] | None = None,
+) -> str:
     """Calibrate a camera and write its info and a picture; returns a sentence with the result.
 
     Args:
@@ -31,6 +36,7 @@ def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -
         board: what the photos show.
         out: YAML file to write; the picture goes beside it.
         name: of the camera.
+        progress: told the fraction of the photos that is done, and how many show the board.
 
     Raises:
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
@@ -40,7 +46,7 @@ def calibrate_photos(given: Sequence[str], board: Board, out: Path, name: str) -
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
     photos = find_photos(given)
-    names, views, blank, size = _views(photos, board)
+    names, views, blank, size = _views(photos, board, progress)
     if not views:
         raise CalibrationError(
             f"none of the {len(photos)} photos shows the board: check --board, --size and "
@@ -101,28 +107,28 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
 
 
 def _views(
-    photos: Sequence[Path], board: Board
+    photos: Sequence[Path], board: Board, progress: Callable[[float, str], None] | None
 ) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
     """Names and views of the photos that show the board, names of those that do not, the size."""
     names, views, blank = [], [], []
     size: tuple[int, int] | None = None
-    with Progress("looking for the board", len(photos), "photos") as progress:
-        for k, photo in enumerate(photos):
-            image = _read(photo)
-            columns_rows = (image.shape[1], image.shape[0])
-            if size is not None and columns_rows != size:
-                raise CalibrationError(
-                    f"{photo}: has {columns_rows[0]} × {columns_rows[1]} pixels and the photos "
-                    f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
-                )
-            size = columns_rows
-            view = board.find(image)
-            if view is None:
-                blank.append(photo.name)
-            else:
-                names.append(photo.name)
-                views.append(view)
-            progress.update(k + 1, f"{len(views)} found")
+    for k, photo in enumerate(photos):
+        image = _read(photo)
+        columns_rows = (image.shape[1], image.shape[0])
+        if size is not None and columns_rows != size:
+            raise CalibrationError(
+                f"{photo}: has {columns_rows[0]} × {columns_rows[1]} pixels and the photos "
+                f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
+            )
+        size = columns_rows
+        view = board.find(image)
+        if view is None:
+            blank.append(photo.name)
+        else:
+            names.append(photo.name)
+            views.append(view)
+        if progress is not None:
+            progress((k + 1) / len(photos), f"{len(views)} with the board")
     if size is None:
         raise CalibrationError("no photo is given; name files, a folder or a pattern")
     return names, views, blank, size

@@ -137,12 +137,9 @@ def _with_times(
                 f"{path}: sighting {len(seen) + 1}: {recording.name} has no pose around "
                 f"{time:.3f} s; it goes from {stamps[0]:.3f} to {stamps[-1]:.3f} s"
             )
-        before, behind = (
-            Pose(motion.positions[first[k]], motion.orientations[first[k]])
-            for k in (after - 1, after)
-        )
-        share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        pose = to_phantom @ interpolate(before, behind, share)
+        before, behind = (motion.pose(first[k]) for k in (after - 1, after))
+        fraction = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        pose = to_phantom @ interpolate(before, behind, fraction)
         seen.append(PixelSighting(feature, column, row, pose))
     return seen
 

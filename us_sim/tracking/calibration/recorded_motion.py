@@ -16,15 +16,13 @@ array([[0.01, 0.02, 0.03]])
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.geometry.pose import Pose
-from us_sim.progress import Progress
 from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
 from us_sim.recording.plus_recording import read_tracker_recording
 from us_sim.tracking.calibration.position_signal import (
@@ -36,7 +34,7 @@ from us_sim.volume.sequence_header import frame_fields
 from us_sim.volume.stored_size import metaimage_header
 from us_sim.volume.sweep import Sweep, read_sweep
 
-__all__ = ["poses_of", "read_motion", "read_signal", "seconds_of"]
+__all__ = ["read_motion", "read_signal", "seconds_of"]
 
 
 def read_motion(path: Path, name: str | None) -> ProbePath:
@@ -69,32 +67,31 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
     return recording.probe_path(body, reference or None)
 
 
-def read_signal(path: Path, name: str | None, *, images: bool = False) -> PositionSignal:
+def read_signal(
+    path: Path,
+    name: str | None,
+    *,
+    images: bool = False,
+    progress: Callable[[float, str], None] | None = None,
+) -> PositionSignal:
     """What moved, as one number over time.
 
     Args:
         path: a bag, or a recording of Plus.
         name: as in :func:`read_motion`.
         images: take a Plus recording's images even where it has poses.
+        progress: told the fraction of the images that is done, and what is looked for.
 
     Raises:
         UsSimError: it cannot be read, or shows no motion.
     """
     if is_tracker_recording(path) and (images or not _has_transforms(path)):
         sweep = read_sweep(path, tracked=False)
-        return signal_of_images(sweep.times, _with_progress(sweep))
+        return signal_of_images(sweep.times, _with_progress(sweep, progress))
     if images:
         raise CalibrationError(f"{path}: images are read from recordings of Plus (.igs.mha) only")
     motion = read_motion(path, name)
     return signal_of_positions(seconds_of(motion), motion.positions)
-
-
-def poses_of(motion: ProbePath) -> list[Pose]:
-    """Its poses, one by one."""
-    return [
-        Pose(position, orientation)
-        for position, orientation in zip(motion.positions, motion.orientations, strict=True)
-    ]
 
 
 def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
@@ -109,8 +106,10 @@ def _has_transforms(path: Path) -> bool:
     return any(key.endswith("Transform") for fields in frames.values() for key in fields)
 
 
-def _with_progress(sweep: Sweep) -> Iterator[NDArray[np.uint8]]:
-    with Progress("looking for the line", len(sweep.times), "images") as progress:
-        for k, image in enumerate(sweep.images()):
-            yield image
-            progress.update(k + 1)
+def _with_progress(
+    sweep: Sweep, progress: Callable[[float, str], None] | None
+) -> Iterator[NDArray[np.uint8]]:
+    for k, image in enumerate(sweep.images()):
+        yield image
+        if progress is not None:
+            progress((k + 1) / len(sweep.times), "the line in each image")

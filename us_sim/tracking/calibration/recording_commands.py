@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from us_sim.tracking.calibration.landmark_file import read_landmarks
 from us_sim.tracking.calibration.landmarks import register_landmarks
 from us_sim.tracking.calibration.pivot import calibrate_pivot
 from us_sim.tracking.calibration.recorded_motion import (
-    poses_of,
     read_motion,
     read_signal,
     seconds_of,
@@ -40,7 +40,7 @@ def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
         UsSimError: the recording cannot be read or does not determine the tip.
     """
     motion = read_motion(recording, name)
-    found = calibrate_pivot(poses_of(motion))
+    found = calibrate_pivot(motion.poses)
     write_transform(
         out,
         Pose(found.tip),
@@ -145,6 +145,7 @@ def calibrate_clock(
     out: Path,
     *,
     images: bool = False,
+    progress: Callable[[float, str], None] | None = None,
 ) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
@@ -155,6 +156,7 @@ def calibrate_clock(
         largest: s, the largest offset to believe.
         out: file to write; a picture goes beside it.
         images: take the fixed recording's images even where it has poses.
+        progress: told the fraction of the images that is done, and what is looked for.
 
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
@@ -162,8 +164,8 @@ def calibrate_clock(
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    moving = read_signal(moving_file, names[0])
-    fixed = read_signal(fixed_file, names[1], images=images)
+    moving = read_signal(moving_file, names[0], progress=progress)
+    fixed = read_signal(fixed_file, names[1], images=images, progress=progress)
     found = find_time_offset(moving, fixed, largest=largest)
     write_calibration(
         out,
@@ -196,7 +198,7 @@ def _touched(
             f"as `us-sim calibrate pivot` writes it"
         )
     motion = read_motion(recording, name)
-    poses = poses_of(motion)
+    poses = motion.poses
     offset = read_transform(tip).position
     dwells = find_dwells(
         seconds_of(motion),

@@ -1,0 +1,54 @@
+"""Bars that are drawn late, and what the domain tells them."""
+
+import numpy as np
+import pytest
+
+from us_sim import progress
+from us_sim.tissue.linear_algebra import compliance
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds, set by hand."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_short_work_draws_nothing(clock, capsys):
+    show = progress.late_progress("solving")
+    for clock[0], fraction in ((0.0, 0.0), (0.4, 0.5), (0.9, 1.0)):
+        show(fraction, "half")
+    assert capsys.readouterr().err == ""
+
+
+def test_long_work_draws_a_bar_to_its_end_and_later_work_another(clock, capsys):
+    show = progress.late_progress("solving")
+    for start in (0.0, 100.0):
+        for seconds, fraction in ((0.0, 0.0), (1.5, 0.25), (9.0, 1.0)):
+            clock[0] = start + seconds
+            show(fraction, "the rest")
+        drawn = capsys.readouterr().err
+        assert drawn.count("solving: 100 %") == 1
+        assert drawn.endswith("the rest\n")
+
+
+def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
+    monkeypatch.setattr(compliance, "_KEPT", 0)
+    told = []
+    compliance.surface_compliance(
+        TissueModel.block(), lambda fraction, text: told.append((fraction, text))
+    )
+    fractions = [fraction for fraction, _ in told]
+    assert fractions == sorted(fractions)
+    assert 0.0 < fractions[0] < 0.6 < fractions[-1] == 1.0
+    assert {text for _, text in told} == {"compliance of the surface"}
+
+
+def test_a_solver_tells_how_far_its_making_is():
+    told = []
+    MsdsImplicit(TissueModel.block(nodes=(12, 12, 3)), None, lambda done, _: told.append(done))
+    np.testing.assert_allclose(told, [64 / 144, 128 / 144, 1.0])
