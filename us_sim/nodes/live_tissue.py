@@ -70,7 +70,7 @@ class LiveTissue:
         self._current = dict(values)  # what the tissue is deformed by
         self._asked = dict(values)  # what is being made ready
         self._preparation = Preparation(self.tissue)
-        node.create_timer(LOOK_S, self._look)
+        node.create_timer(LOOK_S, self._tick)
 
     @property
     def state(self) -> str:
@@ -129,6 +129,12 @@ class LiveTissue:
             return self.tissue.make(plan)
         except UsSimError as error:
             return Failed(plan, str(error))
+
+    def _tick(self) -> None:
+        """Look, and tell diagnostics how far it is, also while no pose comes."""
+        if self._preparation.state:
+            self._node.health.state = self.state
+        self._look()
 
     def _look(self) -> None:
         """Go on with what is ready, or say why it never will be."""

@@ -37,14 +37,15 @@ class Preparation:
         self._outcome: Prepared | Failed | None = None
         self._thread: threading.Thread | None = None
         self._began = 0.0
+        self._progress = ""
 
     @property
     def state(self) -> str:
-        """What is being made, and for how long already; '' when nothing is."""
+        """For how long something is being made already, and how far it is; '' when nothing is."""
         with self._lock:
-            busy = self._thread is not None
-            seconds = time.monotonic() - self._began
-        return f"preparing for {seconds:.0f} s" if busy else ""
+            if self._thread is None:
+                return ""
+            return f"preparing for {time.monotonic() - self._began:.0f} s{self._progress}"
 
     def want(self, plan: Plan) -> None:
         """Begin to make what a plan needs; what is being made for another is given up after."""
@@ -62,16 +63,20 @@ class Preparation:
             outcome, self._outcome = self._outcome, None
             return outcome
 
+    def _show(self, fraction: float, text: str) -> None:
+        with self._lock:
+            self._progress = f", {100 * fraction:.0f} % of {text}"
+
     def _work(self) -> None:
         while True:
             with self._lock:
-                plan, self._wanted = self._wanted, None
+                plan, self._wanted, self._progress = self._wanted, None, ""
                 if plan is None:
                     self._thread = None
                     return
             outcome: Prepared | Failed
             try:
-                outcome = self._tissue.make(plan)
+                outcome = self._tissue.make(plan, self._show)
             except UsSimError as error:
                 outcome = Failed(plan, str(error))
             except Exception as error:  # lest the thread end without a word

@@ -86,10 +86,9 @@ class SwitchableTissue:
         progress: Callable[[float, str], None] | None = None,
     ) -> None:
         self._model = model
-        self._progress = progress
         self._solvers: dict[str, TissueSolver] = {}
         self._plan = Plan(name, settings=dict(settings or {}))
-        self._solvers = self.make(self._plan).solvers
+        self._solvers = self.make(self._plan, progress).solvers
         self._solver = self._solvers[name]
         self._beside: TissueSolver | None = None
         self.difference: Difference | None = None
@@ -113,10 +112,14 @@ class SwitchableTissue:
         """Of the solver in use, see `TissueSolver.contact_stiffness`."""
         return self._solver.contact_stiffness()
 
-    def make(self, plan: Plan) -> Prepared:
+    def make(self, plan: Plan, progress: Callable[[float, str], None] | None = None) -> Prepared:
         """Make and compile what a plan needs and is not there yet; nothing changes by that.
 
         It may be called in a thread of its own while another deforms the tissue.
+
+        Args:
+            plan: what is wanted.
+            progress: as for `create_solver`.
 
         Raises:
             SolverError: no such solver, one compared with itself, or a model it cannot solve.
@@ -129,7 +132,7 @@ class SwitchableTissue:
             made = self._solvers.get(name)
             settings = plan.settings.get(name)
             if made is None or made.model is not model or settings not in (None, made.settings):
-                made = create_solver(name, model, settings, self._progress)
+                made = create_solver(name, model, settings, progress)
                 made.warm_up()
             solvers[name] = made
         return Prepared(plan, model, solvers)

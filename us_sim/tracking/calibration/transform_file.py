@@ -26,11 +26,12 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import Reader
+from us_sim.settings.setting import Settings, setting
 
 __all__ = [
     "TransformFile",
@@ -41,6 +42,16 @@ __all__ = [
 ]
 
 _KEYS = ("from", "to", "position", "orientation")
+
+
+@dataclass(frozen=True)
+class _Written(Settings):
+    """The keys of a file without which it is no transform."""
+
+    position: tuple[float, float, float] = setting(Quantity("length", -1e3, 1e3), "x, y, z")
+    orientation: tuple[float, float, float, float] = setting(
+        Quantity("number", -1e6, 1e6), "quaternion x, y, z, w, of any length"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,19 +85,13 @@ def read_transform_file(path: str | Path) -> TransformFile:
     """
     path = Path(path)
     document = _document(path)
-    for key in ("position", "orientation"):
-        if key not in document:
-            raise CalibrationError(
-                f"{path}: {key}: is missing; a transform has a position (x, y, z in metres) and "
-                f"an orientation (quaternion x, y, z, w), as `us-sim calibrate` writes them"
-            )
-    position = _numbers(path, "position", document["position"], 3, Quantity("length"))
-    orientation = _numbers(path, "orientation", document["orientation"], 4, Quantity("number"))
+    written = {key: document[key] for key in ("position", "orientation") if key in document}
+    place = Reader(str(path), error=CalibrationError).read(_Written, written)
     residuals = document.get("residuals", {})
     if not isinstance(residuals, dict):
         raise CalibrationError(f"{path}: residuals: must be a mapping of names, not {residuals!r}")
     try:
-        pose = Pose(position, orientation)
+        pose = Pose(np.array(place.position), np.array(place.orientation))
     except PoseError as error:
         raise CalibrationError(f"{path}: {error}") from error
     known = {*_KEYS, "method", "date", "residuals"}
@@ -179,17 +184,6 @@ def _document(path: Path) -> dict[str, Any]:
             f"{path}: holds no transform; it needs the keys position and orientation"
         )
     return document
-
-
-def _numbers(
-    path: Path, key: str, value: object, count: int, quantity: Quantity
-) -> NDArray[np.float64]:
-    if not isinstance(value, list) or len(value) != count:
-        raise CalibrationError(f"{path}: {key}: must be {count} numbers, not {value!r}")
-    try:
-        return np.array([quantity.parse(number) for number in value])
-    except ValueError as error:
-        raise CalibrationError(f"{path}: {key}: {error}") from error
 
 
 def _plain(value: Any) -> Any:
