@@ -83,7 +83,7 @@ def test_a_person_may_write_units_and_exponents(tmp_path):
         (HALF_TURN, "position: is missing"),
         ("position: [0, 0]\n" + HALF_TURN, "position: needs 3 values, not 2"),
         ("position: [0, 0, .nan]\n" + HALF_TURN, "not finite"),
-        ("position: [0, 0, true]\n" + HALF_TURN, "position\[2\]: True is not a length"),
+        ("position: [0, 0, true]\n" + HALF_TURN, r"position\[2\]: True is not a length"),
         ("position: [0, 0, 0]\norientation: [0, 0, 0, 0]\n", "quaternion is zero"),
         ("position: [0, 0\n", "line 2: is not YAML"),
         ("position: [0, 0, 0]\nresiduals: 3\n" + HALF_TURN, "residuals: must be a mapping"),
