@@ -189,7 +189,19 @@ def mistakes(place: Place) -> Iterator[Mistake]:
             for what, value, index, words in wrong_values(kind, rule, others):
                 key = ".".join((*place.path, name)) + index
                 yield Mistake(f"{what}: {value!r}", place.with_value(name, value), key, words)
+        if rule.file:
+            yield missing_file(place, name, rule)
     yield from not_here(place)
+
+
+def missing_file(place: Place, name: str, rule: Rule) -> Mistake:
+    """A file that is not there, in a mapping that says nothing else but what the file needs."""
+    mapping = {name: "qqqq.yaml"}
+    if rule.applies:
+        mapping[rule.applies[0]] = rule.applies[1][0]
+    document = put(place.document, place.path, mapping) if place.path else place.document | mapping
+    words = ("there is no file", "qqqq.yaml")
+    return Mistake("file", document, ".".join((*place.path, name)), words)
 
 
 def unknown_keys(place: Place) -> Iterator[Mistake]:
@@ -277,8 +289,6 @@ def wrong_texts(rule: Rule) -> Wrong:
         yield "empty", "", "", ("'' is not one of",)
     else:
         yield "empty", "", "", ("is empty: give a text",)
-    if rule.file:
-        yield "file", "qqqq.yaml", "", ("there is no file", "qqqq.yaml")
 
 
 def wrong_choice(choice: Choice) -> Wrong:
