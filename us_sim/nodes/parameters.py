@@ -100,7 +100,8 @@ class LiveSettings:
                 is_parameter = group.names is None or name in group.names
                 if is_parameter and getattr(settings, name) != getattr(self.values[key], name):
                     back.append(Parameter(group.prefix + name, value=_default(settings, name)))
-        self._node.set_parameters(back)
+        if back:
+            self._node.set_parameters_atomically(back)  # one alone may not go with another
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

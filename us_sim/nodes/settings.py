@@ -319,7 +319,7 @@ def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
         raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise UsSimError(f"--param {node}.{name}={text}: is not YAML") from error
 
 

@@ -147,3 +147,5 @@ def _yaml(path: Path) -> Any:
         if "is there twice" in problem:
             raise SceneError(f"{path}:{where} {problem}: keep one") from error
         raise SceneError(f"{path}:{where} is not YAML: {problem}") from error
+    except (ValueError, RecursionError) as error:  # PyYAML lets those of bad dates and numbers pass
+        raise SceneError(f"{path}: is not YAML: {error}") from error

@@ -17,7 +17,7 @@ from us_sim.scene.building import probe_of
 from us_sim.scene.document import read_document
 from us_sim.scene.scene import Scene
 from us_sim.settings.reading import Reader
-from us_sim.settings.spelling import nearest
+from us_sim.settings.spelling import nearest, shown
 from us_sim.share import shared_roots
 
 __all__ = ["find_scene", "load_scene", "parse_scene"]
@@ -75,19 +75,24 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
     def find_file(name: str, key: str) -> str:
         return _existing(name, origin, [*folders, Path.cwd()], key)
 
-    document = _with_named_structures(document)
+    document = _with_named_structures(document, origin)
     Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
     scene = Reader(origin, find_file, SceneError).read(Scene, document).named(origin)
     probe_of(scene)
     return scene
 
 
-def _with_named_structures(document: object) -> object:
+def _with_named_structures(document: object, origin: str) -> object:
     """Structures that have nothing but a name may be a list of names, or keys without a value."""
     if not isinstance(document, dict) or "structures" not in document:
         return document
     given = document["structures"]
-    if isinstance(given, list) and all(isinstance(name, str) for name in given):
+    if isinstance(given, list):
+        for i, name in enumerate(given):
+            if not isinstance(name, str):
+                raise SceneError(f"{origin}: structures[{i}]: must be a text, not {shown(name)}")
+            if name in given[:i]:
+                raise SceneError(f"{origin}: structures[{i}]: {name} is there already: keep one")
         given = dict.fromkeys(given)
     if isinstance(given, dict):
         given = {name: {} if value is None else value for name, value in given.items()}

@@ -11,6 +11,8 @@ import math
 import re
 from dataclasses import dataclass
 
+from us_sim.settings.spelling import shown
+
 __all__ = ["Quantity"]
 
 _UNITS: dict[str, dict[str, float]] = {
@@ -58,32 +60,43 @@ class Quantity:
         """
         number = self._number(value)
         if not math.isfinite(number):
-            raise ValueError(f"{value!r} is not finite")
+            raise ValueError(f"{shown(value)} is not finite; give {self._range}")
         if not self.minimum <= number <= self.maximum:
             unit = f" {self.unit}" if self.unit else ""
-            hint = self._hint(number)
-            raise ValueError(
-                f"{number:g}{unit} is outside {self.minimum:g} to {self.maximum:g}{unit}{hint}"
-            )
+            raise ValueError(f"{number:g}{unit} is outside {self._range}{self._hint(number)}")
         return number
 
     def _number(self, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise ValueError(f"{value!r} is not a {self.dimension}")
+            raise ValueError(self._misfit(value))
         if not isinstance(value, str):
             # A whole number may be larger than any that a float holds.
             return float(value) if abs(value) < 1e308 else math.inf
         match = _NUMBER.match(value)
         units = _UNITS[self.dimension]
         if match is None:
-            raise ValueError(f"{value!r} is not a {self.dimension}")
+            raise ValueError(self._misfit(value))
         number, unit = float(match[1]), match[2]
         if not unit:
             return number
         if unit not in units:
-            known = ", ".join(units) or "none"
-            raise ValueError(f"{value!r} is not a {self.dimension}: its units are {known}")
+            raise ValueError(self._misfit(value))
         return number * units[unit]
+
+    @property
+    def _range(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.minimum:g} to {self.maximum:g}{unit}"
+
+    def _misfit(self, value: object) -> str:
+        """That a value is none of this dimension, and in which units one is written."""
+        article = "an" if self.dimension[0] in "aeiou" else "a"
+        units = list(_UNITS[self.dimension])
+        if units:
+            hint = f": its unit{'s are' if units[1:] else ' is'} {', '.join(units)}"
+        else:
+            hint = ": it has no unit" if isinstance(value, str) and _NUMBER.match(value) else ""
+        return f"{shown(value)} is not {article} {self.dimension}{hint}"
 
     def _hint(self, number: float) -> str:
         """A likely unit slip: millimetres or kilopascals written where SI is meant."""

@@ -13,13 +13,13 @@ us_sim.errors.SettingsError: my.yaml: imaging.gian: unknown key; did you mean `g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, TypeVar, get_args, get_origin
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.setting import Refusal, Rule, Settings, convert, kinds_of, rules_of
-from us_sim.settings.spelling import nearest, unknown
+from us_sim.settings.spelling import nearest, shown, unknown
 
 __all__ = ["Reader"]
 
@@ -60,12 +60,12 @@ class Reader:
         mapping = self._mapping(document, path)
         rules, kinds = rules_of(settings), kinds_of(settings)
         values: dict[str, Any] = {}
-        known = set(rules)
-        for name, rule in rules.items():
-            if rule.choice and rule.place != "within":
-                known -= {name}
-                taken, values[name] = self._chosen_here(settings, name, rule, mapping, path)
-                known |= taken
+        here = {n for n, rule in rules.items() if rule.choice and rule.place != "within"}
+        known = set(rules) - here
+        for name in here:
+            rule = rules[name]
+            taken, values[name] = self._chosen_here(settings, name, rule, mapping, path, known)
+            known |= taken
         for key in mapping:
             if key not in known:
                 raise self._unknown_key(key, known, path)
@@ -103,11 +103,11 @@ class Reader:
             made = convert(kind, value, rule, lambda k, v, r: self._other(k, v, r, path))
         except Refusal as refusal:
             raise self._refused(f"{path}{refusal.key}", refusal.problem) from refusal
-        if isinstance(made, str):
-            if not made and kind is str and not rule.choices:
-                raise self._refused(path, "is empty: give a text, or leave the key out")
-            if rule.file and made and self._find_file is not None:
-                return self._find_file(made, path)
+        for key, text in _texts(made):
+            if not text.strip():
+                raise self._refused(path + key, "is empty: give a text, or leave it out")
+        if isinstance(made, str) and rule.file and self._find_file is not None:
+            return self._find_file(made, path)
         return made
 
     def _other(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
@@ -132,6 +132,9 @@ class Reader:
         """What a mapping with the choice's key names, with the other keys as its settings."""
         mapping = self._mapping(document, path)
         if choice.key not in mapping:
+            for key in mapping:
+                if nearest(key, [choice.key]):
+                    raise self._unknown_key(key, {choice.key}, path)
             raise self._refused(
                 joined(path, choice.key), f"is missing; it is one of {', '.join(choice.names)}"
             )
@@ -140,7 +143,13 @@ class Reader:
         return Chosen(name, self._settings_of(choice, name, rest, path))
 
     def _chosen_here(
-        self, settings: type, field: str, rule: Rule, mapping: Mapping[Any, Any], path: str
+        self,
+        settings: type,
+        field: str,
+        rule: Rule,
+        mapping: Mapping[Any, Any],
+        path: str,
+        beside: set[str],
     ) -> tuple[set[str], Chosen]:
         """What is chosen among the keys of other settings; the keys that are about it."""
         choice = rule.choice
@@ -158,30 +167,39 @@ class Reader:
             own = mapping.get(name)
             made = None if name not in mapping else self._settings(choice, name, own, path)
             return {choice.key, name}, Chosen(name, made)
-        beside = set(rules_of(settings))
         rest = {k: v for k, v in mapping.items() if k not in beside and k != choice.key}
-        return {choice.key, *rest}, Chosen(name, self._settings_of(choice, name, rest, path))
+        return {choice.key, *rest}, Chosen(
+            name, self._settings_of(choice, name, rest, path, beside)
+        )
 
     def _settings(self, choice: Choice, name: str, document: object, path: str) -> Settings:
         return self.read(choice.settings(name), document, joined(path, name))
 
     def _settings_of(
-        self, choice: Choice, name: str, mapping: dict[Any, Any], path: str
+        self,
+        choice: Choice,
+        name: str,
+        mapping: dict[Any, Any],
+        path: str,
+        beside: Collection[str] = (),
     ) -> Settings | None:
         """The settings of an option, whose keys say of which option they are."""
         kind = f"{name} {choice.what}"
-        article = "an" if kind[0] in "aeiou" else "a"
+        article = "an" if kind[0] in "aeiou" and not kind.startswith("one") else "a"
         if not (mapping or choice.needs):
             return None  # so that its module need not be imported to say nothing of it
         own = choice.settings(name)
         rules = rules_of(own)
         for key in mapping:
             if key not in rules:
-                others = {k for other in choice.names for k in rules_of(choice.settings(other))}
-                if key not in others:
-                    raise self._unknown_key(key, {*rules, choice.key}, path)
+                others = [o for o in choice.names if key in rules_of(choice.settings(o))]
+                if not others:
+                    raise self._unknown_key(key, {*rules, choice.key, *beside}, path)
                 has = f"it has {', '.join(rules)}" if rules else "it has no settings"
-                raise self._refused(joined(path, key), f"{article} {kind} has no {key}; {has}")
+                raise self._refused(
+                    joined(path, key),
+                    f"{article} {kind} has no {key}; {has}, and {key} is for {' or '.join(others)}",
+                )
         needed = [key for key in rules if _is_required(own, key)]
         for key in needed:
             if key not in mapping:
@@ -191,10 +209,10 @@ class Reader:
         return self.read(own, mapping, path)
 
     def _by_choice(self, choice: Choice, mapping: Mapping[Any, Any], path: str) -> dict[str, Any]:
-        return {
-            self._name(choice, name, path): self._settings(choice, name, block, path)
-            for name, block in mapping.items()
-        }
+        for name in mapping:
+            if name not in choice.names:
+                raise self._unknown_key(name, set(choice.names), path)
+        return {name: self._settings(choice, name, block, path) for name, block in mapping.items()}
 
     def _name(self, choice: Choice, value: object, path: str) -> str:
         if not isinstance(value, str) or value not in choice.names:
@@ -203,19 +221,28 @@ class Reader:
 
     def _mapping(self, document: object, path: str) -> Mapping[Any, Any]:
         if not isinstance(document, Mapping):
-            raise self._refused(path, f"must be a mapping of keys, not {document!r}")
+            raise self._refused(path, f"must be a mapping of keys, not {shown(document)}")
         return document
 
     def _unknown_key(self, key: object, known: set[str], path: str) -> UsSimError:
         like = nearest(key, known)
         hint = f"did you mean `{like}`?" if like else f"known keys: {', '.join(sorted(known))}"
-        return self._refused(joined(path, str(key)), f"unknown key; {hint}")
+        key = str(key) if str(key).isprintable() else shown(key)
+        return self._refused(joined(path, key), f"unknown key; {hint}")
 
     def _refused(self, path: str, problem: str) -> UsSimError:
         at = f"{path}: " if path else ""
         error = self._error(f"{self._origin}: {at}{problem}")
         error.key, error.problem = path, problem
         return error
+
+
+def _texts(value: object) -> Iterator[tuple[str, str]]:
+    """The texts in a value, each with the rest of the path of keys to it."""
+    if isinstance(value, str):
+        yield "", value
+    elif isinstance(value, tuple):
+        yield from ((f"[{i}]", item) for i, item in enumerate(value) if isinstance(item, str))
 
 
 def joined(path: str, key: str) -> str:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import shown, unknown
 
 if TYPE_CHECKING:
     from us_sim.settings.choice import Choice
@@ -195,7 +195,7 @@ def convert(kind: Any, value: Any, rule: Rule, other: Converter | None = None) -
         return _number(kind, value, rule)
     if kind is bool:
         if not isinstance(value, bool):
-            raise Refusal(f"must be true or false, not {value!r}")
+            raise Refusal(f"must be true or false, not {shown(value)}")
         return value
     if kind is str:
         return _text(value, rule)
@@ -210,13 +210,13 @@ def _number(kind: type, value: Any, rule: Rule) -> float | int:
     except ValueError as error:
         raise Refusal(str(error)) from error
     if kind is int and number != int(number):
-        raise Refusal(f"{value!r} is not a whole number")
+        raise Refusal(f"{shown(value)} is not a whole number")
     return kind(number)  # type: ignore[no-any-return]
 
 
 def _text(value: Any, rule: Rule) -> str:
     if not isinstance(value, str):
-        raise Refusal(f"must be a text, not {value!r}")
+        raise Refusal(f"must be a text, not {shown(value)}")
     choices = rule.choice.names if rule.choice else rule.choices
     if choices and value not in choices:
         raise Refusal(unknown(value, choices))
@@ -228,7 +228,7 @@ def _items(
 ) -> Iterator[Any]:
     """The items of a list, each converted; of a fixed number where the type says so."""
     if isinstance(value, str | dict) or not hasattr(value, "__iter__"):
-        raise Refusal(f"must be a list, not {value!r}")
+        raise Refusal(f"must be a list, not {shown(value)}")
     items = list(value)
     if kinds[-1] is Ellipsis:
         kinds = kinds[:1] * len(items)
@@ -249,4 +249,4 @@ def _suits(kind: Any, value: object) -> bool:
         return dataclasses.is_dataclass(kind)
     if dataclasses.is_dataclass(kind):
         return isinstance(value, kind)  # type: ignore[arg-type]
-    return kind is str if isinstance(value, str) else kind in (int, float)
+    return kind in (str, int, float) if isinstance(value, str) else kind in (int, float)

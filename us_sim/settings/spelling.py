@@ -8,9 +8,19 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable
 
-__all__ = ["nearest", "unknown"]
+__all__ = ["nearest", "shown", "unknown"]
+
+_repr = reprlib.Repr()
+_repr.maxstring = _repr.maxother = _LONGEST = 60
+
+
+def shown(value: object) -> str:
+    """A value as a sentence shows it: in one line, and the start only where it is long."""
+    text = " ".join(_repr.repr(value).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def nearest(name: object, known: Iterable[str]) -> str | None:
@@ -24,4 +34,4 @@ def unknown(name: object, known: Iterable[str]) -> str:
     known = list(known)
     like = nearest(name, known)
     hint = f"; did you mean '{like}'?" if like else ""
-    return f"{name!r} is not one of {', '.join(known)}{hint}"
+    return f"{shown(name)} is not one of {', '.join(known)}{hint}"

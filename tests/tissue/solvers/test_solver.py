@@ -151,9 +151,7 @@ def test_a_state_that_moves_held_nodes_is_refused(solver):
 
 
 def test_unknown_names_are_refused_with_the_known_ones():
-    with pytest.raises(
-        SolverError, match="solver 'magic' is not one of fem, fem_nonlinear"
-    ):
+    with pytest.raises(SolverError, match="solver 'magic' is not one of fem, fem_nonlinear"):
         create_solver("magic", block((3, 3, 3)))
     with pytest.raises(SolverError, match="solver fem_cg: speed: unknown key; known keys: "):
         create_solver("fem_cg", block((3, 3, 3)), speed=3)
