@@ -1,0 +1,124 @@
+"""The table of topics is what the nodes publish and hear: no topic more, none less."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from rclpy.qos import DurabilityPolicy
+
+from us_sim.nodes.camera_driver import CameraDriver
+from us_sim.nodes.haptic_renderer import HapticRenderer
+from us_sim.nodes.image_writer import ImageWriter
+from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
+from us_sim.nodes.path_player import PathPlayer
+from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.session_monitor import SessionMonitor
+from us_sim.nodes.session_player import SessionPlayer
+from us_sim.nodes.session_recorder import SessionRecorder
+from us_sim.nodes.settings import NODES
+from us_sim.nodes.skin_deformer import SkinDeformer
+from us_sim.nodes.slice_interpolator import SliceInterpolator
+from us_sim.nodes.space_mouse_driver import SpaceMouseDriver
+from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.nodes.topics import TOPICS
+from us_sim.settings.registry import TRACKERS
+from us_sim.share import shared_path
+
+ROS_OWN = {"/rosout", "/parameter_events", "/clock"}
+TRACKER_KEYS = {
+    "tf": "frame: world, body: stylus",
+    "path": f"file: {Path(shared_path('bags/press_and_slide.mcap'))}",
+    "openigtlink": "body: stylus, openigtlink: {port: 1}",
+}
+
+
+@pytest.fixture
+def scenes(tmp_path, small_scene):
+    """The small scene with structures, for each source of poses."""
+
+    def scene(source):
+        file = tmp_path / f"{source}.yaml"
+        keys = TRACKER_KEYS.get(source)
+        file.write_text(
+            small_scene.read_text()
+            + "structures: [vein]\n"
+            + f"tracker: {{source: {source}{', ' + keys if keys else ''}}}\n"
+        )
+        return str(file)
+
+    return scene
+
+
+def endpoints_of(node):
+    """Topic, type, latched or not, and direction of each endpoint of a node."""
+    namespace = node.get_namespace()
+    for direction, endpoints in (("from", node.publishers), ("to", node.subscriptions)):
+        for endpoint in endpoints:
+            if endpoint.topic_name in ROS_OWN:
+                continue
+            package = endpoint.msg_type.__module__.partition(".")[0]
+            latched = endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            yield (
+                endpoint.topic_name.removeprefix(namespace).lstrip("/"),
+                f"{package}/{endpoint.msg_type.__name__}",
+                latched,
+                direction,
+                node.get_name(),
+            )
+
+
+def told(nodes):
+    """The same of the table, for those nodes."""
+    return {
+        (topic.name, topic.type_name, topic.latched, direction, node)
+        for topic in TOPICS
+        for direction, names in (("from", topic.publishers), ("to", topic.subscribers))
+        for node in names
+        if node in nodes
+    }
+
+
+def test_the_probe_tracker_hears_what_each_source_needs(bench, scenes):
+    found = set()
+    for source in TRACKERS:
+        found |= set(endpoints_of(bench.make(ProbeTracker, scene=scenes(source))))
+    assert found == told({"probe_tracker"})
+
+
+def test_the_nodes_of_a_scene_publish_and_hear_what_the_table_says(bench, scenes):
+    scene = scenes("haptic")
+    nodes = [
+        bench.make(kind, scene=scene)
+        for kind in (TissueDeformer, SkinDeformer, SliceInterpolator, HapticRenderer)
+    ]
+    nodes.append(bench.make(OpenIGTLinkBridge, scene=scene, port=0))
+    found = {endpoint for node in nodes for endpoint in endpoints_of(node)}
+    assert found == told({node.get_name() for node in nodes})
+
+
+def test_players_drivers_and_writers_do_too(bench, tmp_path):
+    bag = str(shared_path("bags/press_and_slide.mcap"))
+    nodes = [
+        bench.make(PathPlayer, path=bag, lockstep=True),
+        bench.make(ImageWriter, folder=str(tmp_path / "images")),
+        bench.make(CameraDriver, source="/dev/no_camera"),
+        bench.make(SpaceMouseDriver),
+        bench.add(SessionMonitor(context=bench.context)),
+    ]
+    found = {endpoint for node in nodes for endpoint in endpoints_of(node)}
+    assert found == told({node.get_name() for node in nodes})
+
+
+def test_what_records_and_plays_every_topic_reports_too(bench, tmp_path):
+    bag = tmp_path / "bag.mcap"
+    shutil.copy(shared_path("bags/press_and_slide.mcap"), bag)
+    player = bench.make(SessionPlayer, path=str(bag))
+    recorder = bench.make(SessionRecorder, file=str(tmp_path / "session.mcap"), topics=["/none"])
+    played = {endpoint for endpoint in endpoints_of(player) if endpoint[0] != "tracker/pose"}
+    assert played | set(endpoints_of(recorder)) == told({"session_player", "session_recorder"})
+
+
+def test_every_node_is_in_the_table_and_no_other():
+    named = {node for topic in TOPICS for node in (*topic.publishers, *topic.subscribers)}
+    assert named == set(NODES) | {"session_monitor"}
+    assert len({topic.name for topic in TOPICS}) == len(TOPICS)
