@@ -1,4 +1,4 @@
-"""The command `us-sim`: demo, run, render, play, bag info, calibrate, print-marker, evaluate."""
+"""The command `us-sim`: each of its commands, and how errors reach a person."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from us_sim import __version__
 from us_sim.command.calibrate import add_calibrate
 from us_sim.command.print_marker import add_print_marker
+from us_sim.command.reference import add_reference
 from us_sim.errors import UsSimError
 from us_sim.share import find_bag
 
@@ -109,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_calibrate(commands)
     add_print_marker(commands)
+    add_reference(commands)
 
     evaluate = commands.add_parser("evaluate", help="measure: CSV, pictures and a report")
     subjects = evaluate.add_subparsers(required=True, metavar="tissue|stability|slice|tracking")

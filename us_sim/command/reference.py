@@ -1,0 +1,225 @@
+"""The command `us-sim reference`: topics, node parameters and scene settings, as tables.
+
+`docs/reference.md` is what it prints in a plain installation. Packages that are installed beside
+this one and add solvers or trackers are in what it prints, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import UsSimError
+from us_sim.settings.registry import PROBES
+from us_sim.settings.setting import Settings, kinds_of, rules_of
+from us_sim.settings.spelling import unknown
+from us_sim.settings.tables import (
+    Section,
+    anchor,
+    default_text,
+    first_sentence,
+    sections_of,
+    table,
+    values,
+)
+
+__all__ = ["add_reference", "reference_page", "reference_sections"]
+
+INTRODUCTION = """\
+# Reference
+
+Every topic, every node parameter and every key of a scene, with its range and default. This page
+is made from the code: `us-sim reference --out docs/reference.md` writes it, and a test compares
+them. `us-sim reference tissue` prints a part of it: `topics`, a node's name, or a key of a scene.
+
+- [Topics](#topics)
+- [Node parameters](#node-parameters)
+- [Scene settings](#scene-settings)
+"""
+
+TOPICS_TEXT = """\
+Names are relative to the simulator's namespace. A message that comes from a pose carries that
+pose's stamp, so `now - stamp` is its age anywhere in the graph. Topics are published reliable, the
+last 10 kept; those marked latched are kept for subscribers that come later (transient local, the
+last 1). `probe_tracker` and `haptic_renderer` hear devices best effort, so their drivers may
+publish either way. History, depth and reliability are parameters, `qos_overrides.…`, of each.
+
+`session_recorder` subscribes to all topics that it is not told to leave out, and `session_player`
+publishes all topics of a recording. `session_monitor` is `us-sim` itself, which follows the nodes
+that it started."""
+
+PARAMETERS_TEXT = """\
+A parameter of a running node is set with `ros2 param set /tissue_deformer solver msds` where "while
+running" says yes; others are given at the start: `--ros-args -p name:=value`, or
+`us-sim run SCENE --param NODE.NAME=VALUE`. Values are in SI units (m, s, Pa, rad); `--param` takes
+units, too (`40 mm`). A parameter has no value for nothing: none is 0 for a number, and '' for a
+text. ROS 2's own commands need a decimal point in a number that may be a fraction (`6.0`)."""
+
+SCENE_TEXT = """\
+A scene is a YAML file. Only `name`, `volume` and `probe` must be there; what it does not name costs
+nothing. Numbers are in SI units (m, s, Pa, rad) or carry a unit (`40 mm`, `12 kPa`, `30 deg`).
+Relative files are looked up beside the scene's own file. `based_on: OTHER` takes everything from
+another scene, by file or name, that this one does not say.
+
+In this page a path of keys is written with dots: `tissue.mesh.nodes` is the key `nodes` in `mesh`
+in `tissue`; `NAME` stands for a name of your choice."""
+
+POSE = "A pose"
+
+
+def add_reference(commands: Any) -> None:
+    """Add the command to `us-sim`'s."""
+    parser = commands.add_parser(
+        "reference", help="topics, node parameters and scene settings, with ranges and defaults"
+    )
+    parser.add_argument(
+        "part", nargs="?", help="topics, a node, or a key of a scene such as tissue; default: all"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write to this Markdown file")
+    parser.set_defaults(command=_reference)
+
+
+def _reference(args: argparse.Namespace) -> int:
+    text = reference_page() if args.part is None else _part(args.part)
+    if args.out is None:
+        print(text, end="")
+    else:
+        args.out.write_text(text, encoding="utf-8")
+    return 0
+
+
+def reference_page() -> str:
+    """The whole page."""
+    return "\n".join([INTRODUCTION, *(_written(*each) for each in reference_sections())])
+
+
+def reference_sections() -> Iterator[tuple[int, Section]]:
+    """All sections in order, each with the level of its heading."""
+    yield 2, Section("topics", "Topics", f"{TOPICS_TEXT}\n\n{_topics()}")
+    yield 2, Section("parameters", "Node parameters", f"{PARAMETERS_TEXT}\n\n{_node_list()}")
+    yield from ((3, section) for section in _nodes())
+    yield 2, Section("scene", "Scene settings", SCENE_TEXT)
+    yield from ((3, section) for section in _scene_sections())
+
+
+def _part(name: str) -> str:
+    """Those sections that a person asks for by name.
+
+    Raises:
+        UsSimError: there are none of that name.
+    """
+    sections = list(reference_sections())
+    found = [
+        (level, section)
+        for level, section in sections
+        if section.path == name or section.path.startswith(f"{name}.")
+    ]
+    if not found:
+        known = dict.fromkeys(section.path.split(".")[0] for _, section in sections)
+        raise UsSimError(f"reference: {unknown(name, [key for key in known if key])}")
+    return "\n".join(_written(*each) for each in found)
+
+
+def _written(level: int, section: Section) -> str:
+    return f"{'#' * level} {section.title}\n\n{section.text}\n"
+
+
+def _topics() -> str:
+    from us_sim.nodes.settings import NODES
+    from us_sim.nodes.topics import TOPICS
+
+    lines = ["| topic | type | from | to | what it carries |", "| --- | --- | --- | --- | --- |"]
+    for topic in TOPICS:
+        sources = _names(topic.publishers)
+        if topic.from_drivers:
+            sources = f"a driver, {sources}" if sources else "a driver"
+        elif len(topic.publishers) > len(NODES) / 2:
+            silent = [node for node in NODES if node not in topic.publishers]
+            sources = f"every node but {_names(silent)}"
+        latched = " (latched)" if topic.latched else ""
+        lines.append(
+            f"| `{topic.name}` | {topic.type_name}{latched} | {sources} | "
+            f"{_names(topic.subscribers)} | {topic.description} |"
+        )
+    return "\n".join(lines)
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _node_list() -> str:
+    """A link to each node's parameters."""
+    from us_sim.nodes.settings import NODES
+
+    return "\n".join(f"- [{node}](#{anchor(node)})" for node in NODES)
+
+
+def _nodes() -> Iterator[Section]:
+    """The parameters of each node."""
+    from us_sim.nodes.settings import NODES, SceneNodeSettings
+    from us_sim.slicing.formation.imaging import Imaging
+
+    common = "Every node that works on a scene"
+    yield Section("scene_nodes", common, _parameters(SceneNodeSettings))
+    for node, settings in NODES.items():
+        text = []
+        if SceneNodeSettings in settings:
+            text.append(f"Those of [every node that works on a scene](#{anchor(common)}).")
+        for each in settings:
+            if each is Imaging:
+                text.append(
+                    f"The keys of [imaging](#imaging), and of the [probe](#probe) its "
+                    f"{_of_probe()}, while running. Their defaults are the scene's."
+                )
+            elif each is not SceneNodeSettings:
+                about = first_sentence(each)
+                text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
+        if node == "tissue_deformer":
+            text.append(
+                "`SOLVER.KEY` for every key of every solver, such as `fem_cg.iterations`, see "
+                "[tissue.settings](#tissuesettings), and `materials.LABEL.KEY` for every key of "
+                "every material, such as `materials.vein.young_modulus`, see "
+                "[tissue.materials](#tissuematerialsname), while running. Their defaults, and that "
+                "of `solver`, are the scene's."
+            )
+        yield Section(node, node, "\n\n".join(text))
+
+
+def _of_probe() -> str:
+    """What may be set of every kind of probe while images are made."""
+    from us_sim.nodes.settings import is_live
+
+    kinds = [PROBES.settings(name) for name in PROBES]
+    live = [{name for name in rules_of(kind) if is_live(kind, name)} for kind in kinds]
+    return _names(sorted(set.intersection(*live)))
+
+
+def _parameters(settings: type[Settings]) -> str:
+    """The parameters that settings are."""
+    from us_sim.nodes.settings import is_live
+
+    lines = [
+        "| parameter | value | default | while running | what it is |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    kinds = kinds_of(settings)
+    for name, rule in rules_of(settings).items():
+        live = "yes" if is_live(settings, name) else ""
+        lines.append(
+            f"| `{name}` | {values(kinds[name], rule)} | {default_text(settings, name)} | {live} | "
+            f"{rule.description} |"
+        )
+    return "\n".join(lines)
+
+
+def _scene_sections() -> Iterator[Section]:
+    """The keys of a scene."""
+    import us_sim.nodes  # noqa: F401 - provides rclpy, which sources of poses import
+    from us_sim.geometry.placement import Placement
+    from us_sim.scene.scene import Scene
+
+    yield from sections_of(Scene, "", {Placement: POSE})
+    yield Section("pose", POSE, f"{first_sentence(Placement)}\n\n{table(Placement)}")
