@@ -99,3 +99,12 @@ def test_the_readmes_node_moves_the_probe(tmp_path):
         bench.close()
     assert poses[0].header.frame_id == "patient"
     assert poses[0].pose.position.z == 0.005
+
+
+def test_modules_are_where_the_changelog_says_that_they_are_now():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    moved = re.findall(r"^\| `([a-z_.]+[a-z0-9_.]*)` \| `([a-z0-9_.]+)` \|$", text, re.MULTILINE)
+    assert len(moved) > 150
+    for was, now in moved:
+        assert (ROOT / "us_sim" / f"{now.replace('.', '/')}.py").is_file(), now
+        assert not (ROOT / "us_sim" / f"{was.replace('.', '/')}.py").is_file(), was
