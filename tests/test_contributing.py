@@ -134,8 +134,8 @@ def test_the_sources_test_holds(installed, bench):
 
 def test_the_lines_for_this_packages_registry_are_as_its_own_lines_are():
     registry = Path(importlib.import_module("us_sim.settings.registry").__file__).read_text()
-    solver, tracker = (code for code in blocks("python") if not code.startswith("# "))
-    assert solver.strip() == 'winkler="us_sim.tissue.solvers.winkler:Winkler",'
+    solver, tracker = (code.strip() for code in blocks("text"))
+    assert solver == 'winkler="us_sim.tissue.solvers.winkler:Winkler",'
     assert 'fem="us_sim.tissue.solvers.fem:Fem",' in registry
     assert tracker.startswith('udp=Option(f"{_INPUTS}.')
     assert 'pose=Option(f"{_INPUTS}.' in registry

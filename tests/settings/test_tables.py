@@ -55,7 +55,7 @@ def test_a_row_for_each_setting():
         "| `bottom` | [bottom](#tankbottom) | `flat` | below |",
         "| `plan` | file | none | drawn |",
         "| `light` | `on` or `off` | `on` |  |",
-        "| `hours` | whole number, 1 to 24 | 8 | only with `light` `on` |",
+        "| `hours` | whole number 1 to 24 | 8 | only with `light` `on` |",
     ]
 
 

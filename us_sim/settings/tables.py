@@ -101,7 +101,7 @@ def values(kind: Any, rule: Rule) -> str:
         return _names(names) if names else ("file" if rule.file else "text")
     if kind in (int, float):
         numbers = span(rule.quantity) if rule.quantity else "number"
-        return f"whole number, {numbers}" if kind is int else numbers
+        return f"whole number {numbers}" if kind is int else numbers
     if get_origin(kind) is tuple:
         return _list(get_args(kind), rule)
     if get_origin(kind) in (dict, Mapping):
