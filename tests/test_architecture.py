@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -27,6 +28,14 @@ def picture():
 
 def test_every_room_has_its_place(picture):
     assert set(picture.places()) == set(picture.rooms())
+
+
+def test_the_picture_shows_the_arrows_that_there_are(picture):
+    with Image.open(picture.PICTURE) as image:
+        assert image.text["Description"] == picture.described(), (
+            "docs/architecture.png is not of this code: draw it anew with "
+            "`python docs/architecture.py`"
+        )
 
 
 def test_no_arrow_leads_to_a_layer_above(picture):
