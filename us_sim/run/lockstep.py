@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.graph import (
@@ -50,6 +52,7 @@ def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Paramet
     return 0
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def render(
     scene: Scene,
     path: Path,
@@ -58,6 +61,8 @@ def render(
     parameters: Parameters | None = None,
 ) -> int:
     """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
+
+    BLAS is held to one thread: the sums of several differ in their last bits with their number.
 
     Args:
         progress: called with the images done and the poses there are.
