@@ -21,19 +21,18 @@ from numpy.typing import NDArray
 
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
-from us_sim.evaluation.tracking.cases import CAMERAS
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate, rotation_between
 from us_sim.recording.path import ProbePath
 from us_sim.scene.scene import Scene
 from us_sim.scene.tracker_building import camera_body_of, tracker_poses_of
 from us_sim.tracking.camera.info import write_camera_info
-from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
+from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 __all__ = ["CAMERA", "PathVideo", "path_video", "video_poses"]
 
-CAMERA = CAMERAS["640x480"]
+CAMERA = WEBCAMS["640x480"]
 RATE = 30.0
 """Images per second."""
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from us_sim.command.main import main
+from us_sim.evaluation.block import LARGEST_MESH, MESHES
 from us_sim.evaluation.slice import measure as evaluation
 from us_sim.evaluation.slice import report as slice_report
 from us_sim.evaluation.slice import targets as slice_targets
@@ -26,15 +27,15 @@ from us_sim.evaluation.slice.cases import (
     dented,
     speckle,
 )
-from us_sim.evaluation.slice.contenders import Contender
 from us_sim.evaluation.slice.memory import peak_memory
+from us_sim.evaluation.slice.methods import SLICING_METHODS, Contender
 from us_sim.evaluation.slice.points import Point, Timing, compare, timed_together
 from us_sim.evaluation.slice.publishing import publishing_ms
 from us_sim.evaluation.slice.reference import exact_slice, sampled, voxel_distance
 from us_sim.evaluation.slice.targets import targets
 from us_sim.evaluation.slice.vtk_images import VtkSlicer
-from us_sim.evaluation.tissue.cases import LARGEST_MESH, MESHES
-from us_sim.slicing.cutting.slicer import METHODS
+from us_sim.settings.choice import Option
+from us_sim.settings.registry import SLICERS
 from us_sim.volume.volume import Volume
 
 COLUMNS = (
@@ -139,6 +140,11 @@ def test_black_and_white_shows_where_an_image_really_comes_from(block):
     assert errors.max_voxel_error == pytest.approx(0.1, abs=0.01)
 
 
+def test_the_evaluated_methods_are_those_of_the_package_and_vtk():
+    built_in = {name for name, option in SLICERS.options.items() if option.package is None}
+    assert set(SLICING_METHODS) == {*built_in, "vtk"}
+
+
 def test_methods_take_turns():
     order = []
 
@@ -227,9 +233,9 @@ def test_rows_plots_and_report_are_written(tmp_path, capsys):
         head, *rows = csv.reader(file)
     assert ",".join(head).startswith(COLUMNS)
     found = [dict(zip(head, row, strict=True)) for row in rows]
-    assert {row["method"] for row in found} == {*METHODS, "vtk"}
+    assert {row["method"] for row in found} == set(SLICING_METHODS)
     for row in found:
-        if row["method"] in METHODS:
+        if row["method"] in SLICERS.names:
             assert row["coverage_mismatch_px"] == "0"
             assert float(row["max_grey_difference"]) <= 1
             assert float(row["max_voxel_error"]) < 0.1
@@ -256,7 +262,7 @@ def test_without_vtk_the_rest_is_measured_and_it_is_said(monkeypatch, tmp_path, 
 
 @pytest.mark.usefixtures("small")
 def test_a_method_that_fails_says_so_and_leaves_the_others(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(METHODS, "per_pixel", "us_sim.slicing.nothing:Nothing")
+    monkeypatch.setitem(SLICERS.options, "per_pixel", Option("us_sim.slicing.nothing:Nothing"))
     assert main(["evaluate", "slice", "--quick", "--out", str(tmp_path)]) == 1
     assert "failed: per_pixel on 48 px, 150 nodes: ModuleNotFoundError" in capsys.readouterr().out
     with (tmp_path / "slice.csv").open(encoding="utf-8") as file:

@@ -9,14 +9,19 @@ import pytest
 
 import us_sim
 from us_sim.command.main import main
+from us_sim.errors import SettingsError
+from us_sim.evaluation.block import LARGEST_MESH, MESHES
+from us_sim.evaluation.power_law import exponent
 from us_sim.evaluation.tissue import kept_reference
 from us_sim.evaluation.tissue import measure as tissue
-from us_sim.evaluation.tissue.cases import LARGEST_MESH, LOCKING, MESHES, SCENES
+from us_sim.evaluation.tissue.cases import LOCKING, SCENES
 from us_sim.evaluation.tissue.measure import Trial, evaluate_tissue, plan
-from us_sim.evaluation.tissue.plots import exponent
-from us_sim.evaluation.tissue.points import Outcome, Point, compare, held_memory, volumes
+from us_sim.evaluation.tissue.points import Outcome, Point, compare, held_memory
 from us_sim.evaluation.tissue.report import pareto_front
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.settings.registry import SOLVERS
+from us_sim.settings.setting import rules_of
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.solvers.solver import create_solver
 
 COLUMNS = (
@@ -36,7 +41,7 @@ def test_errors_of_a_known_field_are_what_they_are_by_hand():
     exact = Outcome(nodes * [0, 0, -0.1], -4.0, 0.0018)
     wrong = nodes * [0, 0, -0.1]
     wrong[7] += [0.003, 0.0, 0.004]
-    found = Outcome(wrong, -5.0, float(volumes(model, nodes * [1, 1, 1.2]).sum()))
+    found = Outcome(wrong, -5.0, signed_volumes(nodes * [1, 1, 1.2], model.mesh.tetrahedra).sum())
     errors = compare(found, exact, 0.002)
     assert errors.rel_l2_error == pytest.approx(0.005 / np.linalg.norm(0.1 * nodes[:, 2]))
     assert errors.max_error_mm == pytest.approx(5.0)
@@ -50,9 +55,9 @@ def test_the_front_leaves_out_what_is_slower_and_worse():
 
 
 def test_the_exponent_of_a_power_law_is_found():
-    points = [point(0.001 * n**1.3, 0.1, n) for n in (2000, 8192, 65536)]
-    assert exponent(points, lambda p: p.ms_median) == pytest.approx(1.3)
-    assert np.isnan(exponent(points[:1], lambda p: p.ms_median))
+    costs = {n: 0.001 * n**1.3 for n in (2000, 8192, 65536)}
+    assert exponent(costs | {70000: float("nan"), 80000: 0.0}) == pytest.approx(1.3)
+    assert np.isnan(exponent({2000: 1.0}))
 
 
 def test_memory_counts_every_array_once():
@@ -66,15 +71,28 @@ def test_memory_counts_every_array_once():
     assert held_memory(solver) == held + 8000
 
 
+def test_the_evaluated_methods_are_those_of_the_package():
+    built_in = {name for name, option in SOLVERS.options.items() if option.package is None}
+    assert set(TISSUE_METHODS) == built_in
+    for name, method in TISSUE_METHODS.items():
+        settings = rules_of(SOLVERS.settings(name))
+        for setting in (*method.tried, method.patient or {}):
+            assert set(setting) <= set(settings)
+        assert method.has_springs == ("stiffness" in settings)
+        assert method.is_explicit == ("stabilisation" in settings)
+    with pytest.raises(SettingsError, match="did you mean 'fem_nonlinear'"):
+        TISSUE_METHODS["fem_nonlinaer"]
+
+
 def test_the_full_plan_has_every_method_on_every_mesh_and_scene():
     trials = plan(quick=False)
-    for method in SOLVERS:
+    for method in TISSUE_METHODS:
         combinations = {(t.scene.name, t.counts) for t in trials if t.method == method}
         ordinary = set(SCENES) - set(LOCKING[1:])
         assert combinations >= {(scene, mesh) for scene in ordinary for mesh in MESHES}
         assert combinations >= {(scene, MESHES[-1]) for scene in LOCKING}
         assert {scene for scene, mesh in combinations if mesh == LARGEST_MESH} == {"press_25mm"}
-    assert {t.method for t in plan(quick=True)} == set(SOLVERS)
+    assert {t.method for t in plan(quick=True)} == set(TISSUE_METHODS)
 
 
 @pytest.fixture
@@ -115,7 +133,7 @@ def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys
     for name in pictures:
         assert (small / name).read_bytes().startswith(b"\x89PNG")
         assert name in said
-    assert "iterations is -1" in text
+    assert "iterations: -1 is outside" in text
 
     # A second run takes the reference from the cache.
     monkeypatch.setattr(kept_reference, "solve_contact", None)
@@ -141,7 +159,7 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("subject", ["tissue", "stability", "slice"])
+@pytest.mark.parametrize("subject", ["tissue", "stability", "slice", "tracking"])
 def test_a_report_is_not_overwritten(subject, tmp_path, capsys):
     report = tmp_path / f"{subject}.md"
     report.write_text("measured for hours", encoding="utf-8")

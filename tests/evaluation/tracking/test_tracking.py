@@ -8,10 +8,11 @@ import pytest
 from us_sim.command.main import main
 from us_sim.evaluation.tracking import measure as tracking
 from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case, marker
-from us_sim.evaluation.tracking.filters import delay, filter_points
-from us_sim.evaluation.tracking.points import COLUMNS, Bench, Point, View, mirrored, visible
+from us_sim.evaluation.tracking.filters import FILTER_METHODS, delay, filter_point, filter_trials
+from us_sim.evaluation.tracking.points import Bench, Point, View, mirrored, visible
 from us_sim.evaluation.tracking.targets import targets
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import FILTERS
 from us_sim.tracking.camera.body_pose import rotation_angle
 
 ASKED = [
@@ -70,15 +71,13 @@ def test_a_hand_over_a_single_marker_makes_it_be_missed_and_nothing_worse(bench)
     assert len(point.views) == 10
     assert len(point.found) < 10
     assert point.flipped == 0
-    assert np.isnan(point.row[COLUMNS.index("pose_cpu_ms")]) == (not point.found)
+    assert np.isnan(point.values["pose_cpu_ms"]) == (not point.found)
 
 
 def test_percentiles_are_of_what_was_found_and_shares_of_all():
     views = [View(True, 5.0, 4.0)]
     views += [View(False, 3.0, 2.0, True, i == 9, float(i), 0.1 * i, 1) for i in range(11)]
-    row = dict(
-        zip(COLUMNS, Point(Case(SINGLE, "640x480", 0.4, 0.0), tuple(views)).row, strict=True)
-    )
+    row = Point(Case(SINGLE, "640x480", 0.4, 0.0), tuple(views)).values
     assert (row["views"], row["detected"], row["flipped"]) == (12, 11, 1)
     assert (row["median_mm"], row["p95_mm"], row["median_deg"]) == (5.0, 9.5, 0.5)
     assert (row["ms_median"], row["ms_first"], row["cpu_ms_median"]) == (3.0, 5.0, 2.0)
@@ -105,7 +104,9 @@ def test_the_delay_of_a_delayed_path_is_found(lag):
 
 
 def test_filters_trade_lag_for_jitter():
-    points = filter_points(quick=True)
+    assert {method for method, *_ in filter_trials(quick=False)} == set(FILTER_METHODS)
+    assert set(FILTER_METHODS) == set(FILTERS)
+    points = [filter_point(*trial) for trial in filter_trials(quick=True)]
     none = next(p for p in points if p.method == "none")
     assert none.lag == pytest.approx(0.0, abs=5e-4)
     assert none.jitter == pytest.approx(np.sqrt(3) * 3e-4, rel=0.05)  # the noise itself
@@ -148,4 +149,4 @@ def test_a_case_that_breaks_is_a_row_that_says_so(monkeypatch):
 
     monkeypatch.setattr(Bench, "point", broken)
     point = tracking._point(Bench(), Case(SINGLE, "640x480", 0.4, 0.0), True)
-    assert point.row[-1] == "ValueError: no room"
+    assert point.cells[-1] == "ValueError: no room"

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from tissue_block import block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.evaluation.stability.independent_residual import IndependentResidual, neo_hookean_forces
+from us_sim.evaluation.independent_residual import IndependentResidual, neo_hookean_forces
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose

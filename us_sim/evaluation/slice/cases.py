@@ -15,17 +15,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from us_sim.evaluation.tissue.cases import LARGEST_MESH, MESHES
+from us_sim.evaluation.block import EXTENT, LARGEST_MESH, MESHES, block
+from us_sim.evaluation.named import Named
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
 __all__ = [
@@ -42,13 +42,12 @@ __all__ = [
 ]
 
 SIZES = (256, 512, 1024)  # columns, and rows, of an image
-DEPTHS = {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03}
+DEPTHS = Named("deformation", {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03})
 """m, by which the block is pressed."""
 
-_EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
 _BEYOND = 5e-3  # m of volume around the block, which does not deform
 _VOXEL = 0.4e-3  # m
-_WIDTH = 0.022  # m, of the dent: its standard deviation
+_WIDTH = 0.022  # m, standard deviation of the dent
 _BULGE = 0.25  # of the dent's depth, by which tissue under it is pushed aside
 _APERTURE, _DEPTH = 0.06, 0.08  # m, of the image
 _LAYERS = (0.008, 0.02, 0.035, 0.05, 0.07, 0.09)  # m below the skin
@@ -57,7 +56,7 @@ _TREMOR = 0.2e-3  # m, of the probe from one image to the next
 
 @dataclass(frozen=True)
 class _View:
-    """How the image lies to the probe's path: where it begins, and how it is turned."""
+    """Where the image lies and how it is turned, seen from where the probe stands."""
 
     words: str
     turned: float = 0.0  # degrees about the probe's axis
@@ -66,12 +65,19 @@ class _View:
     on_faces: bool = False  # moved onto a layer of the mesh's faces
 
 
-PLANES = {
-    "straight": _View("in the probe's plane"),
-    "oblique": _View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
-    "corner": _View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
-    "faces": _View("along a layer of faces", on_faces=True),
-}
+PLANES = Named(
+    "plane",
+    {
+        "straight": _View("in the probe's plane"),
+        "oblique": _View(
+            "turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)
+        ),
+        "corner": _View(
+            "turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)
+        ),
+        "faces": _View("along a layer of faces", on_faces=True),
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -99,10 +105,10 @@ class Case:
 
     def mesh(self) -> TetrahedralMesh:
         """The block at rest."""
-        return _block(self.counts)
+        return block(self.counts)
 
     def frames(self, count: int) -> list[Frame]:
-        """Images of a trembling probe, so that none is a repetition of the one before."""
+        """Images of a trembling probe, so that none repeats the one before."""
         rest = self.mesh().nodes
         depth, view = DEPTHS[self.deformation], PLANES[self.plane]
         found = []
@@ -121,7 +127,8 @@ class Case:
         return found
 
 
-MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")  # the case by which methods are compared
+MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")
+"""The case by which methods are compared."""
 
 
 def cases(quick: bool) -> list[Case]:
@@ -158,7 +165,7 @@ def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
     A smooth field, so that nothing depends on a solver: down under a Gaussian dent that ends at
     the bottom, and aside halfway down.
     """
-    height = _EXTENT[2][1]
+    height = EXTENT[2][1]
     below = nodes[:, 2:] / height
     dent = np.exp(-(nodes[:, :2] ** 2).sum(axis=1, keepdims=True) / (2.0 * _WIDTH**2))
     aside = _BULGE * depth / _WIDTH * nodes[:, :2] * 4.0 * below * (1.0 - below) ** 2
@@ -198,10 +205,10 @@ def black_and_white(seed: int = 1) -> Volume:
 
 def _voxel_axes() -> list[NDArray[np.float64]]:
     """m, the centres of the voxels along x, y and z."""
-    counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in _EXTENT)
+    counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in EXTENT)
     return [
         np.asarray(low - _BEYOND + _VOXEL * (np.arange(count) + 0.5))
-        for (low, _), count in zip(_EXTENT, counts, strict=True)
+        for (low, _), count in zip(EXTENT, counts, strict=True)
     ]
 
 
@@ -209,12 +216,6 @@ def _placed(voxels: NDArray[np.uint8]) -> Volume:
     placed = np.diag([_VOXEL, _VOXEL, _VOXEL, 1.0])
     placed[:3, 3] = [axis[0] for axis in _voxel_axes()]
     return Volume(voxels, placed)
-
-
-@cache
-def _block(counts: tuple[int, int, int]) -> TetrahedralMesh:
-    planes = (uniform_planes(*side, count) for side, count in zip(_EXTENT, counts, strict=True))
-    return box_mesh(*planes)
 
 
 def _turn(about_z: float, about_x: float) -> NDArray[np.float64]:

@@ -7,8 +7,6 @@ where it is installed.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,28 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.report_folder import prepare_folder, write_rows
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures, words_of
 from us_sim.evaluation.slice.cases import MAIN, Case, black_and_white, cases, speckle
-from us_sim.evaluation.slice.contenders import Contender, contender, methods
 from us_sim.evaluation.slice.costs import costs
 from us_sim.evaluation.slice.memory import peak_memory
+from us_sim.evaluation.slice.methods import Contender, contender, methods
 from us_sim.evaluation.slice.pictures import draw_differences
-from us_sim.evaluation.slice.points import COLUMNS, Point, compare, timed_together
+from us_sim.evaluation.slice.points import Point, compare, timed_together
 from us_sim.evaluation.slice.publishing import publishing_ms
 from us_sim.evaluation.slice.recorded_frames import RecordedComparison, compare_with_recorded
 from us_sim.evaluation.slice.reference import exact_slice, sampled
 from us_sim.evaluation.slice.report import Surroundings, table, write_report
 from us_sim.evaluation.slice.targets import LARGE_VOLUME
 from us_sim.evaluation.slice.vtk_images import HOW_TO_GET, is_installed
+from us_sim.evaluation.steps import steps
 from us_sim.progress import Progress
 
 __all__ = ["evaluate_slice"]
 
-# Threads that each method is given.
-_THREADS = {"scan_conversion": (1, 2), "row_subdivision": (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
-_FRAMES = 4  # that a case's images go through
-# s, of timing the main case and another.
-_SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)
+_FRAMES = 4  # images that a case's are taken from, in turns
+_SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)  # s, of timing the main case, and another
 
 
 def evaluate_slice(
@@ -59,22 +56,20 @@ def evaluate_slice(
         UsSimError: the folder cannot be written or holds a report, one of the two files is given
             without the other, or cannot be read.
     """
-    begin = time.perf_counter()
-    prepare_folder(out, "slice.md")
+    folder = ReportFolder("slice", out, quick)
     recorded = _recorded(volume_file, sweep_file, out, quick)
     bench = _Bench(quick)
-    planned = cases(quick)
-    points: list[Point] = []
-    with Progress("slices", len(planned), "cases") as progress:
-        for done, case in enumerate(planned):
-            progress.update(done, case.name)
-            points += bench.points(case)
-        progress.update(len(planned))
-    write_rows(out / "slice.csv", COLUMNS, [point.row for point in points])
+    points = [
+        point
+        for case in steps("slices", cases(quick), "cases", lambda case: case.name)
+        for point in bench.points(case)
+    ]
+    folder.write_rows("slice", points)
     with Progress("around the slices", 4, "parts") as progress:
         progress.update(0, "picture of differences")
-        differences = out / "slice_differences.png"
-        draw_differences(bench.volume, _working(points), differences)
+        failed = {point.method for point in points if point.failure}
+        working = [method.name for method in methods() if method.name not in failed]
+        draw_differences(bench.volume, working, folder.picture("differences"))
         progress.update(1, "probes and image formation")
         probes, settings = costs(bench.volume, quick)
         progress.update(2, "publishing")
@@ -83,16 +78,10 @@ def evaluate_slice(
         memory = peak_memory(LARGE_VOLUME)
         progress.update(4)
     around = Surroundings(probes, settings, publishing, memory, recorded)
-    seconds = time.perf_counter() - begin
-    pictures = [*write_report(out, points, around, quick, seconds), differences]
-    print(table(points))
+    write_report(folder, points, around)
     if not is_installed():
         print(HOW_TO_GET)
-    print(f"Report: {out / 'slice.md'}; pictures: {', '.join(map(str, pictures))}")
-    failed = [point for point in points if point.failure]
-    for point in failed:
-        print(f"failed: {point.method} on {point.size} px, {point.nodes} nodes: {point.failure}")
-    return 1 if failed else 0
+    return folder.finish(table(points), failures(points))
 
 
 def _recorded(
@@ -117,14 +106,8 @@ def _recorded(
     return found
 
 
-def _working(points: Sequence[Point]) -> list[str]:
-    """The methods that did not fail."""
-    failed = {point.method for point in points if point.failure}
-    return [method for method in methods() if method not in failed]
-
-
 class _Bench:
-    """Cuts cases with every method; keeps what they share."""
+    """Cuts cases with every method; keeps the volumes that they cut."""
 
     def __init__(self, quick: bool) -> None:
         self.volume = speckle()
@@ -140,9 +123,9 @@ class _Bench:
         seen: dict[str, NDArray[np.uint8]] = {}
         contenders: list[Contender] = []
         points: dict[tuple[str, int], Point] = {}
-        for method, threads in ((m, n) for m in methods() for n in _THREADS[m]):
+        for method, threads in ((m, n) for m in methods() for n in m.threads):
             point = Point(
-                method,
+                method.name,
                 case.size,
                 len(mesh.nodes),
                 len(mesh.tetrahedra),
@@ -151,22 +134,21 @@ class _Bench:
                 plane=case.plane,
             )
             try:
-                ready = contender(self.volume, case, method, threads)
-                if method not in seen:
-                    other = contender(self._contrast, case, method, threads)
-                    seen[method] = other.image(first)
+                ready = contender(self.volume, case, method.name, threads)
+                if method.name not in seen:
+                    other = contender(self._contrast, case, method.name, threads)
+                    seen[method.name] = other.image(first)
                 errors = compare(
                     *(self.volume, first, exact, ready.image(first)),
                     ready.rest_coordinates(first),
-                    (shown, seen[method]),
-                    tissue_only=method == "vtk",
+                    (shown, seen[method.name]),
+                    tissue_only=method.tissue_only,
                 )
             # Whatever breaks in one method must not take the others' results along.
             except Exception as error:
-                words = f"{type(error).__name__}: {error}".replace("\n", " ")
-                points[method, threads] = replace(point, failure=words)
+                points[method.name, threads] = replace(point, failure=words_of(error))
                 continue
-            points[method, threads] = replace(point, **errors._asdict())
+            points[method.name, threads] = replace(point, **errors._asdict())
             contenders.append(ready)
         times = timed_together(contenders, frames, self._seconds[case != MAIN])
         for ready, timing in zip(contenders, times, strict=True):

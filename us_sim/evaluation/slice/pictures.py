@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from us_sim.evaluation.figure import new_figure, save
 from us_sim.evaluation.slice.cases import MAIN, PLANES, Case
-from us_sim.evaluation.slice.contenders import contender
+from us_sim.evaluation.slice.methods import SLICING_METHODS, contender
 from us_sim.evaluation.slice.points import wrong_pixels
 from us_sim.evaluation.slice.reference import ExactSlice, exact_slice, voxel_distance
 from us_sim.volume.volume import Volume
@@ -25,7 +24,7 @@ SHOWN = (
     replace(MAIN, deformation="pressed_30mm", plane="oblique"),
     replace(MAIN, deformation="pressed_30mm", plane="corner"),
 )
-"""What the picture has, a row each."""
+"""The cases that the picture has, a row each."""
 _LEAST, _MOST = 1e-13, 1e-2  # voxels, at the ends of the colours
 _RIGHT = 1e-14  # voxels, drawn for what is exact to the last bit
 _WRONG = "#00e5ff"
@@ -42,8 +41,12 @@ class _Result:
 def draw_differences(volume: Volume, methods: Sequence[str], file: Path) -> None:
     """A row a case: the image, then for every method how far each pixel is from its true place."""
     columns = 1 + len(methods)
-    figure = Figure(figsize=(2.7 * columns + 0.9, 3.75 * len(SHOWN) + 0.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(
+        2.7 * columns + 0.9,
+        3.75 * len(SHOWN) + 0.5,
+        "What is cut, and where each pixel's tissue is taken from (grey: nothing there; "
+        "cyan: wrong coverage)",
+    )
     axes = figure.subplots(len(SHOWN), columns, squeeze=False)
     norm = LogNorm(_LEAST, _MOST, clip=True)
     colours = None
@@ -72,19 +75,13 @@ def draw_differences(volume: Volume, methods: Sequence[str], file: Path) -> None
     if colours is not None:
         bar = figure.colorbar(colours, ax=axes[:, 1:], shrink=0.6, pad=0.01)
         bar.set_label("distance from the true place at rest, voxels", fontsize=9)
-    figure.suptitle(
-        "What is cut, and where each pixel's tissue is taken from (grey: nothing there; "
-        "cyan: wrong coverage)",
-        fontsize=12,
-        x=0.01,
-        ha="left",
-    )
-    figure.savefig(file, dpi=100)
+    save(figure, file)
 
 
 def _result(volume: Volume, case: Case, method: str, exact: ExactSlice) -> _Result:
     frame = case.frames(1)[0]
     rest = contender(volume, case, method, 1).rest_coordinates(frame)
-    right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only=method == "vtk")
+    tissue_only = SLICING_METHODS[method].tissue_only
+    right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
     distance = np.where(right, voxel_distance(volume, rest, expected), np.nan)
     return _Result(distance, wrong)

@@ -11,19 +11,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.row import Row, not_a_column
 from us_sim.evaluation.run_times import RunTimes
 from us_sim.evaluation.slice.cases import Frame
-from us_sim.evaluation.slice.contenders import Contender
+from us_sim.evaluation.slice.methods import Contender
 from us_sim.evaluation.slice.reference import ExactSlice, voxel_distance
 from us_sim.volume.volume import Volume
 
-__all__ = ["COLUMNS", "Errors", "Point", "Timing", "compare", "timed_together", "wrong_pixels"]
+__all__ = ["Errors", "Point", "Timing", "compare", "timed_together", "wrong_pixels"]
 
 _AGAIN = 5  # images in a turn of a method that takes less than _SHORT
 _SHORT = 8.0  # ms
@@ -44,7 +45,7 @@ class Errors(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Point:
+class Point(Row):
     """A row of slice.csv, and what the report says beyond it."""
 
     method: str
@@ -64,17 +65,12 @@ class Point:
     filter_ms: float = float("nan")  # of VTK: finding pixels, processor time
     sampling_ms: float = float("nan")  # of VTK: sampling, processor time
     images: int = 0  # that were timed
-    failure: str = field(default="", metadata={"column": False})
+    failure: str = not_a_column("")
 
     @property
-    def row(self) -> list[str]:
-        """As in the file."""
-        values = (getattr(self, name) for name in COLUMNS)
-        return [_cell(value) for value in values]
-
-
-COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
-"""Of slice.csv, in order."""
+    def title(self) -> str:
+        """The method and what it cut."""
+        return f"{self.method} on {self.size} px, {self.nodes} nodes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +185,3 @@ def wrong_pixels(
     # Tissue that hardly moved is where the rigid volume is, and shows the same.
     right = known & seen & ~(moved & ~seen_moved) & (exact.tissue | ~seen_moved)
     return right, (known | seen) & ~right, expected
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return "" if np.isnan(value) else f"{value:.4g}"
-    return str(value)

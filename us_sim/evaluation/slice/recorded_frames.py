@@ -2,20 +2,21 @@
 
 A freehand sweep was compounded to a volume; cutting that volume along the sweep's own poses must
 give back its images, but for what compounding blurred. This puts to the test, on real data, the
-whole way from a pose to an image: the probe's geometry, the frames and their units, the slicer.
+whole path from a pose to an image: the probe's geometry, the frames and their units, the slicer.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.markdown_table import markdown_table
+from us_sim.evaluation.report_folder import write_rows
 from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP, RecordedFan
 from us_sim.evaluation.slice.recorded_pairs import (
     LARGEST_SHIFT,
@@ -33,9 +34,9 @@ from us_sim.volume.sweep import read_sweep
 __all__ = ["RecordedComparison", "compare_with_recorded"]
 
 _ATTRIBUTION = "Data: ImFusion GmbH, CC BY 4.0"
-_ASKED = 0.8
-_SHOWN = 6
-_QUICK = 10  # every so many frames
+_ASKED = 0.8  # normalised cross-correlation
+_SHOWN = 6  # frames in the picture
+_QUICK = 10  # every so many frames are compared in a quick run
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class RecordedComparison:
             for name in ("raw", "smoothed", "mirrored")
         )
         lateral, elevation, axial = 1e3 * np.abs(self.shifts).max(axis=0)
-        lines = [
+        parts = [
             f"{len(self.rows)} recorded frames beside the volume cut at their poses: a curved "
             f"array of {1e3 * probe.radius:.1f} mm radius, "
             f"{math.degrees(probe.opening_angle):.1f}° and {1e3 * probe.depth:.0f} mm depth, "
@@ -69,19 +70,27 @@ class RecordedComparison:
             f"They are compared in the fan, {1e3 * MARGIN:g} mm or more inside what the sweep "
             f"covers ({100 * self._coverage:.0f} % of the fan). {self.left_out} frames had no "
             f"usable pose.",
-            "",
-            "| normalised cross-correlation with | lowest | median | highest | at least 0.8 |",
-            "| --- | --- | --- | --- | --- |",
-            *(
-                f"| {words} | {values.min():.3f} | {np.median(values):.3f} | {values.max():.3f} | "
-                f"{(values >= _ASKED).sum()} of {len(values)} |"
-                for words, values in (
-                    ("the frame as recorded", raw),
-                    (f"the frame smoothed by {1e3 * RESOLUTION:g} mm, as the volume is", smoothed),
-                    ("the smoothed frame, left and right swapped", mirrored),
-                )
+            markdown_table(
+                (
+                    "normalised cross-correlation with",
+                    "lowest",
+                    "median",
+                    "highest",
+                    "at least 0.8",
+                ),
+                [
+                    (
+                        words,
+                        *(f"{x:.3f}" for x in (values.min(), np.median(values), values.max())),
+                        f"{(values >= _ASKED).sum()} of {len(values)}",
+                    )
+                    for words, values in (
+                        ("the frame as recorded", raw),
+                        (f"it, smoothed by {1e3 * RESOLUTION:g} mm, as the volume is", smoothed),
+                        ("the smoothed frame, left and right swapped", mirrored),
+                    )
+                ],
             ),
-            "",
             "The volume is the mean of these very frames: this shows that poses, geometry and "
             "sampling are right, not how well an unseen image would be foretold. Tissue at rest "
             "and the volume without tissue differ by "
@@ -92,7 +101,7 @@ class RecordedComparison:
             f"and {elevation:.1f} mm across the image. "
             f"{_ATTRIBUTION}.",
         ]
-        return "\n".join(lines)
+        return "\n\n".join(parts)
 
     @property
     def _coverage(self) -> float:
@@ -133,17 +142,7 @@ def compare_with_recorded(
             shifts.append(frames.best_shift(pair))
     out.mkdir(parents=True, exist_ok=True)
     table, picture = out / "recorded_frames.csv", out / "recorded_frames.png"
-    _write(table, rows)
+    write_rows(table, rows)
     draw_recorded(rows, pairs, frames.probe, _ATTRIBUTION, picture)
     left_out = sum(sweep.left_out.values())
     return RecordedComparison(rows, np.array(shifts), left_out, frames.probe, (table, picture))
-
-
-def _write(file: Path, rows: Sequence[RecordedFrame]) -> None:
-    with file.open("w", newline="", encoding="utf-8") as table:
-        writer = csv.writer(table, lineterminator="\n")
-        writer.writerow(entry.name for entry in fields(RecordedFrame))
-        for row in rows:
-            writer.writerow(
-                f"{value:.6g}" if isinstance(value, float) else value for value in astuple(row)
-            )

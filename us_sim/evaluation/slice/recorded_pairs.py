@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.evaluation.row import Row
 from us_sim.evaluation.slice.recorded_fan import RecordedFan
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
@@ -40,10 +41,11 @@ __all__ = [
 ]
 
 RESOLUTION = 1e-3
-"""m, standard deviation of what smooths a frame to its volume's resolution."""
+"""m, standard deviation of the Gaussian that smooths a frame to its volume's resolution."""
 
 MARGIN = 2e-3
-"""m, from the border of what the sweep covered, where few frames were averaged: not compared."""
+"""m, from the border of what the sweep covered; nearer, few frames were averaged, so that pixels
+are not compared."""
 
 SHIFT_STEP = 0.63e-3
 """m, between the shifts that are tried; about two pixels of the liver sweep."""
@@ -51,17 +53,19 @@ SHIFT_STEP = 0.63e-3
 LARGEST_SHIFT = 3 * SHIFT_STEP
 
 _SHIFTS = SHIFT_STEP * np.arange(-3, 4)
-_COARSE = 5e-3  # m, standard deviation of what is taken away where only structures shall count
+_COARSE = 5e-3  # m, standard deviation of the Gaussian that leaves no structures
 _MESH = (24, 20, 16)  # nodes along each axis of the tissue around the volume
 
 
 @dataclass(frozen=True)
-class RecordedFrame:
+class RecordedFrame(Row):
     """How like a recorded frame its simulated image is; a row of recorded_frames.csv."""
+
+    digits = 6
 
     frame: int
     time: float  # s
-    coverage: float  # part of the fan in which the two are compared
+    coverage: float  # fraction of the fan in which the two are compared
     ncc_raw: float  # normalised cross-correlation with the frame as it was recorded
     ncc_smoothed: float  # with the frame smoothed to the volume's resolution
     ncc_mirrored: float  # smoothed, left and right swapped: what a wrong image reaches

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from us_sim.evaluation.slice.recorded_pairs import RecordedFrame, RecordedPair
 from us_sim.slicing.probe.probe import Probe
-
-if TYPE_CHECKING:
-    from us_sim.evaluation.slice.recorded_pairs import RecordedFrame, RecordedPair
 
 __all__ = ["draw_recorded"]
 

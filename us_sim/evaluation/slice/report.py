@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from us_sim.evaluation.machine import machine
 from us_sim.evaluation.markdown_table import markdown_table
+from us_sim.evaluation.power_law import exponent
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
 from us_sim.evaluation.slice.cases import DEPTHS, MAIN, PLANES
 from us_sim.evaluation.slice.costs import Cost
 from us_sim.evaluation.slice.plots import plot_errors, plot_meshes, plot_pixels
 from us_sim.evaluation.slice.points import Point
 from us_sim.evaluation.slice.recorded_frames import RecordedComparison
-from us_sim.evaluation.slice.targets import (
-    exponent,
-    main_points,
-    mesh_points,
-    size_points,
-    targets,
-)
+from us_sim.evaluation.slice.targets import main_points, mesh_points, size_points, targets
 from us_sim.evaluation.slice.vtk_images import HOW_TO_GET
+from us_sim.evaluation.target import target_table
 
 __all__ = ["Surroundings", "table", "write_report"]
 
@@ -43,54 +39,28 @@ def table(points: Sequence[Point]) -> str:
     return markdown_table(*_summary(points))
 
 
-def write_report(
-    out: Path,
-    points: Sequence[Point],
-    around: Surroundings,
-    quick: bool,
-    seconds: float,
-) -> list[Path]:
-    """Write slice.md and its plots; returns the plots' files.
-
-    Args:
-        out: folder.
-        points: all rows.
-        around: what was measured besides.
-        quick: whether it was the short run.
-        seconds: that the run took.
-    """
+def write_report(folder: ReportFolder, points: Sequence[Point], around: Surroundings) -> None:
+    """Draw the plots and write slice.md."""
     in_sizes = size_points(points)
-    on_meshes = mesh_points(points)
     panels = {
         f"{size} × {size}": [p for p in in_sizes if p.size == size]
         for size in sorted({p.size for p in in_sizes})
     }
-    files = [out / f"slice_{name}.png" for name in ("error", "meshes", "pixels")]
-    if points and panels:
-        plot_errors(panels, files[0])
-        plot_meshes(on_meshes, f"{MAIN.size} × {MAIN.size}, pressed by 12 mm", files[1])
-        plot_pixels(in_sizes, f"{_nodes()} nodes, pressed by 12 mm", files[2])
-    else:
-        files = []
-    text = _text(points, around, quick, seconds)
-    (out / "slice.md").write_text(text, encoding="utf-8")
-    return files
+    if panels:
+        plot_errors(panels, folder.picture("error"))
+        title = f"{MAIN.size} × {MAIN.size}, pressed by 12 mm"
+        plot_meshes(mesh_points(points), title, folder.picture("meshes"))
+        plot_pixels(in_sizes, f"{_nodes()} nodes, pressed by 12 mm", folder.picture("pixels"))
+    folder.write_report(_parts(folder, points, around), failures(points))
 
 
-def _text(
-    points: Sequence[Point],
-    around: Surroundings,
-    quick: bool,
-    seconds: float,
-) -> str:
+def _parts(folder: ReportFolder, points: Sequence[Point], around: Surroundings) -> list[str]:
     asked = targets(points, around.peak_memory, around.publishing)
     without_vtk = not any(p.method == "vtk" for p in points)
     views = "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items())
-    parts = [
+    return [
         "# Slices: error against run time",
-        f"`us-sim evaluate slice{' --quick' if quick else ''}`, {seconds:.0f} s, on "
-        f"{machine('numpy', 'scipy', 'numba', 'vtk')}. "
-        "Every row is in [slice.csv](slice.csv).",
+        folder.opening("numpy", "scipy", "numba", "vtk"),
         "A block of 0.2 × 0.1 × 0.1 m in a volume of speckle (0.4 mm voxels, 5 mm of it around the "
         "block, which stays rigid) is dented by a smooth field, down and aside, by up to 30 mm. "
         "Every method cuts the same images of 60 × 80 mm in one run, in turns, while the probe "
@@ -98,7 +68,7 @@ def _text(
         "brute force in float64 by NumPy and SciPy, which shares no arithmetic with any of them.",
         HOW_TO_GET + "." if without_vtk else "",
         "## What is asked",
-        markdown_table(("", "asked", "seen", "met"), [target.cells for target in asked]),
+        target_table(asked),
         "Times are of this run and this machine. Ratios are of methods that took turns on one "
         "thread, the lesser of those of wall clock and of processor time; what grows with nodes "
         "and pixels is processor time. Other programs on the machine lengthen the wall clock, "
@@ -146,17 +116,6 @@ def _text(
         "the peak of a process of its own; the message of an image goes to a subscriber in "
         "another process.",
     ]
-    failures = [p for p in points if p.failure]
-    if failures:
-        parts += [
-            "## Failed",
-            "\n".join(
-                f"- {p.method}, {p.size} px, {p.nodes:,} nodes, {p.deformation}, {p.plane}: "
-                f"{p.failure}"
-                for p in failures
-            ),
-        ]
-    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]]]:
@@ -199,7 +158,7 @@ def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
         mine = [p for p in points if (p.method, p.threads) == (method, 1)]
         times = {across(p): p.cpu_ms_median for p in mine}
         cells = [f"{times[at]:.2f}" if at in times else "" for at, _ in steps]
-        power = exponent(mine, across)
+        power = exponent(times)
         rows.append((method, *cells, f"{power:.2f}" if np.isfinite(power) else ""))
     words = [f"{what} {name}, CPU ms" for _, name in steps]
     return markdown_table(("method", *words, "exponent"), rows)

@@ -3,22 +3,20 @@
 `vtkProbeFilter` finds the pixels in the deformed mesh, whose nodes carry their coordinates at
 rest, and interpolates those; a second one samples the volume there. The mesh is given to it in
 columns, rows and heights over the image, since it ignores an image's direction matrix; that is
-also its fast way, which goes through the cells instead of searching one for each pixel.
+also its fast method, which goes through the cells instead of searching one for each pixel.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.slicing.probe.plane import SlicePlane
-
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
+from us_sim.volume.volume import Volume
 
 __all__ = ["HOW_TO_GET", "VtkSlicer", "is_installed"]
 

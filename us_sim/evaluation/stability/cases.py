@@ -44,7 +44,8 @@ COLLIDERS: dict[str, Collider] = {
 }
 """Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are."""
 
-LAYOUTS = ("inclusion", "skin", "half", "scattered")  # where a mesh is stiffer by the contrast
+LAYOUTS = ("inclusion", "skin", "half", "scattered")
+"""Where a mesh is stiffer by the contrast."""
 
 SPRINGS = ("algorithm_1", "fitted", "fitted with volume")
 """Spring constants of methods that have springs, and whether tetrahedra keep their volumes."""
@@ -61,10 +62,10 @@ MOTIONS = (
     "scribble",
     "flicker",
 )
-"""Motions of the probe; see `us_sim.evaluation.stability.motions`."""
+"""What the probe does, see `us_sim.evaluation.stability.motions`."""
 
-_STIFFEST = 12.0  # lg Pa
-_GREATEST_CONTRAST = 9.0  # lg
+_STIFFEST = 12.0  # decimal logarithm of Pa
+_GREATEST_CONTRAST = 9.0  # decimal logarithm
 _REACHED_FROM_ALL_SIDES = ("through", "sideways", "upside down", "scribble")
 
 
@@ -86,8 +87,8 @@ class StabilityCase:
     support: str = "bottom"
     collider: str = "sphere"
     release: str = "removed"  # the probe is "removed" or "lifted"
-    stabilisation: str = "mass_scaling"  # of msds
-    springs: str = "algorithm_1"  # of msds and msds_implicit, see `SPRINGS`
+    stabilisation: str = "mass_scaling"  # of explicit methods
+    springs: str = "algorithm_1"  # of methods that have some, see `SPRINGS`
 
 
 def sampled_cases(count: int) -> list[StabilityCase]:
@@ -101,8 +102,8 @@ def sampled_cases(count: int) -> list[StabilityCase]:
 
 
 def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
-    def one_of(values: tuple[str, ...], share: float) -> str:
-        return values[int(share * len(values))]
+    def one_of(values: tuple[str, ...], fraction: float) -> str:
+        return values[int(fraction * len(values))]
 
     contrast = _GREATEST_CONTRAST * point[1]
     damping = 8 * point[5] / 7 - 1 / 7
@@ -222,11 +223,11 @@ def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
     """(M,) which tetrahedra are the stiff ones."""
     middle = mesh.nodes[mesh.tetrahedra].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    share = (middle - low) / (high - low)
+    place = (middle - low) / (high - low)
     if layout == "inclusion":
-        return np.asarray(np.linalg.norm(share - [0.5, 0.5, 0.4], axis=1) < 0.3)
+        return np.asarray(np.linalg.norm(place - [0.5, 0.5, 0.4], axis=1) < 0.3)
     if layout == "skin":
-        return np.asarray(share[:, 2] < 0.3)
+        return np.asarray(place[:, 2] < 0.3)
     if layout == "half":
-        return np.asarray(share[:, 0] < 0.5)
+        return np.asarray(place[:, 0] < 0.5)
     return np.asarray(np.random.default_rng(7).random(len(middle)) < 0.3)

@@ -7,78 +7,46 @@ true, and does it refuse what it must. The cases are the same in every run.
 
 from __future__ import annotations
 
-import csv
 import math
 import multiprocessing
 import os
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import SolverError
-from us_sim.evaluation.report_folder import prepare_folder
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
 from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
 from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
-from us_sim.evaluation.stability.points import Trial, try_case
+from us_sim.evaluation.stability.points import Trial, Tried, try_case
 from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
-from us_sim.evaluation.stability.report import print_table, write_report
+from us_sim.evaluation.stability.report import table, write_report
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.progress import Progress
-from us_sim.tissue.solvers.solver import SOLVERS, create_solver
+from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["COLUMNS", "Tried", "evaluate_stability", "write_rows"]
+__all__ = ["evaluate_stability"]
 
-_SAMPLES = {True: 64, False: 2048}  # by quick
-_STEP_LIMITS = {True: 24, False: 200}
-
-_CHUNK = 12
-"""Cases that a process is handed at a time."""
-
-_STEP_LIMIT_ERROR = 0.02  # predicted and observed step limit agree within this
-
-_VARIED = [field.name for field in fields(StabilityCase) if field.name != "case"]
-
-COLUMNS = [
-    "method",
-    "case",
-    *_VARIED,
-    "recovery_frames",
-    "dt_limit_predicted",
-    "dt_limit_observed",
-    "finite",
-    "bounded",
-    "recovered_mm",
-    "residual_reported",
-    "residual_checked",
-    "truthful",
-    "action",
-]
-"""Of stability.csv."""
-
-_OF_SPRINGS = ("time_step", "damping", "springs")  # what a method without it leaves empty
-
-
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """A method, what it was given, and what came of it."""
-
-    method: str
-    name: str
-    case: StabilityCase | None  # None for input that must be refused
-    trial: Trial
+_SAMPLES, _QUICK_SAMPLES = 2048, 64
+_STEP_LIMITS, _QUICK_STEP_LIMITS = 200, 24  # sampled cases whose step limit is looked for
+_STEP_LIMIT_ERROR = 0.02  # relative, of predicted step limits
+_CHUNK = 12  # cases that a process is handed at a time
 
 
 @dataclass(frozen=True)
 class _Task:
+    """A case for one method."""
+
     method: str
     case: StabilityCase | str  # or the name of what must be refused
-    bisect: bool = False
+    bisect: bool = False  # whether its step limit is looked for
 
 
 def evaluate_stability(out: Path, quick: bool) -> int:
@@ -94,71 +62,30 @@ def evaluate_stability(out: Path, quick: bool) -> int:
     Raises:
         UsSimError: the folder cannot be written or holds a report.
     """
-    prepare_folder(out, "stability.md")
-    start = time.perf_counter()
+    folder = ReportFolder("stability", out, quick)
     tasks = list(_tasks(quick))
     with Progress("stability", len(tasks), "cases") as progress:
-        tried = _run(tasks, progress)
-    write_rows(tried, out / "stability.csv")
-    write_report(tried, out, quick, time.perf_counter() - start)
-    print_table(tried, out)
-    return 0 if all(one.trial.passed for one in tried) else 1
-
-
-def write_rows(tried: Sequence[Tried], file: Path) -> None:
-    """A CSV row for each case; what a method does not have, or a refused case lacks, is empty."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        rows = csv.DictWriter(stream, COLUMNS)
-        rows.writeheader()
-        for one in tried:
-            rows.writerow(_row(one))
-
-
-def _row(one: Tried) -> dict[str, object]:
-    trial = one.trial
-    row: dict[str, object] = {"method": one.method, "case": one.name}
-    if one.case is not None:
-        varied = asdict(one.case)
-        for name in _VARIED:
-            springs_only = name in _OF_SPRINGS and not one.method.startswith("msds")
-            explicit_only = name == "stabilisation" and one.method != "msds"
-            row[name] = "" if springs_only or explicit_only else _written(varied[name])
-    said = trial.actions[:3]
-    if trial.failure:
-        said = [f"FAILED: {trial.failure}", *said]
-    row["action"] = " | ".join(said)
-    row["dt_limit_predicted"] = _written(trial.step_limit_predicted)
-    row["dt_limit_observed"] = _written(trial.step_limit_observed)
-    if not trial.refused:
-        row["recovery_frames"] = trial.recovery_frames
-        row["recovered_mm"] = _written(trial.recovered_mm)
-        row["residual_reported"] = _written(trial.residual_reported)
-        row["residual_checked"] = _written(trial.residual_checked)
-        for name in ("finite", "bounded", "truthful"):
-            row[name] = str(getattr(trial, name)).lower()
-    return row
-
-
-def _written(value: object) -> object:
-    if not isinstance(value, float):
-        return value
-    return "" if math.isnan(value) else f"{value:.6g}"
+        tried = _run(tasks, progress.update)
+    folder.write_rows("stability", tried)
+    write_report(folder, tried)
+    return folder.finish(table(tried), failures(tried))
 
 
 def _tasks(quick: bool) -> Iterator[_Task]:
-    named, sampled = extreme_cases(corners=not quick), sampled_cases(_SAMPLES[quick])
-    for method in SOLVERS:
+    named = extreme_cases(corners=not quick)
+    sampled = sampled_cases(_QUICK_SAMPLES if quick else _SAMPLES)
+    limits = _QUICK_STEP_LIMITS if quick else _STEP_LIMITS
+    for name_of_method, method in TISSUE_METHODS.items():
         for name in REFUSALS:
-            yield _Task(method, name)
+            yield _Task(name_of_method, name)
         for case in named:
-            yield _Task(method, case)
+            yield _Task(name_of_method, case)
         for number, case in enumerate(sampled):
-            yield _Task(method, case, method == "msds" and number < _STEP_LIMITS[quick])
+            yield _Task(name_of_method, case, method.is_explicit and number < limits)
 
 
-def _run(tasks: Sequence[_Task], progress: Progress) -> list[Tried]:
+def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list[Tried]:
     """All tasks, in processes of their own, in order."""
-    done: list[list[Trial]] = []
     chunks = [tasks[i : i + _CHUNK] for i in range(0, len(tasks), _CHUNK)]
     results: dict[int, list[Trial]] = {}
     with (
@@ -185,9 +112,8 @@ def _run(tasks: Sequence[_Task], progress: Progress) -> list[Tried]:
                     f"PYTHONFAULTHANDLER=1 to see where"
                 ) from error
             counted += len(chunks[number])
-            progress.update(counted, chunks[number][-1].method)
-    done = [results[number] for number in range(len(chunks))]
-    trials = [trial for chunk in done for trial in chunk]
+            progress(counted, chunks[number][-1].method)
+    trials = [trial for number in range(len(chunks)) for trial in results[number]]
     return [_tried(task, trial) for task, trial in zip(tasks, trials, strict=True)]
 
 
@@ -220,7 +146,7 @@ def _try(task: _Task) -> Trial:
         return refusal_of(task.method, task.case)
     trial = try_case(task.method, task.case)
     if task.bisect and not trial.refused:
-        predicted, observed = observed_step_limit(task.case)
+        predicted, observed = observed_step_limit(task.method, task.case)
         if math.isfinite(predicted):
             trial.step_limit_predicted, trial.step_limit_observed = predicted, observed
             if abs(observed - predicted) > _STEP_LIMIT_ERROR * predicted:

@@ -16,16 +16,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 __all__ = ["MESHES", "SUPPORTS", "fixed_nodes", "mesh_named", "parts"]
 
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
-"""How a tissue can be held."""
+"""What of a tissue is held."""
 
 _FLATTEST = 1e-7
-"""Tetrahedra flatter than this (volume over longest edge cubed) are left out of Delaunay's."""
+"""Volume over the longest edge cubed, below which a tetrahedron of Delaunay's is left out."""
 
 
 @lru_cache
@@ -35,7 +36,7 @@ def mesh_named(name: str) -> TetrahedralMesh:
 
 
 def fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
-    """(N,) which nodes a way of `SUPPORTS` holds."""
+    """(N,) which nodes one of `SUPPORTS` holds."""
     nodes = mesh.nodes
     fixed = np.zeros(len(nodes), dtype=bool)
     if support in ("bottom", "walls", "three", "one piece"):
@@ -99,7 +100,7 @@ def _delaunay() -> TetrahedralMesh:
 def _from_points(points: NDArray[np.float64]) -> TetrahedralMesh:
     corners = Delaunay(points).simplices
     a, b, c, d = np.moveaxis(points[corners], 1, 0)
-    volume = np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
+    volume = signed_volumes(points, corners)
     corners[volume < 0] = corners[volume < 0][:, [0, 1, 3, 2]]
     longest = np.max([np.linalg.norm(p - q, axis=1) for p in (a, b, c, d) for q in (a, b, c)], 0)
     corners = corners[np.abs(volume) > _FLATTEST * longest**3]
@@ -113,14 +114,14 @@ def _sliver() -> TetrahedralMesh:
     nodes = mesh.nodes.copy()
     inner = int(np.argmin(np.linalg.norm(nodes - [0.017, 0.017, 0.027], axis=1)))
     beside = (mesh.tetrahedra == inner).any(axis=1)
-    way = nodes[mesh.tetrahedra[beside][0]].mean(axis=0) - nodes[inner]
-    nodes[inner] += 0.5 * way
+    inwards = nodes[mesh.tetrahedra[beside][0]].mean(axis=0) - nodes[inner]
+    nodes[inner] += 0.5 * inwards
     before = mesh.volumes[beside]
     slope = 2 * (TetrahedralMesh(nodes, mesh.tetrahedra).volumes[beside] - before)
-    # Volumes change linearly on the way, and the first to vanish stops it.
+    # Volumes change linearly with the distance, and the first to vanish ends it.
     shrinking = slope < 0
     furthest = ((before[shrinking] - 1e-10) / -slope[shrinking]).min()
-    nodes[inner] += (furthest - 0.5) * way
+    nodes[inner] += (furthest - 0.5) * inwards
     return TetrahedralMesh(nodes, mesh.tetrahedra)
 
 

@@ -15,10 +15,10 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["LIFTED", "poses_of"]
 
-_TREMOR, _FRAMES_A_SECOND = 1000.0, 2718.0
-"""Hz, and the rate of frames at which it is seen: no small multiple, so that no phase repeats."""
+_TREMOR = 1000.0  # Hz
+_FRAME_RATE = 2718.0  # Hz; no small multiple of the tremor's, so that no phase repeats
 
-LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # a probe far from any tissue
+LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # far from any tissue
 
 
 def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
@@ -46,26 +46,26 @@ def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
     wide = high[0] - low[0]
     deep = depth * thick
     if motion == "press":
-        return [_at(z=share * deep) for share in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)]
+        return [_at(z=part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)]
     if motion == "jump":
         return [_at(z=deep), _at(z=deep), _at(x=0.2 * wide, z=deep), _at(z=0.3 * deep)]
     if motion == "through":
         stops = (-0.2 * thick, deep, 2.5 * thick, deep, -0.2 * thick, deep)
         return [_at(z=z) for z in stops]
     if motion == "tremor":
-        phase = 2 * np.pi * _TREMOR / _FRAMES_A_SECOND * np.arange(14)
+        phase = 2 * np.pi * _TREMOR / _FRAME_RATE * np.arange(14)
         return [_at(z=deep + 0.02 * thick * shake) for shake in np.sin(phase)]
     if motion == "slide":
         aside = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)
-        return [_at(x=way * wide, y=0.3 * way * wide, z=deep) for way in aside]
+        return [_at(x=x * wide, y=0.3 * x * wide, z=deep) for x in aside]
     if motion == "tilt":
         angles = (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)
         return [_at(z=deep, angle=angle, about=(0.4, 1.0, 0.1)) for angle in angles]
     if motion == "sideways":
-        ways = (0.2, 0.5, 1.0, 1.0, -0.5, 0.6)
+        reached = (0.2, 0.5, 1.0, 1.0, -0.5, 0.6)
         return [
-            _at(x=low[0] + way * depth * wide, z=0.4 * thick, angle=np.pi / 2, about=(0, 1, 0))
-            for way in ways
+            _at(x=low[0] + part * depth * wide, z=0.4 * thick, angle=np.pi / 2, about=(0, 1, 0))
+            for part in reached
         ]
     if motion == "upside down":
         depths = (1.2 * thick, thick - deep, -0.5 * deep, -0.2 * deep)

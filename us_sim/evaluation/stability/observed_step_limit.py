@@ -2,7 +2,7 @@
 
 >>> from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
 >>> from us_sim.evaluation.stability.cases import StabilityCase
->>> predicted, observed = observed_step_limit(StabilityCase("paper's", damping=0.1))
+>>> predicted, observed = observed_step_limit("msds", StabilityCase("paper's", damping=0.1))
 >>> bool(abs(observed / predicted - 1) < 0.02)
 True
 """
@@ -10,29 +10,33 @@ True
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from us_sim.evaluation.stability.cases import StabilityCase, model_of
 from us_sim.evaluation.stability.points import damping_factor, spring_settings
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.registry import SOLVERS
+from us_sim.settings.setting import rules_of
 from us_sim.tissue.deformation import TissueState
-from us_sim.tissue.solvers.msds import Msds, MsdsSettings
+from us_sim.tissue.solvers.solver import create_solver
 
 __all__ = ["observed_step_limit"]
 
-# An amplitude so small that springs do not turn, and how much it may swell on its way: just below
-# the limit by 20 times, without ever growing further; just above it grows in every step.
-_AMPLITUDE, _SWELLING = 1e-8, 1e3
+_AMPLITUDE = 1e-8
+"""First displacements over the shortest edge: so small that springs do not turn."""
+_SWELLING = 1e3
+"""Growth that shows instability. Just below the limit amplitudes swell by 20 times and stay so."""
 _STEPS = 3000
-
-# Relative, of the bisection.
-_PRECISION = 2e-3
+_PRECISION = 2e-3  # relative, of the bisection
 
 
-def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
-    """s, the step limit that `Msds` predicts for a case without a probe, and the observed one.
+def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]:
+    """s, the step limit that a solver predicts for a case without a probe, and the observed one.
 
-    Both are infinite where every node is fixed.
+    Both are infinite where every node is fixed, or the limit is none that can be set.
 
     Small random displacements are let go with unscaled masses, for some thousand steps of a length
     that is bisected until it is known whether they grow.
@@ -42,7 +46,8 @@ def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
     """
     model = model_of(case)
     nodes = model.mesh.nodes
-    settings = spring_settings(case) | {"damping_factor": damping_factor(case, model)}
+    settings: dict[str, Any] = asdict(spring_settings(case))
+    settings |= {"damping_factor": damping_factor(case, model), "stabilisation": "none"}
     shape = np.random.default_rng(1).uniform(-1.0, 1.0, nodes.shape)
     shape[model.fixed] = 0.0
     edges = nodes[model.mesh.edges]
@@ -50,10 +55,9 @@ def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
     start = TissueState(shape, np.zeros_like(nodes))
 
     def grows(step: float) -> bool:
-        tried = MsdsSettings(
-            steps=_STEPS, time_step=step, stabilisation="none", rest_tolerance=0.0, **settings
+        solver = create_solver(
+            method, model, steps=_STEPS, time_step=step, rest_tolerance=0.0, **settings
         )
-        solver = Msds(model, tried)
         solver.take_over(start)
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)
@@ -62,12 +66,15 @@ def observed_step_limit(case: StabilityCase) -> tuple[float, float]:
 
     if model.fixed.all():
         return math.inf, math.inf
-    unlimited = MsdsSettings(stabilisation="none", time_step=1e-9, **settings)
-    predicted = Msds(model, unlimited).step_limit
+    solver: Any = create_solver(method, model, time_step=1e-9, **settings)
+    predicted = float(solver.step_limit)
+    can_be_set = rules_of(SOLVERS.settings(method))["time_step"].quantity or Quantity("time")
     low, high = 0.98 * predicted, 1.02 * predicted
-    while grows(low):
+    if not can_be_set.minimum < low < high < can_be_set.maximum:
+        return math.inf, math.inf
+    while low > 2 * can_be_set.minimum and grows(low):
         low /= 2
-    while not grows(high):
+    while high < can_be_set.maximum / 2 and not grows(high):
         high *= 2
     while high > (1 + _PRECISION) * low:
         middle = (low * high) ** 0.5

@@ -9,22 +9,22 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap, LogNorm
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from us_sim.evaluation.figure import new_figure, save
 from us_sim.evaluation.stability.cases import MOTIONS, StabilityCase
 from us_sim.evaluation.stability.meshes import MESHES
-from us_sim.evaluation.stability.points import Trial
+from us_sim.evaluation.stability.points import Trial, Tried
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
 __all__ = ["draw_map", "draw_step_limits"]
 
 _FAILED, _REFUSED = "#d62728", "#d9d9d9"
 
-# With fewer cases than this, cells are larger.
-_MANY, _FINE, _COARSE = 500, 10, 5
+_MANY = 500  # cases, with fewer of which cells are larger
+_FINE, _COARSE = 10, 5  # cells along an axis
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class _Axis:
         """Of the case; what is beyond the range is in the first or the last cell."""
         if self.categories:
             return int(self.value(case))
-        share = (self.value(case) - self.low) / (self.high - self.low)
-        return int(min(max(share * cells, 0), cells - 1))
+        fraction = (self.value(case) - self.low) / (self.high - self.low)
+        return int(min(max(fraction * cells, 0), cells - 1))
 
     def count(self, cells: int) -> int:
         """How many cells there are."""
@@ -77,11 +77,16 @@ _MOTION = _Axis("motion", lambda c: MOTIONS.index(c.motion), categories=MOTIONS)
 _MESH = _Axis("mesh", lambda c: list(MESHES).index(c.mesh), categories=tuple(MESHES))
 
 
-def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Path) -> None:
+def draw_map(method: str, mine: Sequence[Tried], file: Path) -> None:
     """Write a method's map as PNG: in each cell the worst of the cases that fall into it."""
-    figure = Figure(figsize=(15, 9.2), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    third = (_STEP, _DAMPING) if method.startswith("msds") else (_MOTION, _MESH)
+    tried = [(one.case, one.trial) for one in mine if one.case is not None]
+    failed = sum(not trial.passed for _, trial in tried)
+    title = (
+        f"{method}: {len(tried)} cases, {failed} failed   "
+        f"(a cell shows its worst case; white: none; grey: all refused; red ×: one failed)"
+    )
+    figure = new_figure(15, 9.2, title)
+    third = (_STEP, _DAMPING) if TISSUE_METHODS[method].has_springs else (_MOTION, _MESH)
     pairs = ((_MODULUS, _RATIO), (_CONTRAST, _DEPTH), third)
     rows: tuple[tuple[str, Callable[[Trial], float], LogNorm], ...] = (
         (
@@ -97,27 +102,20 @@ def draw_map(method: str, tried: Sequence[tuple[StabilityCase, Trial]], file: Pa
             image = _draw_cells(panel, tried, x, y, value, norm)
         bar = figure.colorbar(image, ax=list(line), pad=0.01, extend="both")
         bar.set_label(title)
-    failed = sum(not trial.passed for _, trial in tried)
-    figure.suptitle(
-        f"{method}: {len(tried)} cases, {failed} failed   "
-        f"(a cell shows its worst case; white: none; grey: all refused; red ×: one failed)"
-    )
-    figure.savefig(file)
+    save(figure, file)
 
 
 def draw_step_limits(
-    predicted: NDArray[np.float64], observed: NDArray[np.float64], file: Path
+    method: str, predicted: NDArray[np.float64], observed: NDArray[np.float64], file: Path
 ) -> None:
     """Write predicted against observed step limits (K,) s as PNG."""
-    figure = Figure(figsize=(8, 6.4), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 6.4, f"{method}: longest stable step, {len(predicted)} cases")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1))
     low, high = predicted.min() / 2, predicted.max() * 2
     upper.loglog([low, high], [low, high], color="0.6", linewidth=1, label="equal")
     upper.loglog(predicted, observed, "o", markersize=4, alpha=0.6, label="a case")
     upper.set_ylabel("observed by bisection / s")
     upper.legend(frameon=False)
-    upper.set_title(f"msds: longest stable step, {len(predicted)} cases")
     lower.semilogx(predicted, 100 * (observed / predicted - 1), "o", markersize=4, alpha=0.6)
     lower.axhspan(-2, 2, color="0.93", zorder=0)
     lower.set_ylim(-3, 3)
@@ -126,7 +124,7 @@ def draw_step_limits(
     lower.set_ylabel("deviation / %")
     for panel in (upper, lower):
         panel.grid(alpha=0.3)
-    figure.savefig(file)
+    save(figure, file)
 
 
 def _draw_cells(

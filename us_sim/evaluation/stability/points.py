@@ -1,6 +1,8 @@
 """One solver on one extreme case: did it stay finite and bounded, come back, and say the truth.
 
->>> from us_sim.evaluation.stability.cases import StabilityCase
+>>> from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
+from us_sim.evaluation.row import Row
+from us_sim.evaluation.stability.cases import StabilityCase
 >>> from us_sim.evaluation.stability.points import try_case
 >>> trial = try_case("fem_cg", StabilityCase("soft", young_modulus=1.0))
 >>> trial.finite, trial.bounded, trial.truthful, trial.recovered_mm
@@ -11,39 +13,30 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
+from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
+from us_sim.evaluation.row import Row
 from us_sim.evaluation.stability.cases import StabilityCase, model_of
-from us_sim.evaluation.stability.independent_residual import (
-    IndependentResidual,
-    averaged_hooke_forces,
-    hooke_forces,
-    neo_hookean_forces,
-    rounding_of_forces,
-    spring_forces,
-    volume_forces,
-)
 from us_sim.evaluation.stability.meshes import parts
 from us_sim.evaluation.stability.motions import LIFTED, poses_of
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
 from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.elasticity.springs import fitted_springs, springs_of
-from us_sim.tissue.elasticity.volume_term import volume_term
+from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 __all__ = [
-    "KEPT",
-    "QUASI_STATIC",
     "Trial",
+    "Tried",
     "agrees",
     "damping_factor",
     "equations_of",
@@ -52,20 +45,16 @@ __all__ = [
     "try_case",
 ]
 
-QUASI_STATIC = ("fem", "fem_nonlinear", "fem_cg")
-"""Methods without masses: a part that is not held has no position of rest, and is refused."""
-
-FAILED, KEPT = "came out not finite or far away", "so the last good state was kept"
-"""What a solver says of a frame that failed, and of one after which it kept the last good state."""
+_FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"
+"""What a solver says of a frame that failed, and where it kept the last good state after that."""
 
 _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
-"""Residuals below this are the same, and above it they agree within this factor."""
+"""Residuals below the first are the same; above it they agree within the second."""
 
-_FRAMES_OF_RELEASE = {True: 40, False: 150}
-"""Frames after the release that a quasi-static and a dynamic method are given."""
+_QUASI_STATIC_FRAMES, _DYNAMIC_FRAMES = 40, 150
+"""Frames after the release, of methods without masses and of those with them."""
 
-_RECOVERED = 1e-4
-"""Of the thickness: a tissue that is so near its rest has come back."""
+_RECOVERED = 1e-4  # of the thickness; a tissue that is so near its rest has come back
 
 
 @dataclass(eq=False)
@@ -98,18 +87,76 @@ class Trial:
             self.actions.append(action)
 
 
+@dataclass(frozen=True, eq=False)
+class Tried(Row):
+    """A method, the case it was tried on, and what came of that."""
+
+    digits = 6
+
+    method: str
+    name: str
+    case: StabilityCase | None  # None for input that must be refused
+    trial: Trial
+
+    @property
+    def values(self) -> dict[str, object]:
+        """By column; what a method does not have, or a refused case lacks, is None."""
+        trial, method = self.trial, TISSUE_METHODS[self.method]
+        varied = {entry.name: None for entry in fields(StabilityCase)}
+        if self.case is not None:
+            varied = asdict(self.case)
+            if not method.has_springs:
+                varied |= {"time_step": None, "damping": None, "springs": None}
+            if not method.is_explicit:
+                varied |= {"stabilisation": None}
+        failed = [f"FAILED: {trial.failure}"] if trial.failure else []
+        ran: dict[str, object] = {
+            "recovered_mm": trial.recovered_mm,
+            "residual_reported": trial.residual_reported,
+            "residual_checked": trial.residual_checked,
+            "truthful": str(trial.truthful).lower(),
+        }
+        return {
+            "method": self.method,
+            **(varied | {"case": self.name}),
+            "recovery_frames": None if trial.refused else trial.recovery_frames,
+            "dt_limit_predicted": trial.step_limit_predicted,
+            "dt_limit_observed": trial.step_limit_observed,
+            "finite": None if trial.refused else str(trial.finite).lower(),
+            "bounded": None if trial.refused else str(trial.bounded).lower(),
+            **(dict.fromkeys(ran) if trial.refused else ran),
+            "action": " | ".join([*failed, *trial.actions[:3]]),
+        }
+
+    @property
+    def failure(self) -> str:
+        """What went wrong, and nothing where nothing did."""
+        trial = self.trial
+        if trial.failure or trial.passed:
+            return trial.failure
+        if not trial.finite:
+            return "not finite"
+        if not trial.bounded:
+            return "not bounded"
+        return (
+            f"reported a residual of {trial.residual_reported:.3g}, but it is "
+            f"{trial.residual_checked:.3g}"
+        )
+
+
 def try_case(method: str, case: StabilityCase) -> Trial:
     """Make the solver and run the case; a refusal in one sentence is a result, too."""
     trial = Trial()
     unheld = False
     try:
         model = model_of(case)
-        unheld = method in QUASI_STATIC and not _held(model).all()
+        unheld = TISSUE_METHODS[method].is_quasi_static and not _held(model).all()
         solver = create_solver(method, model, **_settings(method, case, model))
     except UsSimError as error:
         trial.refused = True
         trial.say(f"refused: {error}")
-        if not unheld and not (case.stabilisation == "substeps" and method == "msds"):
+        too_many_steps = case.stabilisation == "substeps" and TISSUE_METHODS[method].is_explicit
+        if not (unheld or too_many_steps):
             trial.failure = "was refused, and has nothing to be refused for"
         return trial
     except Exception as error:  # whatever it is, a user would see a traceback
@@ -130,7 +177,8 @@ def run_trial(
     bound = _bound(model, poses)
     thickness = float(np.ptp(model.mesh.nodes[:, 2]))
     released = None if case.release == "removed" else LIFTED
-    frames = _FRAMES_OF_RELEASE[solver.name in QUASI_STATIC]
+    quasi_static = TISSUE_METHODS[solver.name].is_quasi_static
+    frames = _QUASI_STATIC_FRAMES if quasi_static else _DYNAMIC_FRAMES
     last: Deformation | None = None
     stuck = 0
     for number, pose in enumerate([*poses, *[released] * frames]):
@@ -146,8 +194,8 @@ def run_trial(
         if not _finite(deformation):
             trial.finite = False
             return
-        failed = FAILED in deformation.action
-        kept = KEPT in deformation.action
+        failed = _FAILED in deformation.action
+        kept = _KEPT in deformation.action
         if failed:
             trial.kept += 1
             residual.forget()
@@ -207,44 +255,13 @@ def damping_factor(case: StabilityCase, model: TissueModel) -> float:
 
 def equations_of(method: str, case: StabilityCase, model: TissueModel) -> IndependentResidual:
     """What checks the residuals of a method on a case."""
-    mesh, materials = model.mesh, model.materials
-    whole = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
-    modulus = whole / (1 - 2 * materials.poisson_ratio) + whole
-    forces: dict[str, Callable[..., NDArray[np.float64]]] = {
-        "fem": averaged_hooke_forces,
-        "fem_nonlinear": neo_hookean_forces,
-        "fem_cg": hooke_forces,
-    }
-    if method in forces:
-        rounding = rounding_of_forces(mesh, modulus)
-        return IndependentResidual(
-            model, lambda displacement: forces[method](mesh, materials, displacement), rounding
-        )
-    springs = (springs_of if case.springs == "algorithm_1" else fitted_springs)(mesh, materials)
-    digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
-    volume = volume_term(mesh, materials, springs)
-    with_volume = case.springs == "fitted with volume"
-
-    def of_springs(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        force = spring_forces(springs.edges, springs.stiffness, mesh.nodes, displacement)
-        if with_volume:
-            force += volume_forces(
-                mesh, volume.element, volume.nodal, displacement, yielding=method == "msds"
-            )
-        return force
-
-    rounding = 4 * digit * float(np.linalg.norm(springs.stiffness))
-    if with_volume:
-        rounding += rounding_of_forces(mesh, volume.element + volume.nodal)
-    return IndependentResidual(model, of_springs, rounding)
+    return TISSUE_METHODS[method].residual(model, spring_settings(case))
 
 
-def spring_settings(case: StabilityCase) -> dict[str, Any]:
+def spring_settings(case: StabilityCase) -> SpringSettings:
     """Settings of methods with springs for a case's ``springs``."""
-    return {
-        "stiffness": "algorithm_1" if case.springs == "algorithm_1" else "fitted",
-        "volume": case.springs == "fitted with volume",
-    }
+    stiffness = "algorithm_1" if case.springs == "algorithm_1" else "fitted"
+    return SpringSettings(stiffness, volume=case.springs == "fitted with volume")
 
 
 def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
@@ -253,7 +270,7 @@ def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str,
         "time_step": case.time_step,
         "damping_factor": damping_factor(case, model),
         "stabilisation": case.stabilisation,
-        **spring_settings(case),
+        **asdict(spring_settings(case)),
     }
     return {name: value for name, value in asked.items() if name in known}
 

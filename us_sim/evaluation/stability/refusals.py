@@ -29,7 +29,7 @@ __all__ = ["REFUSALS", "refusal_of"]
 
 
 def refusal_of(method: str, name: str) -> Trial:
-    """Give a method one of `REFUSALS`."""
+    """What a method does with one of the inputs of `REFUSALS`."""
     trial = Trial()
     try:
         REFUSALS[name](method)
@@ -133,4 +133,4 @@ REFUSALS: dict[str, Callable[[str], None]] = {
     "a state that is not a number": lambda m: _state(m, np.nan),
     "a state of another mesh": lambda m: _state(m, 0.0, 9),
 }
-"""What is given, by name."""
+"""Each gives a method one broken input, by what is wrong with it."""

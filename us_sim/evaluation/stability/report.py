@@ -6,32 +6,21 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from us_sim.evaluation.machine import machine
+from us_sim.evaluation.markdown_table import markdown_table
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
 from us_sim.evaluation.stability.plots import draw_map, draw_step_limits
-from us_sim.tissue.solvers.solver import SOLVERS
+from us_sim.evaluation.stability.points import Tried
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
-if TYPE_CHECKING:
-    from us_sim.evaluation.stability.measure import Tried
+__all__ = ["table", "write_report"]
 
-__all__ = ["print_table", "write_report"]
-
-_HEADER = (
-    "method",
-    "cases",
-    "refused",
-    "failed",
-    "not finite",
-    "not bounded",
-    "not truthful",
-    "back to rest",
-    "frames",
-    "kept",
-    "slowest ms",
+_HEAD = (
+    *("method", "cases", "refused", "failed", "not finite", "not bounded", "not truthful"),
+    *("back to rest", "frames", "kept", "slowest ms"),
 )
 
 _DEFINITIONS = """\
@@ -52,63 +41,44 @@ Every case is a small tissue (4 to 150 nodes), a collider and a motion of it, an
 - *kept*: frames that failed, after which the solver itself kept the last good state or rest.
 - *refused*: in one sentence, before the run. To be refused for no reason counts as failed, and so
   does not to refuse a tissue that can move as a whole (quasi-static methods) or broken input.
-- critical damping is that of the root mean square of the nodes' frequencies.
-"""
+- critical damping is that of the root mean square of the nodes' frequencies."""
 
 
-def print_table(tried: Sequence[Tried], out: Path) -> None:
-    """The numbers of each method, the failures, and where everything is."""
-    rows = [_HEADER, *(_numbers(method, tried) for method in _methods(tried))]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADER))]
-    for row in rows:
-        print("  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)))
-    limits = _step_limits(tried)
-    if limits:
-        print(f"step limit of msds: {limits}")
-    failed = [one for one in tried if not one.trial.passed]
-    for one in failed[:10]:
-        print(f"failed: {one.method}, {one.name}: {_failure(one)}")
-    if len(failed) > 10:
-        print(f"and {len(failed) - 10} more, see stability.csv")
-    print(f"written to {out}: stability.csv, stability.md, stability_*.png")
+def table(tried: Sequence[Tried]) -> str:
+    """What the command prints: the numbers of each method, and how well step limits are known."""
+    rows = markdown_table(_HEAD, [_numbers(method, tried) for method in _methods(tried)])
+    limits = [f"step limit of {name}: {said}" for name, said in _step_limits(tried).items()]
+    return "\n".join([rows, *limits])
 
 
-def write_report(tried: Sequence[Tried], out: Path, quick: bool, seconds: float) -> None:
-    """Write stability.md and its pictures."""
-    command = f"us-sim evaluate stability{' --quick' if quick else ''}"
-    lines = [
+def write_report(folder: ReportFolder, tried: Sequence[Tried]) -> None:
+    """Draw the maps and write stability.md."""
+    failed = failures(tried)
+    parts = [
         "# Stability of the tissue solvers",
-        "",
-        f"`{command}`, {seconds:.0f} s in two processes, on {machine('numpy', 'scipy', 'numba')}.",
-        "",
+        f"{folder.opening('numpy', 'scipy', 'numba')} Two processes shared the cases.",
         _DEFINITIONS,
-        "| " + " | ".join(_HEADER) + " |",
-        "|" + " --- |" * len(_HEADER),
-        *("| " + " | ".join(_numbers(method, tried)) + " |" for method in _methods(tried)),
-        "",
+        markdown_table(_HEAD, [_numbers(method, tried) for method in _methods(tried)]),
+        "" if failed else "No case failed.",
     ]
-    lines += _failures(tried)
-    limits = [one for one in tried if not math.isnan(one.trial.step_limit_predicted)]
-    if limits:
+    for method, said in _step_limits(tried).items():
+        limits = _with_step_limit(method, tried)
         predicted = np.array([one.trial.step_limit_predicted for one in limits])
         observed = np.array([one.trial.step_limit_observed for one in limits])
-        draw_step_limits(predicted, observed, out / "stability_step_limit.png")
-        lines += ["## Step limit of msds", "", f"{_step_limits(tried)}.", ""]
-        lines += ["![predicted and observed](stability_step_limit.png)", ""]
+        picture = folder.picture(f"step_limit_{method}")
+        draw_step_limits(method, predicted, observed, picture)
+        parts += [f"## Step limit of {method}", f"{said}."]
+        parts += [f"![predicted and observed]({picture.name})"]
     for method in _methods(tried):
-        of_method = [
-            (one.case, one.trial) for one in tried if one.method == method and one.case is not None
-        ]
-        draw_map(method, of_method, out / f"stability_{method}.png")
-        lines += [f"## {method}", "", f"![map](stability_{method}.png)", ""]
-        lines += _worst([one for one in tried if one.method == method])
-        lines += _said([one for one in tried if one.method == method])
-    lines += _refusals(tried)
-    (out / "stability.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+        mine = [one for one in tried if one.method == method]
+        picture = folder.picture(method)
+        draw_map(method, mine, picture)
+        parts += [f"## {method}", f"![map]({picture.name})", *_worst(mine), *_said(mine)]
+    folder.write_report([*parts, *_refusals(tried)], failed)
 
 
 def _methods(tried: Sequence[Tried]) -> list[str]:
-    return [method for method in SOLVERS if any(one.method == method for one in tried)]
+    return [method for method in TISSUE_METHODS if any(one.method == method for one in tried)]
 
 
 def _numbers(method: str, tried: Sequence[Tried]) -> tuple[str, ...]:
@@ -130,63 +100,48 @@ def _numbers(method: str, tried: Sequence[Tried]) -> tuple[str, ...]:
     )
 
 
-def _step_limits(tried: Sequence[Tried]) -> str:
-    ratios = [
-        one.trial.step_limit_observed / one.trial.step_limit_predicted
+def _with_step_limit(method: str, tried: Sequence[Tried]) -> list[Tried]:
+    return [
+        one
         for one in tried
-        if not math.isnan(one.trial.step_limit_predicted)
+        if one.method == method and not math.isnan(one.trial.step_limit_predicted)
     ]
-    if not ratios:
-        return ""
-    deviation = np.abs(np.array(ratios) - 1)
-    return (
-        f"{len(ratios)} cases bisected, observed and predicted limits differ by "
-        f"{100 * np.median(deviation):.2f} % (median) and {100 * deviation.max():.2f} % (largest)"
-    )
 
 
-def _failure(one: Tried) -> str:
-    trial = one.trial
-    if trial.failure:
-        return trial.failure
-    if not trial.finite:
-        return "not finite"
-    if not trial.bounded:
-        return "not bounded"
-    return (
-        f"reported a residual of {trial.residual_reported:.3g}, but it is "
-        f"{trial.residual_checked:.3g}"
-    )
-
-
-def _failures(tried: Sequence[Tried]) -> list[str]:
-    failed = [one for one in tried if not one.trial.passed]
-    if not failed:
-        return ["No case failed.", ""]
-    lines = ["## Failures", "", "| method | case | what |", "| --- | --- | --- |"]
-    lines += [f"| {one.method} | {one.name} | {_failure(one)} |" for one in failed[:60]]
-    if len(failed) > 60:
-        lines += ["", f"and {len(failed) - 60} more, see stability.csv"]
-    return [*lines, ""]
+def _step_limits(tried: Sequence[Tried]) -> dict[str, str]:
+    """By method, for those of which a step limit was looked for: how good its prediction is."""
+    said = {}
+    for method in _methods(tried):
+        limits = _with_step_limit(method, tried)
+        if limits:
+            trials = [one.trial for one in limits]
+            deviation = np.array(
+                [abs(t.step_limit_observed / t.step_limit_predicted - 1) for t in trials]
+            )
+            said[method] = (
+                f"{len(limits)} cases bisected, observed and predicted limits differ by "
+                f"{100 * np.median(deviation):.2f} % (median) and {100 * deviation.max():.2f} % "
+                f"(largest)"
+            )
+    return said
 
 
 def _worst(tried: Sequence[Tried]) -> list[str]:
     """Of those that ran: the five farthest from rest, and the five with the largest residual."""
     ran = [one for one in tried if not math.isnan(one.trial.recovered_mm) and one.case is not None]
-    lines = []
+    parts = []
     far = [one for one in ran if one.trial.recovery_frames is None]
     if far:
-        lines += ["Farthest from rest after release:", ""]
         far.sort(key=lambda one: -one.trial.recovered_mm)
-        lines += [f"- {one.trial.recovered_mm:.3g} mm: {_described(one)}" for one in far[:5]]
-        lines += [""]
+        lines = [f"- {one.trial.recovered_mm:.3g} mm: {_described(one)}" for one in far[:5]]
+        parts += ["Farthest from rest after release:", "\n".join(lines)]
     large = [one for one in ran if one.trial.residual_checked > 1e-2]
     if large:
-        lines += [f"Residual above 1e-2 under the probe in {len(large)} cases; the largest:", ""]
         large.sort(key=lambda one: -one.trial.residual_checked)
-        lines += [f"- {one.trial.residual_checked:.3g}: {_described(one)}" for one in large[:5]]
-        lines += [""]
-    return lines
+        lines = [f"- {one.trial.residual_checked:.3g}: {_described(one)}" for one in large[:5]]
+        parts += [f"Residual above 1e-2 under the probe in {len(large)} cases; the largest:"]
+        parts += ["\n".join(lines)]
+    return parts
 
 
 def _described(one: Tried) -> str:
@@ -198,7 +153,7 @@ def _described(one: Tried) -> str:
         f"ν = {case.poisson_ratio:.5g}, {case.motion} to {100 * case.depth:.0f} % of the depth, "
         f"{case.mesh}, {case.collider}, held: {case.support}"
     )
-    if one.method.startswith("msds"):
+    if TISSUE_METHODS[one.method].has_springs:
         text += f", {case.time_step:.2g} s steps, damping {case.damping:.2g}, {case.springs}"
     return text + ")"
 
@@ -212,22 +167,20 @@ def _said(tried: Sequence[Tried]) -> list[str]:
             counted.update({re.sub(r"\d[\d.e+-]*", "#", part) for part in parts})
     if not counted:
         return []
-    lines = ["What it said it did (numbers left out), in how many cases:", ""]
-    return [*lines, *(f"- {number}: {said}" for said, number in counted.most_common(12)), ""]
+    lines = [f"- {number}: {said}" for said, number in counted.most_common(12)]
+    return ["What it said it did (numbers left out), in how many cases:", "\n".join(lines)]
 
 
 def _refusals(tried: Sequence[Tried]) -> list[str]:
-    lines = ["## Refused, and with what words", "", "| case | methods | sentence |"]
-    lines += ["| --- | --- | --- |"]
-    seen: dict[str, tuple[str, list[str]]] = {}
+    """Each sentence once, though its numbers and the method in it differ."""
+    seen: dict[str, tuple[str, str, list[str]]] = {}
     for one in tried:
         if one.trial.refused:
             sentence = one.trial.actions[0].removeprefix("refused: ")
             key = re.sub(r"\d[\d.e+-]*", "#", sentence.replace(one.method, ""))
-            methods = seen.setdefault(key, (f"{one.name} | {{}} | {sentence}", []))[1]
+            methods = seen.setdefault(key, (one.name, sentence, []))[2]
             if one.method not in methods:
                 methods.append(one.method)
-    for text, methods in seen.values():
-        name, _, sentence = text.split(" | ", 2)
-        lines += [f"| {name} | {', '.join(methods)} | {sentence} |"]
-    return [*lines, ""]
+    rows = [(name, ", ".join(methods), sentence) for name, sentence, methods in seen.values()]
+    words = "## Refused, and with what words"
+    return [words, markdown_table(("case", "methods", "sentence"), rows)]

@@ -1,12 +1,12 @@
-"""What `us-sim evaluate tissue` presses: one block, its meshes, and the ways to press it.
+"""How `us-sim evaluate tissue` presses its block, and with what.
 
->>> from us_sim.evaluation.tissue.cases import MESHES, SCENES
+>>> from us_sim.evaluation.block import MESHES
+>>> from us_sim.evaluation.tissue.cases import SCENES
 >>> scene = SCENES["press_and_slide"]
 >>> len(scene.path), scene.path[-1].position.round(4).tolist()
 (18, [0.02, 0.0, 0.025])
->>> model = scene.model(MESHES[0])
->>> len(model.mesh.nodes), len(model.mesh.tetrahedra)
-(2000, 7695)
+>>> int(scene.model(MESHES[0]).fixed.sum())  # nodes at the bottom
+200
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.block import EXTENT, block
+from us_sim.evaluation.named import Named
+from us_sim.evaluation.tissue.graded_planes import graded_planes
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["LARGEST_MESH", "LOCKING", "MESHES", "SCENES", "Scene"]
+__all__ = ["LOCKING", "MAIN_SCENE", "SCENES", "Scene"]
 
-MESHES = ((20, 10, 10), (24, 12, 12), (28, 14, 14), (32, 16, 16))
-"""Nodes along x, y and z: the paper's four (section VI)."""
-LARGEST_MESH = (64, 32, 32)
+MAIN_SCENE = "press_25mm"
+"""The scene that is pressed on every mesh."""
 
-_EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, of the block along x, y and z
 _STEP = 0.0025  # m, of the probe in a frame
 _TURN = math.radians(2.5)  # of the probe in a frame
 _SPHERE = Sphere(0.03)
@@ -52,20 +55,19 @@ class Scene:
 
     def model(self, counts: tuple[int, int, int]) -> TissueModel:
         """The block on a uniform mesh of so many nodes along each axis."""
-        return TissueModel.block(
-            (0.2, 0.1, 0.1), counts, material=self.material, collider=self.collider
-        )
+        mesh = block(counts)
+        fixed = np.zeros(len(mesh.nodes), dtype=bool)
+        fixed[face_nodes(mesh, "bottom")] = True
+        materials = uniform_material(mesh, self.material)
+        return TissueModel(mesh, materials, fixed, self.collider, face_nodes(mesh, "top"))
 
     def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
-        # Not above: that needs scikit-fem, which nobody needs who only wants the block's meshes.
-        from us_sim.evaluation.tissue.reference import graded_planes
-
         low, high, beside = self.touched
         return (
-            graded_planes(*_EXTENT[0], low, high, size),
-            graded_planes(0.0, _EXTENT[1][1], 0.0, beside, size),
-            graded_planes(*_EXTENT[2], 0.0, 0.02, size),
+            graded_planes(*EXTENT[0], low, high, size),
+            graded_planes(0.0, EXTENT[1][1], 0.0, beside, size),
+            graded_planes(*EXTENT[2], 0.0, 0.02, size),
         )
 
 
@@ -75,8 +77,8 @@ def _press(depth: float) -> tuple[Pose, ...]:
 
 
 def _slide(depth: float, distance: float) -> tuple[Pose, ...]:
-    ways = np.arange(1, round(distance / _STEP) + 1) * _STEP
-    return tuple(Pose(np.array([x, 0.0, depth])) for x in ways)
+    travelled = np.arange(1, round(distance / _STEP) + 1) * _STEP
+    return tuple(Pose(np.array([x, 0.0, depth])) for x in travelled)
 
 
 def _tilt(depth: float, angle: float) -> tuple[Pose, ...]:
@@ -87,48 +89,47 @@ def _tilt(depth: float, angle: float) -> tuple[Pose, ...]:
     )
 
 
-_AROUND = (-0.03, 0.03, 0.03)
+_AROUND = (-0.03, 0.03, 0.03)  # m, what a sphere touches that is pressed straight down
 
-SCENES = {
-    scene.name: scene
-    for scene in (
-        Scene("press_12mm", "pressed by 12 mm", _SPHERE, _press(0.012), _AROUND),
-        Scene("press_25mm", "pressed by 25 mm", _SPHERE, _press(0.025), _AROUND),
+_ALL = (
+    Scene("press_12mm", "pressed by 12 mm", _SPHERE, _press(0.012), _AROUND),
+    Scene("press_25mm", "pressed by 25 mm", _SPHERE, _press(0.025), _AROUND),
+    Scene(
+        "press_and_slide",
+        "pressed by 25 mm, then slid by 20 mm",
+        _SPHERE,
+        _press(0.025) + _slide(0.025, 0.02),
+        (-0.01, 0.05, 0.03),
+    ),
+    Scene(
+        "tilt",
+        "a capsule pressed by 12 mm, then tilted by 20°",
+        Capsule(0.025, 0.04),
+        _press(0.012) + _tilt(0.012, math.radians(20)),
+        (-0.05, 0.05, 0.03),
+    ),
+    Scene(
+        "press_25mm_nu0.49",
+        "pressed by 25 mm, Poisson's ratio 0.49",
+        _SPHERE,
+        _press(0.025),
+        _AROUND,
+        0.49,
+    ),
+    *(
         Scene(
-            "press_and_slide",
-            "pressed by 25 mm, then slid by 20 mm",
+            f"press_12mm_nu{ratio}",
+            f"pressed by 12 mm, Poisson's ratio {ratio}",
             _SPHERE,
-            _press(0.025) + _slide(0.025, 0.02),
-            (-0.01, 0.05, 0.03),
-        ),
-        Scene(
-            "tilt",
-            "a capsule pressed by 12 mm, then tilted by 20°",
-            Capsule(0.025, 0.04),
-            _press(0.012) + _tilt(0.012, math.radians(20)),
-            (-0.05, 0.05, 0.03),
-        ),
-        Scene(
-            "press_25mm_nu0.49",
-            "pressed by 25 mm, Poisson's ratio 0.49",
-            _SPHERE,
-            _press(0.025),
+            _press(0.012),
             _AROUND,
-            0.49,
-        ),
-        *(
-            Scene(
-                f"press_12mm_nu{ratio}",
-                f"pressed by 12 mm, Poisson's ratio {ratio}",
-                _SPHERE,
-                _press(0.012),
-                _AROUND,
-                ratio,
-            )
-            for ratio in (0.49, 0.499, 0.4999)
-        ),
-    )
-}
+            ratio,
+        )
+        for ratio in (0.49, 0.499, 0.4999)
+    ),
+)
+
+SCENES = Named("scene of the tissue evaluation", {scene.name: scene for scene in _ALL})
 
 LOCKING = ("press_12mm", *(name for name in SCENES if name.startswith("press_12mm_nu")))
-"""Where linear tetrahedra lock: the same press of ever less compressible tissue."""
+"""Scenes in which linear tetrahedra lock: the same press of ever less compressible tissue."""

@@ -23,8 +23,7 @@ from us_sim.volume.phantom_cache import cache_folder
 
 __all__ = ["Reference", "kept_reference"]
 
-# m. Poses on the way to the last are this far apart, at least.
-_STRIDE = 0.005
+_STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
 
 _logger = logging.getLogger(__name__)
 

@@ -8,61 +8,31 @@ fine quadratic elements (`us_sim.evaluation.tissue.reference`).
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from us_sim.evaluation.report_folder import prepare_folder, write_rows
-from us_sim.evaluation.tissue.cases import LARGEST_MESH, LOCKING, MESHES, SCENES, Scene
+from us_sim.evaluation.block import LARGEST_MESH, MESHES
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures, words_of
+from us_sim.evaluation.steps import steps
+from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
 from us_sim.evaluation.tissue.kept_reference import Reference, kept_reference
-from us_sim.evaluation.tissue.own_equations import converged, equations, solved_independently
-from us_sim.evaluation.tissue.points import (
-    COLUMNS,
-    Outcome,
-    Point,
-    Timing,
-    compare,
-    held_memory,
-    timed,
-    volumes,
-)
+from us_sim.evaluation.tissue.own_equations import converged, solved_independently
+from us_sim.evaluation.tissue.points import Outcome, Point, Timing, compare, held_memory, timed
 from us_sim.evaluation.tissue.report import table, write_report
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
 from us_sim.progress import Progress
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import SOLVERS, create_solver
+from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["evaluate_tissue", "plan", "settings_of"]
+__all__ = ["Trial", "evaluate_tissue", "plan"]
 
-_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
-    "fem": (),
-    "fem_nonlinear": (
-        {"iterations": 2, "frame_tolerance": 0.5},
-        {"iterations": 4, "frame_tolerance": 0.1},
-        {"iterations": 12, "frame_tolerance": 0.01},
-        {"iterations": 30, "frame_tolerance": 0.001, "most_iterations": 200},
-    ),
-    "fem_cg": tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
-    "msds": (
-        {"steps": 5},
-        {"steps": 80},
-        {"stiffness": "fitted"},
-        {"stiffness": "fitted", "volume": True},
-        {"stiffness": "fitted", "volume": True, "steps": 80},
-    ),
-    "msds_implicit": (
-        {"iterations": 1},
-        {"iterations": 10},
-        {"iterations": 30},
-        {"stiffness": "algorithm_1", "volume": False},
-    ),
-}
-"""What is tried besides each method's own defaults."""
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
-_QUICK_SETTINGS = 2
+_QUICK_SETTINGS = 3  # of each method, the defaults among them
 _SIZES, _QUICK_SIZES = (0.01, 0.005, 0.00325), (0.01, 0.0065)  # m, of the reference's elements
-
-MAIN_SCENE = "press_25mm"  # the scene that is pressed on every mesh
 
 
 @dataclass(frozen=True)
@@ -72,18 +42,12 @@ class Trial:
     scene: Scene
     counts: tuple[int, int, int]
     method: str
-    setting: dict[str, Any]
+    setting: Setting
     own: bool  # whether its own equations are solved too
 
-
-def settings_of(method: str) -> list[dict[str, Any]]:
-    """The settings that are tried: the default and others.
-
-    Raises:
-        ImportError: the method's module cannot be imported.
-    """
-    SOLVERS.load(method)
-    return [{}, *_SETTINGS.get(method, ())]
+    def __str__(self) -> str:
+        """For a person who waits for it."""
+        return f"{self.scene.name}, {self.method}, {'x'.join(map(str, self.counts))}"
 
 
 def plan(quick: bool) -> list[Trial]:
@@ -104,14 +68,14 @@ def plan(quick: bool) -> list[Trial]:
             meshes = [MESHES[-1]] if locking else [*MESHES]
         for counts in meshes:
             finest = counts == MESHES[-1]
-            for method in SOLVERS:
-                settings = _known_settings(method)
+            own = (main and counts == MESHES[0]) or (finest and scene.name in _QUICK_SCENES)
+            for method in TISSUE_METHODS.values():
+                settings = method.settings
                 if quick:
-                    settings = settings[: 1 + _QUICK_SETTINGS if main and finest else 1]
+                    settings = settings[: _QUICK_SETTINGS if main and finest else 1]
                 elif locking or not (finest or (main and counts == MESHES[0])):
                     settings = settings[:1]
-                own = (main and counts == MESHES[0]) or (finest and scene.name in _QUICK_SCENES)
-                trials += [Trial(scene, counts, method, setting, own) for setting in settings]
+                trials += [Trial(scene, counts, method.name, setting, own) for setting in settings]
     return trials
 
 
@@ -129,39 +93,22 @@ def evaluate_tissue(out: Path, quick: bool) -> int:
         UsSimError: the folder cannot be written or holds a report, or no reference can be
             computed.
     """
-    begin = time.perf_counter()
-    prepare_folder(out, "tissue.md")
+    folder = ReportFolder("tissue", out, quick)
     trials = plan(quick)
-    scenes = {trial.scene.name: trial.scene for trial in trials}
-    references = _references(list(scenes.values()), quick)
-    points: list[Point] = []
-    with Progress("errors and times", len(trials), "points") as progress:
-        bench = _Bench(references)
-        for done, trial in enumerate(trials):
-            counts = "x".join(map(str, trial.counts))
-            progress.update(done, f"{trial.scene.name}, {trial.method}, {counts}")
-            points += bench.points(trial)
-        progress.update(len(trials))
-    write_rows(out / "tissue.csv", COLUMNS, [point.row for point in points])
-    seconds = time.perf_counter() - begin
-    pictures = write_report(out, points, references, quick, seconds)
-    print(table(points))
-    print(f"Report: {out / 'tissue.md'}; pictures: {', '.join(map(str, pictures))}")
-    failed = [point for point in points if point.failure]
-    for point in failed:
-        print(f"failed: {point.method} ({point.setting}) in {point.scene}: {point.failure}")
-    return 1 if failed else 0
+    references = _references({trial.scene.name: trial.scene for trial in trials}.values(), quick)
+    bench = _Bench(references)
+    points = [
+        point
+        for trial in steps("errors and times", trials, "points")
+        for point in bench.points(trial)
+    ]
+    folder.write_rows("tissue", points)
+    write_report(folder, points, references)
+    return folder.finish(table(points), failures(points))
 
 
-def _known_settings(method: str) -> list[dict[str, Any]]:
-    try:
-        return settings_of(method)
-    except ImportError:
-        return [{}]  # its trial fails, and says so
-
-
-def _references(scenes: list[Scene], quick: bool) -> dict[str, Reference]:
-    found: dict[str, Reference] = {}
+def _references(scenes: Iterable[Scene], quick: bool) -> dict[str, Reference]:
+    scenes, found = list(scenes), {}
     with Progress("nonlinear reference", len(scenes), "scenes") as progress:
         for done, scene in enumerate(scenes):
 
@@ -176,7 +123,7 @@ def _references(scenes: list[Scene], quick: bool) -> dict[str, Reference]:
 
 
 class _Bench:
-    """Runs trials; keeps what several of them share."""
+    """Runs trials; keeps what several of them have in common."""
 
     def __init__(self, references: dict[str, Reference]) -> None:
         self._references = references
@@ -205,14 +152,14 @@ class _Bench:
                 solver.warm_up()
                 self._warm.add(trial.method)
             timing = timed(solver, trial.scene, threads)
-            smallest = float((volumes(model, timing.last.nodes) / model.mesh.volumes).min())
+            volumes = signed_volumes(timing.last.nodes, model.mesh.tetrahedra)
             done = replace(
                 empty,
                 ms_median=timing.median,
                 ms_p99=timing.p99,
                 memory=float(held_memory(solver)),
                 setup=setup,
-                smallest_volume_ratio=smallest,
+                smallest_volume_ratio=float((volumes / model.mesh.volumes).min()),
             )
             del solver
             found = Outcome.of(model, timing.last)
@@ -232,7 +179,7 @@ class _Bench:
 
     @staticmethod
     def _failed(point: Point, error: Exception) -> Point:
-        words = f"{type(error).__name__}: {error}".replace("\n", " ")
+        words = words_of(error)
         return replace(point, reference=f"failed: {words}", failure=words)
 
     def _model(self, trial: Trial) -> TissueModel:
@@ -244,11 +191,12 @@ class _Bench:
     def _own_solution(
         self, trial: Trial, model: TissueModel, timing: Timing
     ) -> tuple[Outcome, str]:
-        if trial.method == "fem":
+        method = TISSUE_METHODS[trial.method]
+        if method.patient is None:
             return solved_independently(trial.scene, model, timing.last)
-        key = equations(trial.method, trial.setting)
+        key = method.equations(trial.setting)
         if key not in self._exact:
-            self._exact[key] = converged(trial.scene, model, trial.method, trial.setting)
+            self._exact[key] = converged(trial.scene, model, method, trial.setting)
         return self._exact[key]
 
     def _nonlinear(self, trial: Trial, model: TissueModel) -> tuple[Outcome, str]:

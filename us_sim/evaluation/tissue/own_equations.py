@@ -3,60 +3,34 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 
 from us_sim.evaluation.tissue.cases import Scene
 from us_sim.evaluation.tissue.linear_equations import LinearEquations
-from us_sim.evaluation.tissue.points import Outcome, volumes
+from us_sim.evaluation.tissue.points import Outcome
+from us_sim.evaluation.tissue_methods import Setting, TissueMethod
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["EFFORT", "converged", "equations", "solved_independently"]
+__all__ = ["converged", "solved_independently"]
 
-EFFORT = (
-    "iterations",
-    "steps",
-    "threads",
-    "contact_updates",
-    "frame_tolerance",
-    "tolerance",
-    "most_iterations",
-    "time_step",
-)
-"""Settings that say how hard a method tries, and not what it solves."""
-
-_PATIENT: dict[str, dict[str, Any]] = {
-    "fem_nonlinear": {
-        "iterations": 60,
-        "most_iterations": 400,
-        "frame_tolerance": 1e-7,
-        "tolerance": 1e-7,
-    },
-    "fem_cg": {"iterations": 500, "tolerance": 1e-9},
-    "msds": {"steps": 100, "rest_tolerance": 1e-8},
-    "msds_implicit": {"iterations": 50, "tolerance": 1e-8, "rest_tolerance": 1e-8},
-}
-"""What each method is given to converge; a setting that it has not is left out."""
-_FRAMES = 400
-_LONGEST = 10.0  # s
-
-
-def equations(method: str, setting: dict[str, Any]) -> tuple[Any, ...]:
-    """What two settings have in common when they approach the same solution."""
-    kept = {key: value for key, value in setting.items() if key not in EFFORT}
-    return (method, *sorted(kept.items()))
+_FRAMES = 400  # at the last pose, at the most
+_LONGEST = 10.0  # s, of these frames together
 
 
 def converged(
-    scene: Scene, model: TissueModel, method: str, setting: dict[str, Any]
+    scene: Scene, model: TissueModel, method: TissueMethod, setting: Setting
 ) -> tuple[Outcome, str]:
-    """The scene's end by a method that takes its time, and words that say how far it came."""
-    kept = {key: value for key, value in setting.items() if key not in EFFORT}
-    solver = create_solver(method, model, **kept, **_PATIENT.get(method, {}))
+    """The scene's end by an iterative method that goes on until nothing changes.
+
+    The words say how far it came.
+    """
+    patient = method.without_effort(setting) | dict(method.patient or {})
+    solver = create_solver(method.name, model, **patient)
     for pose in scene.path:
         deformation = solver.deform(pose)
     begin = time.perf_counter()
@@ -67,7 +41,7 @@ def converged(
     settled = "settled" if deformation is before else "cut off"
     return (
         Outcome.of(model, deformation),
-        f"own equations: {method} {settled} at residual {deformation.residual:.0e}",
+        f"own equations: {method.name} {settled} at residual {deformation.residual:.0e}",
     )
 
 
@@ -80,7 +54,8 @@ def solved_independently(
     depths = np.einsum("ij,ij->i", normals, deformation.nodes[touched] - model.mesh.nodes[touched])
     displacement, pushes = LinearEquations(model).solve(touched, normals, depths)
     force = -float(((pushes[:, None] * normals).sum(axis=0) @ pose.rotation)[2])
-    volume = float(volumes(model, model.mesh.nodes + displacement).sum())
+    nodes = model.mesh.nodes + displacement
+    volume = float(signed_volumes(nodes, model.mesh.tetrahedra).sum())
     return (
         Outcome(displacement, force, volume),
         "own equations: scikit-fem and SciPy on fem's contact",

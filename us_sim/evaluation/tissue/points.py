@@ -12,20 +12,22 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from us_sim.evaluation.row import Row, not_a_column
 from us_sim.evaluation.run_times import RunTimes
 from us_sim.evaluation.tissue.cases import Scene
 from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver
 
-__all__ = ["COLUMNS", "Errors", "Outcome", "Point", "Timing", "compare", "held_memory", "timed"]
+__all__ = ["Errors", "Outcome", "Point", "Timing", "compare", "held_memory", "timed"]
 
 _PASSES = 3  # along the path; the first is not timed
 _LONGEST = 20.0  # s, after which no further pass begins
@@ -41,7 +43,7 @@ class Errors(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Point:
+class Point(Row):
     """A row of tissue.csv, and what the report says beyond it."""
 
     scene: str
@@ -57,26 +59,21 @@ class Point:
     force_error: float = float("nan")
     volume_error: float = float("nan")
     reference: str = ""  # what the errors are against; begins with `own` or with `nonlinear`
-    default: bool = field(default=False, metadata={"column": False})
-    memory: float = field(default=float("nan"), metadata={"column": False})  # bytes
-    setup: float = field(default=float("nan"), metadata={"column": False})  # s
-    smallest_volume_ratio: float = field(default=float("nan"), metadata={"column": False})
-    failure: str = field(default="", metadata={"column": False})
+    default: bool = not_a_column(False)
+    memory: float = not_a_column(float("nan"))  # bytes
+    setup: float = not_a_column(float("nan"))  # s
+    smallest_volume_ratio: float = not_a_column(float("nan"))
+    failure: str = not_a_column("")
 
     @property
-    def row(self) -> list[str]:
-        """As in the file."""
-        values = (getattr(self, name) for name in COLUMNS)
-        return [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values]
+    def title(self) -> str:
+        """The method, its settings, and what it was tried on."""
+        return f"{self.method} ({self.setting}), {self.scene}, {self.nodes:,} nodes"
 
     @property
     def own(self) -> bool:
         """Whether the errors are against the method's own converged equations."""
         return self.reference.startswith("own")
-
-
-COLUMNS = [entry.name for entry in fields(Point) if entry.metadata.get("column", True)]
-"""Of tissue.csv, in order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +90,7 @@ class Outcome:
         return cls(
             deformation.nodes - model.mesh.nodes,
             float(deformation.force[2]),
-            float(volumes(model, deformation.nodes).sum()),
+            float(signed_volumes(deformation.nodes, model.mesh.tetrahedra).sum()),
         )
 
 
@@ -130,12 +127,6 @@ def compare(found: Outcome, exact: Outcome, rest_volume: float) -> Errors:
         abs(found.force / exact.force - 1.0),
         abs(found.volume - exact.volume) / rest_volume,
     )
-
-
-def volumes(model: TissueModel, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(M,) m3, of the mesh's tetrahedra with their nodes at (N, 3) m."""
-    a, b, c, d = np.moveaxis(nodes[model.mesh.tetrahedra], 1, 0)
-    return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6
 
 
 def held_memory(solver: TissueSolver) -> int:

@@ -36,19 +36,18 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 
-__all__ = ["Solution", "graded_planes", "solve_contact"]
+__all__ = ["Solution", "solve_contact"]
 
-# Pa/m over Young's modulus: a soft contact finds its extent in few steps, a hard one is exact. The
-# multipliers are updated each time that the penalty is raised.
 _SOFT = 200.0
+"""Penalty, Pa/m over Young's modulus, of the first poses: a soft contact is found in few steps."""
 _HARDER = (200.0, 200.0, 1000.0, 5000.0, 20000.0)
+"""Penalties at the last pose; a hard contact is exact. The multipliers are updated each time."""
 _AUGMENTATIONS = 4
 _PENETRATION = 1.5e-5  # m, above which the multipliers are updated once more
-_TOLERANCE = 1e-5  # unbalanced force over contact force at the end
-_APPROACHING = 1e-2  # the same, on the way
+_TOLERANCE = 1e-5  # unbalanced force over contact force at the last pose
+_APPROACHING = 1e-2  # the same at the poses before
 _NEWTON_STEPS = 60
 _SHORTEST_STEP = 2.0**-12
-_GROWTH = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,27 +69,6 @@ class Solution:
     def pressure_near(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P,) Pa at the surface points that are nearest to rest positions (P, 3) m."""
         return self.pressure[cKDTree(self.block.surface_points).query(points)[1]]
-
-
-def graded_planes(
-    low: float, high: float, fine_low: float, fine_high: float, size: float
-) -> NDArray[np.float64]:
-    """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside."""
-    count = max(1, round((fine_high - fine_low) / size))
-    fine = np.linspace(fine_low, fine_high, count + 1)
-    parts = [fine]
-    for length, end, direction in (
-        (fine_low - low, fine_low, -1),
-        (high - fine_high, fine_high, 1),
-    ):
-        if length <= 0:
-            continue
-        number = max(1, round(np.log1p(length / size * (1 - 1 / _GROWTH)) / np.log(_GROWTH)))
-        steps = _GROWTH ** np.arange(1, number + 1)
-        parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
-    planes = np.unique(np.concatenate(parts))
-    planes[[0, -1]] = low, high
-    return planes
 
 
 def solve_contact(
@@ -273,17 +251,17 @@ def _movable(block: NeoHookeanHexahedra, points: NDArray[np.float64]) -> NDArray
 def _trilinear(planes: Sequence[NDArray[np.float64]], points: NDArray[np.float64]) -> csr_array:
     """(P, K), interpolation from the grid's K nodes, the last axis fastest, to points (P, 3)."""
     shape = tuple(len(coordinates) for coordinates in planes)
-    cells, shares = [], []
+    cells, fractions = [], []
     for axis, coordinates in enumerate(planes):
         cell = np.searchsorted(coordinates, points[:, axis], side="right") - 1
         cell = np.clip(cell, 0, len(coordinates) - 2)
         cells.append(cell)
-        shares.append((points[:, axis] - coordinates[cell]) / np.diff(coordinates)[cell])
+        fractions.append((points[:, axis] - coordinates[cell]) / np.diff(coordinates)[cell])
     columns, weights = [], []
     for corner in np.ndindex(2, 2, 2):
         place = [cell + offset for cell, offset in zip(cells, corner, strict=True)]
         columns.append(np.ravel_multi_index(place, shape))
-        near = [s if offset else 1.0 - s for s, offset in zip(shares, corner, strict=True)]
+        near = [f if offset else 1.0 - f for f, offset in zip(fractions, corner, strict=True)]
         weights.append(np.prod(near, axis=0))
     matrix = csr_array(
         (

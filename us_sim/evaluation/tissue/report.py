@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from us_sim.evaluation.machine import machine
+from us_sim.evaluation.block import MESHES
 from us_sim.evaluation.markdown_table import markdown_table
-from us_sim.evaluation.tissue.cases import LOCKING, MESHES, SCENES
+from us_sim.evaluation.power_law import exponent
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
+from us_sim.evaluation.tissue.cases import LOCKING, SCENES
 from us_sim.evaluation.tissue.kept_reference import Reference
-from us_sim.evaluation.tissue.plots import exponent, plot_errors, plot_sizes
+from us_sim.evaluation.tissue.plots import plot_errors, plot_sizes
 from us_sim.evaluation.tissue.points import Point
 
 __all__ = ["pareto_front", "table", "write_report"]
 
 _PAPERS_FINEST = int(np.prod(MESHES[-1]))
+_DEFAULTS = ("scene", "method", "nodes", "ms", "p99 ms", "L2 %", "max mm", "force %", "volume %")
 
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: the defaults of every method against the nonlinear reference."""
     return markdown_table(
-        ("scene", "method", "nodes", "ms", "p99", "L2 %", "max mm", "force %", "volume %"),
-        [
-            (
-                p.scene,
-                p.method,
-                f"{p.nodes}",
-                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
-                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
-            )
-            for p in points
-            if p.default and not p.own
-        ],
+        _DEFAULTS,
+        [_default_cells(p) for p in points if p.default and not p.own],
     )
 
 
@@ -49,81 +41,66 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def write_report(
-    out: Path,
-    points: Sequence[Point],
-    references: dict[str, Reference],
-    quick: bool,
-    seconds: float,
-) -> list[Path]:
-    """Write tissue.md and its pictures; returns the pictures' files."""
-    focus = _Focus.of(points)
-    finest = [p for p in points if p.nodes == focus.nodes]
-    main = [p for p in points if p.scene == focus.scene]
+    folder: ReportFolder, points: Sequence[Point], references: dict[str, Reference]
+) -> None:
+    """Draw the pictures and write tissue.md.
+
+    What can be shown of one mesh only is of the paper's finest, or else of the finest there is;
+    what can be shown of one scene only is of the one that is pressed on the most meshes.
+    """
+    sizes = {p.nodes for p in points}
+    nodes = _PAPERS_FINEST if _PAPERS_FINEST in sizes else max(sizes)
+    meshes = {name: len({p.nodes for p in points if p.scene == name}) for name in references}
+    scene = max(meshes, key=lambda name: meshes[name])
     nonlinear = [p for p in points if not p.own]
-    shown = [name for name in references if name not in LOCKING[1:]]
-    pictures = {
-        "tissue_error.png": (
-            "Error against run time, to large deformation on fine quadratic elements "
-            f"({focus.nodes:,} nodes)",
-            {name: [p for p in finest if p.scene == name and not p.own] for name in shown},
+    by_size = [p for p in nonlinear if p.default and p.scene == scene]
+    panels = {
+        "error": (
+            f"Error against run time, to large deformation on fine quadratic elements "
+            f"({nodes:,} nodes)",
+            _by_scene(nonlinear, references, nodes),
         ),
-        "tissue_own_error.png": (
-            "Error against run time, to each method's own converged equations "
-            f"({focus.nodes:,} nodes)",
-            {name: [p for p in finest if p.scene == name and p.own] for name in shown},
+        "own_error": (
+            f"Error against run time, to each method's own converged equations ({nodes:,} nodes)",
+            _by_scene([p for p in points if p.own], references, nodes),
         ),
-        "tissue_meshes.png": (
-            f"Error against run time, by mesh, {SCENES[focus.scene].words}",
+        "meshes": (
+            f"Error against run time, by mesh, {SCENES[scene].words}",
             {
-                f"{nodes:,} nodes": [p for p in main if p.nodes == nodes and not p.own]
-                for nodes in sorted({p.nodes for p in main})
+                f"{count:,} nodes": [p for p in nonlinear if (p.scene, p.nodes) == (scene, count)]
+                for count in sorted({p.nodes for p in points if p.scene == scene})
             },
         ),
     }
-    files = []
-    for name, (title, panels) in pictures.items():
-        plot_errors({words: some for words, some in panels.items() if some}, title, out / name)
-        files.append(out / name)
-    sizes = [p for p in nonlinear if p.default and p.scene == focus.scene]
-    plot_sizes(sizes, f"Cost against size, {SCENES[focus.scene].words}", out / "tissue_size.png")
-    files.append(out / "tissue_size.png")
-    text = _text(points, references, sizes, focus, quick, seconds)
-    (out / "tissue.md").write_text(text, encoding="utf-8")
-    return files
+    for name, (title, panel) in panels.items():
+        some = {words: shown for words, shown in panel.items() if shown}
+        plot_errors(some, title, folder.picture(name))
+    plot_sizes(by_size, f"Cost against size, {SCENES[scene].words}", folder.picture("size"))
+    folder.write_report(_parts(folder, points, references, by_size, scene, nodes), failures(points))
 
 
-@dataclass(frozen=True)
-class _Focus:
-    """What is shown where only one mesh, or one scene, can be."""
-
-    nodes: int
-    scene: str
-
-    @classmethod
-    def of(cls, points: Sequence[Point]) -> _Focus:
-        """The paper's finest mesh, or the finest there is; the scene on the most meshes."""
-        sizes = {p.nodes for p in points}
-        scenes = list(dict.fromkeys(p.scene for p in points))
-        meshes = [len({p.nodes for p in points if p.scene == scene}) for scene in scenes]
-        return cls(
-            _PAPERS_FINEST if _PAPERS_FINEST in sizes else max(sizes),
-            scenes[int(np.argmax(meshes))],
-        )
+def _by_scene(
+    points: Sequence[Point], references: dict[str, Reference], nodes: int
+) -> dict[str, list[Point]]:
+    """The points on one mesh, by scene, without those scenes in which tetrahedra lock."""
+    return {
+        name: [p for p in points if p.scene == name and p.nodes == nodes]
+        for name in references
+        if name not in LOCKING[1:]
+    }
 
 
-def _text(
+def _parts(
+    folder: ReportFolder,
     points: Sequence[Point],
     references: dict[str, Reference],
-    sizes: Sequence[Point],
-    focus: _Focus,
-    quick: bool,
-    seconds: float,
-) -> str:
-    parts = [
+    by_size: Sequence[Point],
+    scene: str,
+    nodes: int,
+) -> list[str]:
+    return [
         "# Tissue: error against run time",
-        f"`us-sim evaluate tissue{' --quick' if quick else ''}`, {seconds:.0f} s, on "
-        f"{machine('numpy', 'scipy', 'numba', 'scikit-fem')}. "
-        "Every row is in [tissue.csv](tissue.csv).",
+        folder.opening("numpy", "scipy", "numba", "scikit-fem"),
         "A block of 0.2 × 0.1 × 0.1 m, held at its bottom, E = 10 kPa and ν = 0.45 unless a scene "
         "says otherwise, is pressed by a sphere of 30 mm radius that moves 2.5 mm a frame (in "
         "`tilt` by a capsule of 25 mm radius that turns 2.5° a frame). Times are of whole frames, "
@@ -139,33 +116,23 @@ def _text(
         "the dotted line is 30 frames a second.",
         _table_of_defaults(points),
         "### The Pareto front",
-        f"Methods than which no other was both faster and more accurate, on {focus.nodes:,} nodes:",
-        *(_front(points, name, focus.nodes) for name in references if name not in LOCKING[1:]),
+        f"Methods than which no other was both faster and more accurate, on {nodes:,} nodes:",
+        *(_front(points, name, nodes) for name in references if name not in LOCKING[1:]),
         "![Error against run time on several meshes](tissue_meshes.png)",
         "## Against each method's own equations",
         "The same mesh and method with as many iterations as it takes (`fem` against an "
         "independent assembly by scikit-fem, solved by SciPy). This is what the hurry of a frame "
         "costs; what is left in the picture above is the mesh and the model.",
         "![Error to own equations](tissue_own_error.png)",
-        _own_table(points, focus),
+        _own_table(points, scene, nodes),
         *_locking(points),
         "## Cost against size",
         "Memory is that of the arrays that a solver holds when it is ready, those of its mesh "
         "included. Set-up is the time to make the solver, which may read its precomputed part from "
         "the cache.",
         "![Cost against size](tissue_size.png)",
-        _size_table(sizes),
+        _size_table(by_size),
     ]
-    failures = [p for p in points if p.failure]
-    if failures:
-        parts += [
-            "## Failed",
-            "\n".join(
-                f"- {p.method} ({p.setting}), {p.scene}, {p.nodes:,} nodes: {p.failure}"
-                for p in failures
-            ),
-        ]
-    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _locking(points: Sequence[Point]) -> list[str]:
@@ -216,34 +183,23 @@ def _reference_table(references: dict[str, Reference]) -> str:
 
 def _table_of_defaults(points: Sequence[Point]) -> str:
     return markdown_table(
-        (
-            "scene",
-            "method",
-            "nodes",
-            "ms",
-            "p99 ms",
-            "L2 %",
-            "max mm",
-            "force %",
-            "volume %",
-            "smallest volume ratio",
-        ),
+        (*_DEFAULTS, "smallest volume ratio"),
         [
-            (
-                p.scene,
-                p.method,
-                f"{p.nodes:,}",
-                *(_number(v) for v in (p.ms_median, p.ms_p99, 100 * p.rel_l2_error)),
-                *(_number(v) for v in (p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)),
-                _number(p.smallest_volume_ratio),
-            )
+            (*_default_cells(p), _number(p.smallest_volume_ratio))
             for p in points
             if p.default and not p.own
         ],
     )
 
 
-def _own_table(points: Sequence[Point], focus: _Focus) -> str:
+def _default_cells(p: Point) -> tuple[str, ...]:
+    """The cells of the columns `_DEFAULTS`."""
+    errors = (100 * p.rel_l2_error, p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)
+    numbers = (p.ms_median, p.ms_p99, *errors)
+    return (p.scene, p.method, f"{p.nodes:,}", *(_number(value) for value in numbers))
+
+
+def _own_table(points: Sequence[Point], scene: str, nodes: int) -> str:
     return markdown_table(
         ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference"),
         [
@@ -256,7 +212,7 @@ def _own_table(points: Sequence[Point], focus: _Focus) -> str:
                 p.reference,
             )
             for p in points
-            if p.own and p.scene == focus.scene and p.nodes == focus.nodes
+            if p.own and p.scene == scene and p.nodes == nodes
         ],
     )
 
@@ -272,7 +228,9 @@ def _size_table(sizes: Sequence[Point]) -> str:
             ("s to set up", lambda p: p.setup),
         ):
             numbers = [_number(value(mine[n])) if n in mine else "" for n in counts]
-            rows.append((method, what, *numbers, _number(exponent(list(mine.values()), value))))
+            rows.append(
+                (method, what, *numbers, _number(exponent({n: value(p) for n, p in mine.items()})))
+            )
     return markdown_table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
 
 

@@ -9,66 +9,65 @@
 
 from __future__ import annotations
 
+import math
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.named import Named
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import exp, rotation_exp
 from us_sim.share import shared_path
-from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.rendered_views import Conditions
+from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.rigid_body_file import read_rigid_body
 
 __all__ = [
-    "CAMERAS",
     "CONDITIONS",
     "FRAMES",
+    "LARGE",
     "MARKERS",
     "RIGID_BODY",
     "SINGLE",
+    "SMALL",
     "Case",
     "Marker",
+    "MarkerKind",
     "cases",
     "marker",
 ]
 
+SMALL, LARGE = WEBCAMS  # images, by their sizes
 RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"
 FRAMES = 5
 """Views in a row, as a hand moves the body; before the first, the tracker forgets everything."""
 
 _RATE = 30.0  # frames per second
-_SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s of the hand
+_SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s, of the hand
 _EXPOSURE = 0.015  # s, in the condition with motion blur
 _HASTE = 3.0  # times the hand's speed in that condition
-_LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
 
-
-def _pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-CAMERAS = {
-    "640x480": CameraModel(640, 480, _pinhole(600.0, 601.0, 322.3, 238.1), _LENS),
-    "1920x1080": CameraModel(1920, 1080, _pinhole(1350.0, 1352.0, 965.2, 536.7), 0.3 * _LENS),
-}
-"""Webcams of the same field of view from top to bottom, 44°."""
-
-CONDITIONS = {
-    "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),
-    "noise": (Conditions(read_noise=4.0, shot_noise=0.05), "5 grey levels of noise, as at dusk"),
-    "blur": (
-        Conditions(defocus=1.6),
-        f"out of focus by 1.6 pixels, and moving by {_HASTE * _SPEED * _EXPOSURE * 1e3:.1f} mm "
-        f"during the exposure",
-    ),
-    "occlusion": (Conditions(occlusion=0.35), "a hand over a third of the body"),
-    "gradient": (Conditions(gradient=0.7), "light that falls by 70 % across the image"),
-}
+CONDITIONS = Named(
+    "condition",
+    {
+        "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),
+        "noise": (
+            Conditions(read_noise=4.0, shot_noise=0.05),
+            "5 grey levels of noise, as at dusk",
+        ),
+        "blur": (
+            Conditions(defocus=1.6),
+            f"out of focus by 1.6 pixels, and moving by {_HASTE * _SPEED * _EXPOSURE * 1e3:.1f} mm "
+            f"during the exposure",
+        ),
+        "occlusion": (Conditions(occlusion=0.35), "a hand over a third of the body"),
+        "gradient": (Conditions(gradient=0.7), "light that falls by 70 % across the image"),
+    },
+)
 """What makes views worse, and that in words."""
 
 
@@ -78,31 +77,68 @@ class Marker:
 
     body: RigidBody
     front: NDArray[np.float64]  # (3,) unit, towards the camera
+
+
+@dataclass(frozen=True)
+class MarkerKind:
+    """What is known of a kind of body: how a report names and draws it, and how it is made."""
+
+    name: str
     words: str
+    colour: str
+    mark: str  # of its points in a plot, as Matplotlib names it
+    body: Callable[[], RigidBody]
+    front: tuple[float, float, float] | None = None  # not given, the first marker's normal
 
 
-MARKERS = (SINGLE, "apriltag_40mm", "charuco_board", "grid_board", RIGID_BODY)
+_ALL = (
+    MarkerKind(
+        SINGLE,
+        "one ArUco marker of 40 mm",
+        "#D55E00",
+        "D",
+        lambda: RigidBody.single("4X4_50", 7, 0.04),
+    ),
+    MarkerKind(
+        "apriltag_40mm",
+        "one AprilTag of 40 mm",
+        "#E69F00",
+        "v",
+        lambda: RigidBody.single("APRILTAG_36h11", 7, 0.04),
+    ),
+    MarkerKind(
+        "charuco_board",
+        "ChArUco, 5 × 4 squares of 24 mm with markers of 18 mm",
+        "#0072B2",
+        "o",
+        lambda: RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018),
+    ),
+    MarkerKind(
+        "grid_board",
+        "4 × 3 ArUco markers of 24 mm, 6 mm apart",
+        "#009E73",
+        "s",
+        lambda: RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006),
+    ),
+    MarkerKind(
+        RIGID_BODY,
+        "6 markers of 30 mm on three facets, 4 of them visible at 0°",
+        "#CC79A7",
+        "^",
+        lambda: read_rigid_body(shared_path("config/markers/probe_grip.yaml")),
+        # Between its middle facet and the one to the right: these two are seen, at 30° each.
+        front=(0.5, 0.0, math.sqrt(0.75)),
+    ),
+)
+MARKERS = Named("body of markers", {kind.name: kind for kind in _ALL})
+"""By name, in the reports' order; colours are told apart in every common colour blindness."""
 
 
 @lru_cache
 def marker(name: str) -> Marker:
-    """One of the bodies of `MARKERS`."""
-    if name == SINGLE:
-        body, words = RigidBody.single("4X4_50", 7, 0.04), "one ArUco marker of 40 mm"
-    elif name == "apriltag_40mm":
-        body, words = RigidBody.single("APRILTAG_36h11", 7, 0.04), "one AprilTag of 40 mm"
-    elif name == "charuco_board":
-        body = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018)
-        words = "ChArUco, 5 × 4 squares of 24 mm with markers of 18 mm"
-    elif name == "grid_board":
-        body = RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006)
-        words = "4 × 3 ArUco markers of 24 mm, 6 mm apart"
-    else:
-        # Between its middle facet and the one to the right: these two are seen, at 30° each.
-        body = read_rigid_body(shared_path("config/markers/probe_grip.yaml"))
-        front = np.array([0.5, 0.0, np.sqrt(0.75)])
-        return Marker(body, front, "6 markers of 30 mm on three facets, 4 of them visible at 0°")
-    return Marker(body, body.normals[0], words)
+    """One of the bodies of `MARKERS`, made once."""
+    body, front = MARKERS[name].body(), MARKERS[name].front
+    return Marker(body, body.normals[0] if front is None else np.array(front))
 
 
 @dataclass(frozen=True)
@@ -118,7 +154,7 @@ class Case:
     def sequence(self, number: int) -> list[Pose]:
         """Poses of the body in ``camera_optical``, `FRAMES` of them; the middle one as asked."""
         random = np.random.default_rng([zlib.crc32(repr(self).encode()), number])
-        camera, seen = CAMERAS[self.image_size], marker(self.marker)
+        camera, seen = WEBCAMS[self.image_size], marker(self.marker)
         size = np.array([camera.width, camera.height])
         pixel = size * (0.5 + random.uniform(-0.12, 0.12, 2))
         place = np.append(camera.rays(pixel[None])[0], 1.0)
@@ -148,10 +184,10 @@ class Case:
     def velocity(self, number: int) -> NDArray[np.float64]:
         """(6,) m/s and rad/s, of a sequence's middle, along the camera's axes."""
         random = np.random.default_rng([zlib.crc32(repr(self).encode()), number, 1])
-        ways = random.normal(size=(2, 3))
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        directions = random.normal(size=(2, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         haste = _HASTE if self.condition == "blur" else 1.0
-        return haste * np.concatenate([_SPEED * ways[0], _TURNING * ways[1]])
+        return haste * np.concatenate([_SPEED * directions[0], _TURNING * directions[1]])
 
     def motion(self, number: int) -> NDArray[np.float64] | None:
         """(6,) from the beginning to the end of the exposure; None where it is too short."""
@@ -165,14 +201,13 @@ def cases(quick: bool) -> list[Case]:
     tilted = (30.0,) if quick else (0.0, 30.0, 60.0)
     found = []
     for name in MARKERS:
-        small, large = CAMERAS
-        found += [Case(name, small, d, a) for d in distances for a in angles]
-        found += [Case(name, small, 0.4, a, c) for c in CONDITIONS if c != "plain" for a in tilted]
+        found += [Case(name, SMALL, d, a) for d in distances for a in angles]
+        found += [Case(name, SMALL, 0.4, a, c) for c in CONDITIONS if c != "plain" for a in tilted]
         found += [
-            Case(name, large, d, a) for d in ((0.4,) if quick else (0.4, 0.9)) for a in tilted
+            Case(name, LARGE, d, a) for d in ((0.4,) if quick else (0.4, 0.9)) for a in tilted
         ]
         if not quick:
-            found += [Case(name, large, 0.4, 30.0, c) for c in CONDITIONS if c != "plain"]
+            found += [Case(name, LARGE, 0.4, 30.0, c) for c in CONDITIONS if c != "plain"]
     return found
 
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.named import Named
+from us_sim.evaluation.row import Row
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
 from us_sim.settings.registry import FILTERS
@@ -25,27 +27,32 @@ from us_sim.tracking.filter.pose_filter import create_filter
 from us_sim.tracking.filter.settings import KalmanSettings, OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["COLUMNS", "FilterPoint", "delay", "filter_points"]
+__all__ = ["FILTER_METHODS", "FilterPoint", "delay", "filter_point", "filter_trials"]
 
-COLUMNS = (
-    *("filter", "setting", "rate_hz", "noise_mm", "noise_deg", "lag_ms", "rotation_lag_ms"),
-    *("jitter_mm", "jitter_deg", "moving_jitter_mm", "error_mm", "stated_lag_ms", "us_per_pose"),
+FILTER_METHODS = Named(
+    "evaluated filter",
+    {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")},
 )
+"""By name, the colour and the mark of its points in a plot."""
 
 _RATE = 60.0  # Hz
 _NOISE, _TURN_NOISE = 3e-4, 3.5e-3  # m and rad, standard deviation of a coordinate
 _MOVING, _REST = 8.0, 8.0  # s
-_BEGINNING, _SETTLING = 1.0, 4.0  # s of motion, and of rest, that are not judged
-_LONGEST = 0.8  # s
-# Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor.
+_BEGINNING, _SETTLING = 1.0, 4.0  # s of the motion, and of the rest, that do not count
+_LONGEST = 0.8  # s, of lags that are looked for
 _SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
+"""Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor."""
 
 _Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+FilterTrial = tuple[str, Settings | None, str]
+"""A filter's name, its settings, and those in words."""
 
 
 @dataclass(frozen=True)
-class FilterPoint:
+class FilterPoint(Row):
     """A row of filters.csv."""
+
+    decimals = 4
 
     method: str
     setting: str
@@ -60,29 +67,31 @@ class FilterPoint:
     seconds: float  # a pose
 
     @property
-    def row(self) -> tuple[object, ...]:
-        """The values of `COLUMNS`."""
-        return (
-            *(
-                self.method,
-                self.setting,
-                _RATE,
-                1e3 * _NOISE,
-                round(float(np.degrees(_TURN_NOISE)), 3),
-            ),
-            *(round(1e3 * self.lag, 2), round(1e3 * self.rotation_lag, 2)),
-            *(round(1e3 * self.jitter, 4), round(float(np.degrees(self.rotation_jitter)), 4)),
-            *(round(1e3 * self.moving_jitter, 4), round(1e3 * self.error, 4)),
-            *(round(1e3 * self.stated, 2), round(1e6 * self.seconds, 1)),
-        )
+    def values(self) -> dict[str, object]:
+        """By column."""
+        return {
+            "filter": self.method,
+            "setting": self.setting,
+            "rate_hz": _RATE,
+            "noise_mm": 1e3 * _NOISE,
+            "noise_deg": round(float(np.degrees(_TURN_NOISE)), 3),
+            "lag_ms": round(1e3 * self.lag, 2),
+            "rotation_lag_ms": round(1e3 * self.rotation_lag, 2),
+            "jitter_mm": 1e3 * self.jitter,
+            "jitter_deg": float(np.degrees(self.rotation_jitter)),
+            "moving_jitter_mm": 1e3 * self.moving_jitter,
+            "error_mm": 1e3 * self.error,
+            "stated_lag_ms": round(1e3 * self.stated, 2),
+            "us_per_pose": round(1e6 * self.seconds, 1),
+        }
 
 
-def filter_points(quick: bool) -> list[FilterPoint]:
-    """Every filter over its settings, on the same noisy path."""
+def filter_trials(quick: bool) -> list[FilterTrial]:
+    """Every filter over its settings; all are to follow the same noisy path."""
     cutoffs = (0.5, 1.5, 6.0) if quick else (0.25, 0.5, 1.0, 1.5, 3.0, 6.0, 12.0)
     slopes = (180.0,) if quick else (0.0, 60.0, 180.0, 600.0)
     accelerations = (0.01, 0.05, 0.25) if quick else (0.003, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0)
-    tried: list[tuple[str, Settings | None, str]] = [("none", None, "")]
+    tried: list[FilterTrial] = [("none", None, "")]
     for slope in slopes:
         for cutoff in cutoffs:
             turning = slope * OneEuroSettings().rotation_speed_coefficient / 180.0
@@ -96,7 +105,7 @@ def filter_points(quick: bool) -> list[FilterPoint]:
     for acceleration in accelerations:
         kalman = KalmanSettings(acceleration=acceleration, angular_acceleration=10 * acceleration)
         tried.append(("kalman", kalman, f"{acceleration:g} m/s per root second"))
-    return [_point(method, settings, words) for method, settings, words in tried]
+    return tried
 
 
 def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) -> float:
@@ -119,7 +128,8 @@ def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) 
     return best
 
 
-def _point(method: str, settings: Settings | None, words: str) -> FilterPoint:
+def filter_point(method: str, settings: Settings | None, words: str) -> FilterPoint:
+    """What a filter with some settings, named in words, makes of the noisy path."""
     times = np.arange(round((_MOVING + _REST) * _RATE)) / _RATE
     random = np.random.default_rng(7)
     noise = random.normal(0.0, _NOISE, (len(times), 3))
@@ -186,8 +196,8 @@ def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
     for axis in range(3):
         for number, sway in enumerate(_SWAY):
             phase = 1.7 * axis + 0.9 * number
-            share = (1.0, 0.6, 0.3)[axis]
-            total[:, axis] += share * sway[what] * np.sin(2 * np.pi * sway[0] * times + phase)
+            amplitude = (1.0, 0.6, 0.3)[axis] * sway[what]
+            total[:, axis] += amplitude * np.sin(2 * np.pi * sway[0] * times + phase)
     return total * ease[:, None]
 
 

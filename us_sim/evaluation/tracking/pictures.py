@@ -7,28 +7,27 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from us_sim.evaluation.tracking.cases import CAMERAS, CONDITIONS, MARKERS, Case, marker
-from us_sim.tracking.camera.rendered_views import RenderedView
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, marker
+from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
 __all__ = ["draw_views"]
 
-_SIZE = "640x480"
 _CUT = 240  # pixels, of the image around the body
 _TITLE = 22  # pixels
 
 
 def draw_views(file: Path) -> None:
     """Write a picture with a row for each condition and a column for each body."""
-    rooms = {name: RenderedView(CAMERAS[_SIZE], marker(name).body) for name in MARKERS}
+    rooms = {name: RenderedView(WEBCAMS[SMALL], marker(name).body) for name in MARKERS}
     rows = []
     for condition, (settings, _) in CONDITIONS.items():
         cells = []
         for name in MARKERS:
-            case = Case(name, _SIZE, 0.4, 30.0, condition)
+            case = Case(name, SMALL, 0.4, 30.0, condition)
             seen = marker(name)
             pose = case.sequence(0)[0]
             image = rooms[name].render(pose, settings, 3, case.motion(0))
-            middle = CAMERAS[_SIZE].project(pose.apply(seen.body.centres.mean(axis=0)[None]))[0]
+            middle = WEBCAMS[SMALL].project(pose.apply(seen.body.centres.mean(axis=0)[None]))[0]
             high, wide = image.shape
             top = int(np.clip(middle[1] - _CUT / 2, 0, high - _CUT))
             left = int(np.clip(middle[0] - _CUT / 2, 0, wide - _CUT))

@@ -7,32 +7,24 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from us_sim.evaluation.tracking.cases import CAMERAS, CONDITIONS, MARKERS, RIGID_BODY, SINGLE
-from us_sim.evaluation.tracking.filters import FilterPoint
+from us_sim.evaluation.figure import key_beside, new_figure, plain, save
+from us_sim.evaluation.tracking.cases import CONDITIONS, LARGE, MARKERS, SMALL
+from us_sim.evaluation.tracking.filters import FILTER_METHODS, FilterPoint
 from us_sim.evaluation.tracking.points import Point
 
-__all__ = ["STYLES", "plot_conditions", "plot_filters", "plot_run_time", "plot_views"]
+__all__ = ["plot_conditions", "plot_filters", "plot_run_time", "plot_views"]
 
-STYLES = {
-    SINGLE: ("#D55E00", "D"),
-    "apriltag_40mm": ("#E69F00", "v"),
-    "charuco_board": ("#0072B2", "o"),
-    "grid_board": ("#009E73", "s"),
-    RIGID_BODY: ("#CC79A7", "^"),
-}
-"""A colour and a mark for each body, told apart in every common colour blindness."""
-_SMALL = "640x480"
 _DISTANCE = 0.4  # m
 
 
 def plot_views(points: Sequence[Point], file: Path) -> None:
     """Errors of position and rotation over the distance, and over the angle at 0.4 m."""
-    figure = _figure((10.5, 7.4))
-    plain = [p for p in points if (p.case.condition, p.case.image_size) == ("plain", _SMALL)]
+    figure = new_figure(
+        10.5, 7.4, "Error of plain views, 640 × 480 (line: median; dashed: 95th percentile)"
+    )
+    plain = [p for p in points if (p.case.condition, p.case.image_size) == ("plain", SMALL)]
     panels = figure.subplots(2, 2, sharey="row")
     at = {
         "distance, m (30°)": (
@@ -56,50 +48,50 @@ def plot_views(points: Sequence[Point], file: Path) -> None:
     for panel in panels[:, 0]:
         panel.set_xticks(distances, [f"{value:g}" for value in distances])
         panel.xaxis.set_minor_formatter(NullFormatter())
-    _key(panels[0, 1])
-    _title(figure, "Error of plain views, 640 × 480 (line: median; dashed: 95th percentile)")
-    figure.savefig(file, dpi=figure.dpi)
+    key_beside(panels[0, 1])
+    save(figure, file)
 
 
 def plot_run_time(points: Sequence[Point], file: Path) -> None:
     """Median error against processor time: every body at 0.4 m, in images of both sizes."""
-    figure = _figure((10.5, 4.6))
+    figure = new_figure(
+        10.5, 4.6, "Error against run time at 0.4 m (full: 640 × 480; hollow: 1920 × 1080)"
+    )
     panels = figure.subplots(1, 2, sharex=True)
     mine = [p for p in points if (p.case.condition, p.case.distance) == ("plain", _DISTANCE)]
     for panel, value, label in (
         (panels[0], Point.error, "position, mm (median)"),
         (panels[1], Point.turned, "rotation, degrees (median)"),
     ):
-        for name, (colour, mark) in STYLES.items():
-            for size in CAMERAS:
+        for name, kind in MARKERS.items():
+            for size in (SMALL, LARGE):
                 some = [p for p in mine if (p.case.marker, p.case.image_size) == (name, size)]
-                fill = colour if size == _SMALL else "white"
+                fill = kind.colour if size == SMALL else "white"
                 panel.plot(
                     [p.cpu_ms for p in some],
                     [value(p, 50) for p in some],
-                    mark,
+                    kind.mark,
                     mfc=fill,
-                    mec=colour,
+                    mec=kind.colour,
                     ms=7,
-                    label=name if size == _SMALL else None,
+                    label=name if size == SMALL else None,
                 )
         panel.set_xlabel("processor time of an image, ms (median)")
         panel.set_ylabel(label)
         panel.set_xscale("log")
         panel.set_yscale("log")
         _plain(panel)
-    _key(panels[1])
-    _title(figure, "Error against run time at 0.4 m (full: 640 × 480; hollow: 1920 × 1080)")
-    figure.savefig(file, dpi=figure.dpi)
+    key_beside(panels[1])
+    save(figure, file)
 
 
 def plot_conditions(points: Sequence[Point], file: Path) -> None:
-    """Error, and share of views in which the body is found, in every condition."""
-    figure = _figure((10.5, 6.6))
+    """Error, and how many views in a hundred show the body to the tracker, in every condition."""
+    figure = new_figure(10.5, 6.6, "Conditions at 0.4 m and 30°, 640 × 480")
     panels = figure.subplots(3, 1, sharex=True)
     places = np.arange(len(CONDITIONS))
     width = 0.8 / len(MARKERS)
-    for number, name in enumerate(MARKERS):
+    for number, (name, kind) in enumerate(MARKERS.items()):
         columns: list[tuple[float, float, float]] = []
         for condition in CONDITIONS:
             found = [
@@ -107,36 +99,36 @@ def plot_conditions(points: Sequence[Point], file: Path) -> None:
                 for p in points
                 if p.case.marker == name
                 and p.case.condition == condition
-                and (p.case.image_size, p.case.distance, p.case.angle) == (_SMALL, _DISTANCE, 30)
+                and (p.case.image_size, p.case.distance, p.case.angle) == (SMALL, _DISTANCE, 30)
             ]
             p = found[0] if found else None
-            share = 100 * len(p.found) / max(1, len(p.views)) if p else np.nan
-            columns.append((p.error(95), p.turned(95), share) if p else (np.nan,) * 3)
+            percent = 100 * len(p.found) / max(1, len(p.views)) if p else np.nan
+            columns.append((p.error(95), p.turned(95), percent) if p else (np.nan,) * 3)
         for panel, values in zip(panels, zip(*columns, strict=True), strict=True):
             at = places + (number - 0.5 * (len(MARKERS) - 1)) * width
-            panel.bar(at, values, 0.9 * width, color=STYLES[name][0], label=name)
+            panel.bar(at, values, 0.9 * width, color=kind.colour, label=name)
     for panel, label in zip(panels, ("mm, 95 %", "degrees, 95 %", "found, %"), strict=True):
         panel.set_ylabel(label)
         if panel is not panels[2]:
             panel.set_yscale("log")
         _plain(panel)
     panels[2].set_xticks(places, list(CONDITIONS))
-    _key(panels[0])
-    _title(figure, "Conditions at 0.4 m and 30°, 640 × 480")
-    figure.savefig(file, dpi=figure.dpi)
+    key_beside(panels[0])
+    save(figure, file)
 
 
 def plot_filters(points: Sequence[FilterPoint], file: Path) -> None:
     """Lag in motion against what trembles at rest, and what is off at the very moment."""
-    figure = _figure((10.5, 4.6))
+    figure = new_figure(
+        10.5, 4.6, "Filters at 60 poses a second (large and full: the default settings)"
+    )
     panels = figure.subplots(1, 2)
     values: tuple[tuple[str, Callable[[FilterPoint], float]], ...] = (
         ("trembling at rest, mm (root mean square)", lambda p: 1e3 * p.jitter),
         ("error in motion at the very moment, mm", lambda p: 1e3 * p.error),
     )
-    marks = {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")}
     for panel, (label, value) in zip(panels, values, strict=True):
-        for method, (colour, mark) in marks.items():
+        for method, (colour, mark) in FILTER_METHODS.items():
             mine = [p for p in points if p.method == method]
             for p in mine:
                 size = 11 if p.default else 5
@@ -155,8 +147,7 @@ def plot_filters(points: Sequence[FilterPoint], file: Path) -> None:
         panel.set_yscale("log")
         _plain(panel)
     panels[1].legend(fontsize=8, frameon=False)
-    _title(figure, "Filters at 60 poses a second (large and full: the default settings)")
-    figure.savefig(file, dpi=figure.dpi)
+    save(figure, file)
 
 
 def _errors(
@@ -165,41 +156,23 @@ def _errors(
     across: Callable[[Point], float],
     value: Callable[[Point, float], float],
 ) -> None:
-    for name, (colour, mark) in STYLES.items():
+    for name, kind in MARKERS.items():
         mine = sorted((p for p in points if p.case.marker == name and p.found), key=across)
-        x = [across(p) for p in mine]
-        panel.plot(x, [value(p, 50) for p in mine], mark + "-", color=colour, ms=5, label=name)
+        x, colour = [across(p) for p in mine], kind.colour
+        panel.plot(x, [value(p, 50) for p in mine], kind.mark + "-", color=colour, ms=5, label=name)
         panel.plot(x, [value(p, 95) for p in mine], "--", color=colour, lw=1, alpha=0.7)
     panel.set_yscale("log")
     _plain(panel)
 
 
 def _plain(panel: Axes) -> None:
+    plain(panel)
     for axis in (panel.xaxis, panel.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         if axis.get_scale() == "log":
             axis.set_minor_formatter(FuncFormatter(_between_decades))
     panel.tick_params(which="minor", labelsize=7)
-    panel.grid(True, which="major", color="0.93")
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.tick_params(labelsize=8.5)
 
 
 def _between_decades(value: float, _: object) -> str:
     """Twos and fives of a decade are named, so that a panel within one has numbers too."""
     return f"{value:g}" if f"{value:e}"[0] in "25" else ""
-
-
-def _key(panel: Axes) -> None:
-    panel.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5))
-
-
-def _title(figure: Figure, words: str) -> None:
-    figure.suptitle(words, fontsize=12, x=0.01, ha="left")
-
-
-def _figure(size: tuple[float, float]) -> Figure:
-    figure = Figure(figsize=size, dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

@@ -18,25 +18,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.tracking.cases import CAMERAS, CONDITIONS, MARKERS, Case, Marker, marker
+from us_sim.evaluation.row import Row
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, Marker, marker
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_between
 from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.rendered_views import RenderedView
+from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["COLUMNS", "Bench", "Point", "View", "mirrored", "visible"]
-
-COLUMNS = (
-    *("marker", "image_size", "distance_m", "angle_deg", "condition", "views", "detected"),
-    *("flipped", "median_mm", "p95_mm", "median_deg", "p95_deg", "ms_median", "ms_first"),
-    *("cpu_ms_median", "detector_cpu_ms", "pose_cpu_ms", "markers_used", "expected_mm"),
-    *("within_95", "failure"),
-)
+__all__ = ["Bench", "Point", "View", "mirrored", "visible"]
 
 _FLIP = 5.0  # degrees; a body that is turned by less is not the wrong way round
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
@@ -65,8 +59,10 @@ class View:
 
 
 @dataclass(frozen=True)
-class Point:
+class Point(Row):
     """A row of tracking.csv."""
+
+    decimals = 4
 
     case: Case
     views: tuple[View, ...] = ()
@@ -75,21 +71,37 @@ class Point:
     failure: str = ""
 
     @property
-    def row(self) -> tuple[object, ...]:
-        """The values of `COLUMNS`."""
-        case = self.case
-        return (
-            *(case.marker, case.image_size, case.distance, case.angle, case.condition),
-            *(len(self.views), len(self.found), self.flipped),
-            *(_rounded(self.error(share)) for share in (50, 95)),
-            *(_rounded(self.turned(share)) for share in (50, 95)),
-            *(_rounded(self.ms), _rounded(self.ms_first), _rounded(self.cpu_ms)),
-            *(_rounded(self.detector_cpu_ms), _rounded(self.pose_cpu_ms)),
-            _rounded(_mean([view.used for view in self.found])),
-            _rounded(_percentile([view.expected_mm for view in self.found], 50)),
-            _rounded(self.within),
-            self.failure,
-        )
+    def values(self) -> dict[str, object]:
+        """What sums up the case's views, by column."""
+        found = self.found
+        return {
+            "marker": self.case.marker,
+            "image_size": self.case.image_size,
+            "distance_m": self.case.distance,
+            "angle_deg": self.case.angle,
+            "condition": self.case.condition,
+            "views": len(self.views),
+            "detected": len(found),
+            "flipped": self.flipped,
+            "median_mm": self.error(50),
+            "p95_mm": self.error(95),
+            "median_deg": self.turned(50),
+            "p95_deg": self.turned(95),
+            "ms_median": self.ms,
+            "ms_first": self.ms_first,
+            "cpu_ms_median": self.cpu_ms,
+            "detector_cpu_ms": self.detector_cpu_ms,
+            "pose_cpu_ms": self.pose_cpu_ms,
+            "markers_used": _mean([view.used for view in found]),
+            "expected_mm": _percentile([view.expected_mm for view in found], 50),
+            "within_95": self.within,
+            "failure": self.failure,
+        }
+
+    @property
+    def title(self) -> str:
+        """What was looked at."""
+        return str(self.case)
 
     @property
     def found(self) -> list[View]:
@@ -118,20 +130,20 @@ class Point:
 
     @property
     def within(self) -> float:
-        """Share of the errors inside the ellipsoid that should hold 95 % of them."""
+        """Fraction of the errors inside the ellipsoid that should hold 95 % of them."""
         return _mean([view.inside for view in self.found])
 
-    def error(self, share: float) -> float:
+    def error(self, percent: float) -> float:
         """mm, percentile of the position's error."""
-        return _percentile([view.mm for view in self.found], share)
+        return _percentile([view.mm for view in self.found], percent)
 
-    def turned(self, share: float) -> float:
+    def turned(self, percent: float) -> float:
         """Degrees, percentile of the rotation's error."""
-        return _percentile([view.degrees for view in self.found], share)
+        return _percentile([view.degrees for view in self.found], percent)
 
 
 class Bench:
-    """Renders cases and has them tracked; keeps the rooms that several share."""
+    """Renders cases and has them tracked; keeps the room of the last body."""
 
     def __init__(self) -> None:
         self._rooms: dict[tuple[str, str], RenderedView] = {}
@@ -139,11 +151,11 @@ class Bench:
     def warm_up(self) -> None:
         """Let everything be compiled that is timed later."""
         for name in MARKERS:
-            self.point(Case(name, "640x480", 0.4, 30.0), 1)
+            self.point(Case(name, SMALL, 0.4, 30.0), 1)
 
     def point(self, case: Case, sequences: int) -> Point:
         """What so many sequences of images show."""
-        seen, camera = marker(case.marker), CAMERAS[case.image_size]
+        seen, camera = marker(case.marker), WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
         if key not in self._rooms:
             self._rooms = {key: RenderedView(camera, seen.body)}
@@ -251,13 +263,9 @@ def _parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple
     return 1e3 * (between - begin), 1e3 * (time.thread_time() - between)
 
 
-def _percentile(values: Sequence[float], share: float) -> float:
-    return float(np.percentile(values, share)) if len(values) else float("nan")
+def _percentile(values: Sequence[float], percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
-
-
-def _rounded(value: float) -> float:
-    return round(value, 4)

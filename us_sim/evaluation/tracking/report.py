@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from us_sim.evaluation.machine import machine
 from us_sim.evaluation.markdown_table import markdown_table
-from us_sim.evaluation.tracking.cases import CONDITIONS, FRAMES, MARKERS, marker
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
+from us_sim.evaluation.target import target_table
+from us_sim.evaluation.tracking.cases import CONDITIONS, FRAMES, MARKERS, SMALL
 from us_sim.evaluation.tracking.filters import FilterPoint
 from us_sim.evaluation.tracking.plots import (
     plot_conditions,
@@ -25,50 +26,28 @@ __all__ = ["table", "write_report"]
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: every measure that is asked for, and what was seen."""
-    return markdown_table(
-        ("", "asked", "seen", "met"), [target.cells for target in targets(points)]
-    )
+    return target_table(targets(points))
 
 
 def write_report(
-    out: Path,
-    points: Sequence[Point],
-    filters: Sequence[FilterPoint],
-    quick: bool,
-    seconds: float,
-) -> list[Path]:
-    """Write tracking.md and its plots; returns the plots' files.
-
-    Args:
-        out: folder.
-        points: all rows of views.
-        filters: all rows of filters.
-        quick: whether it was the short run.
-        seconds: that the run took.
-    """
-    drawn = {
-        "tracking_error.png": lambda file: plot_views(points, file),
-        "tracking_run_time.png": lambda file: plot_run_time(points, file),
-        "tracking_conditions.png": lambda file: plot_conditions(points, file),
-        "tracking_filters.png": lambda file: plot_filters(filters, file),
-    }
-    files = [out / name for name in drawn]
-    for file, draw in zip(files, drawn.values(), strict=True):
-        draw(file)
-    text = _text(points, filters, quick, seconds)
-    (out / "tracking.md").write_text(text, encoding="utf-8")
-    return files
+    folder: ReportFolder, points: Sequence[Point], filters: Sequence[FilterPoint]
+) -> None:
+    """Draw the plots and write tracking.md."""
+    plot_views(points, folder.picture("error"))
+    plot_run_time(points, folder.picture("run_time"))
+    plot_conditions(points, folder.picture("conditions"))
+    plot_filters(filters, folder.picture("filters"))
+    folder.write_report(_parts(folder, points, filters), failures(points))
 
 
-def _text(
-    points: Sequence[Point], filters: Sequence[FilterPoint], quick: bool, seconds: float
-) -> str:
+def _parts(
+    folder: ReportFolder, points: Sequence[Point], filters: Sequence[FilterPoint]
+) -> list[str]:
     count = sum(len(point.views) for point in points)
-    parts = [
+    libraries = ("numpy", "numba", "opencv-python-headless", "opencv-python")
+    return [
         "# Tracking: error against run time",
-        f"`us-sim evaluate tracking{' --quick' if quick else ''}`, {seconds:.0f} s, on "
-        f"{machine('numpy', 'numba', 'opencv-python-headless', 'opencv-python')}. Every row is in "
-        "[tracking.csv](tracking.csv) and [filters.csv](filters.csv).",
+        folder.opening(*libraries, tables=("tracking", "filters")),
         f"{count:,} images of bodies of markers are rendered as cameras see them: every pixel that "
         "an edge crosses is the mean of 64 rays through a distorting lens; then come the lens's "
         "blur, a lamp beside the camera, and the sensor's noise and grey levels, before a room "
@@ -80,7 +59,7 @@ def _text(
         "lengthen the wall clock (`ms_median` in the CSV), and processor time a little.",
         "## Bodies and conditions",
         "![Bodies and conditions](tracking_views.png)",
-        "\n".join(f"- `{name}`: {marker(name).words}" for name in MARKERS),
+        "\n".join(f"- `{name}`: {kind.words}" for name, kind in MARKERS.items()),
         "\n".join(f"- {name}: {words}" for name, (_, words) in CONDITIONS.items()),
         "## Error against distance and angle",
         "![Error against distance and angle](tracking_error.png)",
@@ -99,7 +78,7 @@ def _text(
         "A single marker that a hand touches is not found, and says so; a body of several is.",
         "## What the covariance says",
         _covariance(points),
-        "Within is the share of errors inside the ellipsoid that the reported covariance says "
+        "Within is the fraction of errors inside the ellipsoid that the reported covariance says "
         "holds 95 % of them. More is caution: the covariance assumes at least "
         "`camera.corner_deviation` (0.1 pixels) for a corner, for real lenses, prints and "
         "calibrations are not as good as rendered ones.",
@@ -117,10 +96,6 @@ def _text(
         "in the middle quarter of the image, turned by any angle about the line of sight and "
         "tilted towards any side. Views of the same case have different noise, hands and light.",
     ]
-    failures = [point for point in points if point.failure]
-    if failures:
-        parts += ["## Failed", "\n".join(f"- {p.case}: {p.failure}" for p in failures)]
-    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _bodies(points: Sequence[Point]) -> str:
@@ -178,7 +153,7 @@ def _conditions(points: Sequence[Point]) -> str:
                 view
                 for p in points
                 if (p.case.marker, p.case.condition) == (name, condition)
-                and (p.case.image_size, p.case.distance) == ("640x480", 0.4)
+                and (p.case.image_size, p.case.distance) == (SMALL, 0.4)
                 for view in p.views
             ]
             found = [view for view in mine if view.detected]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from us_sim.evaluation.target import Target
-from us_sim.evaluation.tracking.cases import RIGID_BODY, SINGLE
+from us_sim.evaluation.tracking.cases import LARGE, RIGID_BODY, SINGLE, SMALL
 from us_sim.evaluation.tracking.points import Point, View
 
 __all__ = ["body_views", "single_views", "targets"]
@@ -23,24 +23,27 @@ def targets(points: Sequence[Point]) -> list[Target]:
     tracked = sum(view.detected for view in body)
     where = f"{_VISIBLE} visible 30 mm markers at 0.4 m, 640 × 480"
     return [
-        _at_most("ms an image of 640 × 480 on one core, body of 6 markers", 8, _ms(points, 640)),
-        _at_most("ms an image of 1920 × 1080 on one core", 20, _ms(points, 1920)),
+        Target.at_most(
+            "ms an image of 640 × 480 on one core, body of 6 markers", 8, _ms(points, SMALL)
+        ),
+        Target.at_most("ms an image of 1920 × 1080 on one core", 20, _ms(points, LARGE)),
         Target(
             f"{where}: tracked of {len(body)} views",
             "all",
             f"{tracked}",
             tracked == len(body) if body else None,
         ),
-        _at_most(f"{where}: mm, median", 0.3, _percentile(body, "mm", 50)),
-        _at_most(f"{where}: mm, 95th percentile", 1.0, _percentile(body, "mm", 95)),
-        _at_most(f"{where}: degrees, median", 0.2, _percentile(body, "degrees", 50)),
-        _at_most(f"{where}: degrees, 95th percentile", 0.6, _percentile(body, "degrees", 95)),
-        _at_most(f"{where}: flips", 0, sum(view.flipped for view in body) if body else np.nan),
-        _at_most(
+        Target.at_most(f"{where}: mm, median", 0.3, _percentile(body, "mm", 50)),
+        Target.at_most(f"{where}: mm, 95th percentile", 1.0, _percentile(body, "mm", 95)),
+        Target.at_most(f"{where}: degrees, median", 0.2, _percentile(body, "degrees", 50)),
+        Target.at_most(f"{where}: degrees, 95th percentile", 0.6, _percentile(body, "degrees", 95)),
+        Target.at_most(
+            f"{where}: flips", 0, sum(view.flipped for view in body) if body else np.nan
+        ),
+        Target.under(
             f"single 40 mm marker in plain views ({len(found)} of {len(single)} found): % flipped",
             0.5,
             100 * sum(view.flipped for view in found) / len(found) if found else np.nan,
-            strictly=True,
         ),
     ]
 
@@ -54,7 +57,7 @@ def body_views(points: Sequence[Point]) -> list[View]:
         if point.case.marker == RIGID_BODY
         and point.case.condition == "plain"
         and point.case.distance == 0.4
-        and point.case.image_size == "640x480"
+        and point.case.image_size == SMALL
     ]
 
 
@@ -68,26 +71,19 @@ def single_views(points: Sequence[Point]) -> list[View]:
     ]
 
 
-def _ms(points: Sequence[Point], width: int) -> float:
+def _ms(points: Sequence[Point], image_size: str) -> float:
     """Median processor time of plain images of the rigid body from 0.4 m."""
     mine = [
         view.cpu_ms
         for point in points
         for view in point.views
         if point.case.marker == RIGID_BODY
-        and point.case.image_size.startswith(f"{width}x")
+        and point.case.image_size == image_size
         and (point.case.condition, point.case.distance) == ("plain", 0.4)
     ]
     return float(np.median(mine)) if mine else float("nan")
 
 
-def _percentile(views: Sequence[View], name: str, share: float) -> float:
+def _percentile(views: Sequence[View], name: str, percent: float) -> float:
     values = [getattr(view, name) for view in views if view.detected]
-    return float(np.percentile(values, share)) if values else float("nan")
-
-
-def _at_most(what: str, asked: float, seen: float, *, strictly: bool = False) -> Target:
-    words = f"under {asked:g}" if strictly else f"at most {asked:g}"
-    if not np.isfinite(seen):
-        return Target(what, words, "not measured", None)
-    return Target(what, words, f"{seen:.3g}", seen < asked if strictly else seen <= asked)
+    return float(np.percentile(values, percent)) if values else float("nan")

@@ -32,7 +32,16 @@ from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import Chessboard, RigidBody
 
-__all__ = ["SHARP", "Conditions", "RenderedView"]
+__all__ = ["SHARP", "WEBCAMS", "Conditions", "RenderedView"]
+
+_LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
+_SMALL = np.array([[600.0, 0.0, 322.3], [0.0, 601.0, 238.1], [0.0, 0.0, 1.0]])  # pixels
+_LARGE = np.array([[1350.0, 0.0, 965.2], [0.0, 1352.0, 536.7], [0.0, 0.0, 1.0]])  # pixels
+WEBCAMS = {
+    "640x480": CameraModel(640, 480, _SMALL, _LENS),
+    "1920x1080": CameraModel(1920, 1080, _LARGE, 0.3 * _LENS),
+}
+"""Cameras to render for, by the size of their images; both see 44° from top to bottom."""
 
 _BLACK, _WHITE = 26.0, 225.0  # grey, of print in full light
 _AMBIENT = 0.35  # of the light, which comes from everywhere

@@ -5,8 +5,7 @@ import pytest
 import skfem
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from us_sim.evaluation.stability.cases import StabilityCase, model_of
-from us_sim.evaluation.stability.independent_residual import (
+from us_sim.evaluation.independent_residual import (
     IndependentResidual,
     averaged_hooke_forces,
     hooke_forces,
@@ -15,6 +14,7 @@ from us_sim.evaluation.stability.independent_residual import (
     spring_forces,
     volume_forces,
 )
+from us_sim.evaluation.stability.cases import StabilityCase, model_of
 from us_sim.evaluation.stability.meshes import mesh_named
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose

@@ -5,7 +5,7 @@ hundred nodes; it shares no kernel with a solver. A method's forces are derivati
 the returned nodes, so that what a solver rounds, or leaves out, shows.
 
 >>> import numpy as np
->>> from us_sim.evaluation.stability.independent_residual import hooke_forces
+>>> from us_sim.evaluation.independent_residual import hooke_forces
 >>> from us_sim.tissue.elasticity.material import Material
 >>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,33 +30,45 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.springs import fitted_springs, springs_of
+from us_sim.tissue.elasticity.volume_term import volume_term
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
 __all__ = [
     "IndependentResidual",
+    "SpringSettings",
     "averaged_hooke_forces",
     "hooke_forces",
     "neo_hookean_forces",
     "push_directions",
     "rounding_of_forces",
+    "solid_residual",
     "spring_forces",
+    "spring_residual",
     "volume_forces",
 ]
 
 Array = NDArray[np.float64]
 
-# (lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages.
-_ELEMENT_SHARE = 5.0
+_ELEMENT_BULK = 5.0
+"""(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
 
-# Parts of its volume below which a nonlinear tetrahedron resists being crushed, and more simply so.
 _CROWDED, _CRUSHED = 1 / 4, 1 / 64
+"""Volume ratios below which a nonlinear tetrahedron resists being crushed, and more simply so."""
 
-# Growth of a tetrahedron's faces at which its volume term yields in an explicit method.
 _YIELD = 1.5
+"""Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
 
-# m, how far the probe is taken to go on behind its collider.
-_GRIP = 0.1
+_GRIP = 0.1  # m, how far the probe is taken to go on behind its collider
+
+
+@dataclass(frozen=True)
+class SpringSettings:
+    """How a method that has springs is set; the fields are named as its settings are."""
+
+    stiffness: str = "algorithm_1"
+    volume: bool = False  # whether tetrahedra keep their volumes
 
 
 class IndependentResidual:
@@ -110,6 +123,54 @@ class IndependentResidual:
         return imbalance / self._scale, self._rounding / self._scale
 
 
+Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
+"""Makes what checks the residuals of one method on a model."""
+
+
+def solid_residual(
+    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array],
+) -> Residual:
+    """For a method of finite elements, whose nodes are held by those ``forces``."""
+
+    def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
+        mesh, materials = model.mesh, model.materials
+        shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
+        stiffest = shear / (1 - 2 * materials.poisson_ratio) + shear
+        return IndependentResidual(
+            model,
+            lambda displacement: forces(mesh, materials, displacement),
+            rounding_of_forces(mesh, stiffest),
+        )
+
+    return residual
+
+
+def spring_residual(*, yielding: bool) -> Residual:
+    """For a method of springs, whose volume term yields as `volume_forces` says, or does not."""
+
+    def residual(model: TissueModel, settings: SpringSettings) -> IndependentResidual:
+        mesh, materials = model.mesh, model.materials
+        made = springs_of if settings.stiffness == "algorithm_1" else fitted_springs
+        springs = made(mesh, materials)
+        term = volume_term(mesh, materials, springs) if settings.volume else None
+
+        def forces(displacement: Array) -> Array:
+            force = spring_forces(springs.edges, springs.stiffness, mesh.nodes, displacement)
+            if term is not None:
+                force += volume_forces(
+                    mesh, term.element, term.nodal, displacement, yielding=yielding
+                )
+            return force
+
+        digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
+        rounding = 4 * digit * float(np.linalg.norm(springs.stiffness))
+        if term is not None:
+            rounding += rounding_of_forces(mesh, term.element + term.nodal)
+        return IndependentResidual(model, forces, rounding)
+
+    return residual
+
+
 def hooke_forces(mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array) -> Array:
     """(N, 3) N that hold linear tetrahedra of Hooke's material at displacements (N, 3) m."""
     shear, whole, volume, gradient = _elements(mesh, materials)
@@ -129,7 +190,7 @@ def averaged_hooke_forces(
     """
     shear, whole, volume, gradient = _elements(mesh, materials)
     slope = _slopes(mesh, gradient, displacement)
-    own, nodal = _shares(shear, whole)
+    own, nodal = _bulk_parts(shear, whole)
     pressure = own * _trace(slope) + nodal * _around(mesh, nodal * volume / 4, _trace(slope))
     stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
     return _gathered(mesh, volume, gradient, stress, pressure - shear * _trace(slope))
@@ -148,7 +209,7 @@ def neo_hookean_forces(
     slope = _slopes(mesh, gradient, displacement)
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     swelling = _trace(slope) + minors + np.linalg.det(slope)
-    own, nodal = _shares(shear, whole)
+    own, nodal = _bulk_parts(shear, whole)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
     pressure += shear * _crowding(1 + swelling)
     cofactor = _cofactors(slope + np.eye(3))
@@ -266,8 +327,8 @@ def _elements(
     return shear, first + shear, mesh.volumes, _gradients(mesh)
 
 
-def _shares(shear: Array, whole: Array) -> tuple[Array, Array]:
-    own = np.minimum(whole, _ELEMENT_SHARE * shear)
+def _bulk_parts(shear: Array, whole: Array) -> tuple[Array, Array]:
+    own = np.minimum(whole, _ELEMENT_BULK * shear)
     return own, whole - own
 
 

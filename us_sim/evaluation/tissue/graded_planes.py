@@ -1,0 +1,36 @@
+"""Planes that are near each other where a probe touches, and farther apart elsewhere.
+
+>>> from us_sim.evaluation.tissue.graded_planes import graded_planes
+>>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01).round(4)
+array([0.    , 0.01  , 0.02  , 0.032 , 0.05  ])
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["graded_planes"]
+
+_GROWTH = 1.5  # of the distance from one plane to the next, away from the fine part
+
+
+def graded_planes(
+    low: float, high: float, fine_low: float, fine_high: float, size: float
+) -> NDArray[np.float64]:
+    """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside."""
+    count = max(1, round((fine_high - fine_low) / size))
+    fine = np.linspace(fine_low, fine_high, count + 1)
+    parts = [fine]
+    for length, end, direction in (
+        (fine_low - low, fine_low, -1),
+        (high - fine_high, fine_high, 1),
+    ):
+        if length <= 0:
+            continue
+        number = max(1, round(np.log1p(length / size * (1 - 1 / _GROWTH)) / np.log(_GROWTH)))
+        steps = _GROWTH ** np.arange(1, number + 1)
+        parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
+    planes = np.unique(np.concatenate(parts))
+    planes[[0, -1]] = low, high
+    return planes

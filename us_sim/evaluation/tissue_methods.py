@@ -1,0 +1,155 @@
+"""What the evaluation knows of each tissue solver: all of it stands here, one entry a solver.
+
+Only these are evaluated, and not what other packages add.
+
+>>> from us_sim.evaluation.tissue_methods import TISSUE_METHODS
+>>> TISSUE_METHODS["msds"].has_springs, TISSUE_METHODS["fem"].equations({"threads": 2})
+(True, ('fem',))
+>>> TISSUE_METHODS["mdsd"]
+Traceback (most recent call last):
+...
+us_sim.errors.SettingsError: evaluated tissue solver 'mdsd' is not one of fem, ...
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from us_sim.evaluation.independent_residual import (
+    Residual,
+    averaged_hooke_forces,
+    hooke_forces,
+    neo_hookean_forces,
+    solid_residual,
+    spring_residual,
+)
+from us_sim.evaluation.named import Named
+
+__all__ = ["TISSUE_METHODS", "Setting", "TissueMethod"]
+
+Setting = Mapping[str, Any]
+"""Values of some of a solver's settings, by name."""
+
+_EFFORT = (
+    *("iterations", "steps", "threads", "contact_updates", "time_step"),
+    *("frame_tolerance", "tolerance", "most_iterations"),
+)
+"""Settings that say how long a method tries, and not which equations it solves."""
+
+
+@dataclass(frozen=True)
+class TissueMethod:
+    """One solver."""
+
+    name: str
+    colour: str
+    mark: str  # of its points in a plot, as Matplotlib names it
+    residual: Residual  # its equations, written down again
+    patient: Setting | None  # settings with which it converges; None where it solves directly
+    tried: tuple[Setting, ...] = ()  # besides the defaults
+    has_springs: bool = False
+    is_quasi_static: bool = True  # without masses: what nothing holds has no position of rest
+    is_explicit: bool = False  # only time steps up to a limit are stable
+    families: Mapping[str, str] = field(default_factory=dict)
+    """What a plot calls settings that change the equations."""
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """All that is tried, the defaults first."""
+        return ({}, *self.tried)
+
+    def equations(self, setting: Setting) -> tuple[Any, ...]:
+        """What two settings have in common when they approach the same solution."""
+        return (self.name, *sorted(self.without_effort(setting).items()))
+
+    @staticmethod
+    def without_effort(setting: Setting) -> dict[str, Any]:
+        """The part of a setting that decides which equations are solved."""
+        return {name: value for name, value in setting.items() if name not in _EFFORT}
+
+    def family(self, setting: str) -> str:
+        """What tells the equations of a setting, written ``a=1, b=2``, from the default's."""
+        parts = (self.families.get(part) for part in setting.split(", "))
+        return ", ".join(part for part in parts if part)
+
+
+_OF_SPRINGS = {
+    "stiffness=fitted": "fitted",
+    "stiffness=algorithm_1": "Algorithm 1",
+    "volume=True": "volume term",
+    "volume=False": "no volume term",
+}
+
+_ALL = (
+    TissueMethod(
+        "fem",
+        colour="#0072B2",
+        mark="o",
+        residual=solid_residual(averaged_hooke_forces),
+        patient=None,
+    ),
+    TissueMethod(
+        "fem_nonlinear",
+        colour="#D55E00",
+        mark="D",
+        residual=solid_residual(neo_hookean_forces),
+        patient={
+            "iterations": 60,
+            "most_iterations": 400,
+            "frame_tolerance": 1e-7,
+            "tolerance": 1e-7,
+        },
+        tried=(
+            {"iterations": 2, "frame_tolerance": 0.5},
+            {"iterations": 4, "frame_tolerance": 0.1},
+            {"iterations": 12, "frame_tolerance": 0.01},
+            {"iterations": 30, "frame_tolerance": 0.001, "most_iterations": 200},
+        ),
+    ),
+    TissueMethod(
+        "fem_cg",
+        colour="#56B4E9",
+        mark="s",
+        residual=solid_residual(hooke_forces),
+        patient={"iterations": 500, "tolerance": 1e-9},
+        tried=tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
+    ),
+    TissueMethod(
+        "msds",
+        colour="#009E73",
+        mark="^",
+        residual=spring_residual(yielding=True),
+        patient={"steps": 100, "rest_tolerance": 1e-8},
+        tried=(
+            {"steps": 5},
+            {"steps": 80},
+            {"stiffness": "fitted"},
+            {"stiffness": "fitted", "volume": True},
+            {"stiffness": "fitted", "volume": True, "steps": 80},
+        ),
+        has_springs=True,
+        is_quasi_static=False,
+        is_explicit=True,
+        families=_OF_SPRINGS,
+    ),
+    TissueMethod(
+        "msds_implicit",
+        colour="#CC79A7",
+        mark="v",
+        residual=spring_residual(yielding=False),
+        patient={"iterations": 50, "tolerance": 1e-8, "rest_tolerance": 1e-8},
+        tried=(
+            {"iterations": 1},
+            {"iterations": 10},
+            {"iterations": 30},
+            {"stiffness": "algorithm_1", "volume": False},
+        ),
+        has_springs=True,
+        is_quasi_static=False,
+        families=_OF_SPRINGS,
+    ),
+)
+TISSUE_METHODS = Named("evaluated tissue solver", {method.name: method for method in _ALL})
+"""By name, in the reports' order; colours are told apart in every common colour blindness."""
