@@ -1,24 +1,29 @@
 """The command's error paths: one sentence, status 1, no traceback."""
 
+import re
+import subprocess
+import sys
+
 import pytest
 
 from us_sim.command.main import main
+from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 
 
 @pytest.mark.parametrize(
     ("args", "words"),
     [
         (["run", "nowhere"], "there is no scene file nowhere; installed scenes are"),
-        (["run", "upper_arm", "--duration", "-1"], "--duration -1: must be more than 0 seconds"),
+        (["run", "upper_arm", "--duration", "-1"], "--duration: -1 s is outside 0.001 to"),
         (["run", "upper_arm", "--dry-run", "--param", "x"], "--param x: write NODE.NAME=VALUE"),
         (
             ["run", "upper_arm", "--dry-run", "--param", "skin.a=1"],
             "--param skin: this scene does not run such a node",
         ),
-        (["run", "upper_arm", "--record", "a.bag"], "--record a.bag: must be a file that ends"),
-        (["run", "upper_arm", "--record", "/"], "--record /: must be a file that ends in .mcap"),
-        (["play", "press_and_slide.mcap", "--rate", "-1"], "--rate -1: must be from 0.01 to 100"),
-        (["play", "press_and_slide.mcap", "--rate", "inf"], "--rate inf: must be from"),
+        (["run", "upper_arm", "--record", "a.bag"], "--record: a.bag: must be a file that ends"),
+        (["run", "upper_arm", "--record", "/"], "--record: /: must be a file that ends in .mcap"),
+        (["play", "press_and_slide.mcap", "--rate", "-1"], "--rate: -1 is outside 0.01 to 100"),
+        (["play", "press_and_slide.mcap", "--rate", "inf"], "--rate: "),
         (["run", "liver_sweep", "--dry-run"], "volume.file: is missing"),
         (["run", "upper_arm", "--path", "nowhere.mcap"], "nowhere.mcap"),
         (["bag", "info", "nowhere.mcap"], "nowhere.mcap"),
@@ -32,6 +37,32 @@ def test_bad_input_is_one_sentence(args, words, capsys):
     assert words in error
     assert error.startswith("us-sim: ")
     assert error.count("\n") == 1
+
+
+def test_what_is_not_chosen_is_not_imported():
+    code = (
+        "import sys; from us_sim.command.main import main\n"
+        "try: main(['calibrate', 'pivot', '--help'])\n"
+        "except SystemExit: pass\n"
+        "names = ('cv2', 'numpy', 'matplotlib', 'us_sim.evaluation', 'us_sim.nodes')\n"
+        "sys.exit(str([name for name in names if name in sys.modules] or 0))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.stderr.strip() in ("", "0")
+    assert "--recording" not in run.stdout
+    assert "tip.yaml" in run.stdout
+
+
+@pytest.mark.parametrize(
+    ("verb", "choice"), [("evaluate", EVALUATIONS), ("calibrate", CALIBRATIONS)]
+)
+def test_every_choice_has_a_line_of_help_and_can_be_imported(verb, choice, capsys):
+    with pytest.raises(SystemExit):
+        main([verb, "--help"])
+    text = capsys.readouterr().out
+    for name in choice:
+        assert re.search(rf"^ +{name} +[A-Z].*\.?$", text, re.MULTILINE), text
+        assert callable(choice.load(name))
 
 
 def test_bag_info_lists_the_demos_path(capsys):

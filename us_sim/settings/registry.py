@@ -4,10 +4,20 @@ One line an option: its name and where its class is. A class is imported when it
 before. Packages of others add solvers and trackers under the entry point groups named here.
 """
 
-from us_sim.errors import ProbeError, SolverError, TrackingError, VolumeError
+from us_sim.errors import CalibrationError, ProbeError, SolverError, TrackingError, VolumeError
 from us_sim.settings.choice import Choice, Option
 
-__all__ = ["COLLIDERS", "FILTERS", "PHANTOMS", "PROBES", "SLICERS", "SOLVERS", "TRACKERS"]
+__all__ = [
+    "CALIBRATIONS",
+    "COLLIDERS",
+    "EVALUATIONS",
+    "FILTERS",
+    "PHANTOMS",
+    "PROBES",
+    "SLICERS",
+    "SOLVERS",
+    "TRACKERS",
+]
 
 SOLVERS = Choice(
     "tissue solver",
@@ -88,4 +98,32 @@ TRACKERS = Choice(
         "us_sim.tracking.openigtlink.settings:OpenIGTLinkSettings",
     ),
     path=Option(f"{_INPUTS}.path_input:PathInput", _NOTHING),
+)
+
+_EVALUATION = "us_sim.evaluation"
+EVALUATIONS = Choice(
+    "evaluation",
+    key="subject",
+    tissue=Option(f"{_EVALUATION}.tissue.measure:evaluate_tissue", _NOTHING),
+    stability=Option(f"{_EVALUATION}.stability.measure:evaluate_stability", _NOTHING),
+    slice=Option(
+        f"{_EVALUATION}.slice.measure:evaluate_slice",
+        f"{_EVALUATION}.slice.recorded_sweep:RecordedSweep",
+    ),
+    tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
+)
+
+_CALIBRATION = "us_sim.tracking.calibration"
+_ASKED = f"{_CALIBRATION}.settings"
+CALIBRATIONS = Choice(
+    "calibration",
+    key="what",
+    error=CalibrationError,
+    camera=Option(f"{_CALIBRATION}.camera_command:calibrate_photos", f"{_ASKED}:CameraSettings"),
+    pivot=Option(f"{_CALIBRATION}.recording_commands:calibrate_tip", f"{_ASKED}:PivotSettings"),
+    landmarks=Option(
+        f"{_CALIBRATION}.recording_commands:calibrate_registration", f"{_ASKED}:LandmarkSettings"
+    ),
+    probe=Option(f"{_CALIBRATION}.probe_command:calibrate_image", f"{_ASKED}:ProbeSettings"),
+    time=Option(f"{_CALIBRATION}.recording_commands:calibrate_clock", f"{_ASKED}:ClockSettings"),
 )

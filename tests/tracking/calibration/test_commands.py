@@ -246,6 +246,6 @@ def test_camera_refuses_what_is_no_photo_or_board(tmp_path, capsys):
     assert "none of the 1 photos shows" in refusal(capsys, "camera", tmp_path, *board, *out)
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((60, 90), np.uint8))
     assert "has 90 × 60 pixels" in refusal(capsys, "camera", tmp_path, *board, *out)
-    assert "write the board's size as 5x7" in refusal(
+    assert "write columns and rows, e.g. 5x7" in refusal(
         capsys, "camera", tmp_path, "--size", "5by7", *out
     )

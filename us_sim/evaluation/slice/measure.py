@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import UsSimError
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures, words_of
 from us_sim.evaluation.slice.cases import MAIN, Case, black_and_white, cases, speckle
@@ -24,6 +23,7 @@ from us_sim.evaluation.slice.pictures import draw_differences
 from us_sim.evaluation.slice.points import Point, compare, timed_together
 from us_sim.evaluation.slice.publishing import publishing_ms
 from us_sim.evaluation.slice.recorded_frames import RecordedComparison, compare_with_recorded
+from us_sim.evaluation.slice.recorded_sweep import RecordedSweep
 from us_sim.evaluation.slice.reference import exact_slice, sampled
 from us_sim.evaluation.slice.report import Surroundings, table, write_report
 from us_sim.evaluation.slice.targets import LARGE_VOLUME
@@ -37,27 +37,22 @@ _FRAMES = 4  # images that a case's are taken from, in turns
 _SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)  # s, of timing the main case, and another
 
 
-def evaluate_slice(
-    out: Path, quick: bool, volume_file: Path | None = None, sweep_file: Path | None = None
-) -> int:
+def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None) -> int:
     """Measure, write slice.csv, the pictures and slice.md, and print the table.
 
     Args:
         out: folder to write to; made if it is not there.
         quick: fewer cases, timed more shortly.
-        volume_file: a volume that was compounded from a tracked sweep, if its recorded frames are
-            to be compared with images of it.
-        sweep_file: that sweep.
+        recorded: a tracked sweep, and its volume, whose frames are compared with images of it.
 
     Returns:
         0, or 1 when a method failed; its row says how, and the others are there.
 
     Raises:
-        UsSimError: the folder cannot be written or holds a report, one of the two files is given
-            without the other, or cannot be read.
+        UsSimError: the folder cannot be written or holds a report, or the sweep cannot be read.
     """
     folder = ReportFolder("slice", out, quick)
-    recorded = _recorded(volume_file, sweep_file, out, quick)
+    comparison = _compared(recorded, out, quick)
     bench = _Bench(quick)
     points = [
         point
@@ -77,31 +72,20 @@ def evaluate_slice(
         progress.update(3, "memory")
         memory = peak_memory(LARGE_VOLUME)
         progress.update(4)
-    around = Surroundings(probes, settings, publishing, memory, recorded)
+    around = Surroundings(probes, settings, publishing, memory, comparison)
     write_report(folder, points, around)
     if not is_installed():
         print(HOW_TO_GET)
     return folder.finish(table(points), failures(points))
 
 
-def _recorded(
-    volume_file: Path | None, sweep_file: Path | None, out: Path, quick: bool
-) -> RecordedComparison | None:
-    """The comparison with recorded frames, if it is asked for.
-
-    Raises:
-        UsSimError: one of the two files is given without the other, or cannot be read.
-    """
-    if volume_file is None and sweep_file is None:
+def _compared(recorded: RecordedSweep | None, out: Path, quick: bool) -> RecordedComparison | None:
+    """The comparison with recorded frames, where there are some."""
+    if recorded is None or recorded.volume is None or recorded.sweep is None:
         return None
-    if volume_file is None or sweep_file is None:
-        raise UsSimError(
-            "--volume and --sweep belong together: give the tracked sweep and the volume that was "
-            "compounded from it"
-        )
     with Progress("recorded frames", 1, "sweep") as progress:
-        progress.update(0, sweep_file.name)
-        found = compare_with_recorded(volume_file, sweep_file, out, quick)
+        progress.update(0, recorded.sweep.name)
+        found = compare_with_recorded(recorded.volume, recorded.sweep, out, quick)
         progress.update(1)
     return found
 

@@ -22,11 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError, TrackingError
+from us_sim.tracking.calibration.settings import BOARD_LENGTH, BOARDS
 from us_sim.tracking.camera.markers import dictionary
 
-__all__ = ["BOARDS", "Board", "BoardView"]
-
-BOARDS = ("charuco", "grid", "chessboard")
+__all__ = ["Board", "BoardView"]
 
 _SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
 _FEWEST_CORNERS = 6  # of a view: fewer do not determine the board's pose and an error
@@ -75,7 +74,7 @@ class Board:
             "chessboard": ("square",),
         }[self.kind]
         for name in needed:
-            if not 0.0 < getattr(self, name) < 10.0:
+            if not 0.0 < getattr(self, name) <= BOARD_LENGTH.maximum:
                 raise CalibrationError(
                     f"a board of kind {self.kind} needs its {name} in metres or with a unit, as "
                     f"measured on the print"

@@ -15,38 +15,40 @@ from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.board import Board, BoardView
 from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
 from us_sim.tracking.calibration.report_picture import draw_coverage
+from us_sim.tracking.calibration.settings import CameraSettings
 from us_sim.tracking.camera.info import write_camera_info
+from us_sim.tracking.camera.settings import columns_and_rows
 
 __all__ = ["calibrate_photos", "find_photos"]
 
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-def calibrate_photos(
-    given: Sequence[str],
-    board: Board,
-    out: Path,
-    name: str,
-    progress: Callable[[float, str], None] | None = None,
-) -> str:
+def calibrate_photos(asked: CameraSettings) -> str:
     """Calibrate a camera and write its info and a picture; returns a sentence with the result.
 
     Args:
-        given: files, folders and patterns.
-        board: what the photos show.
-        out: YAML file to write; the picture goes beside it.
-        name: of the camera.
-        progress: told the fraction of the photos that is done, and how many show the board.
+        asked: the photos, what they show, the camera's name, and the file to write.
 
     Raises:
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
             write exists.
     """
+    out = asked.out
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    photos = find_photos(given)
-    names, views, blank, size = _views(photos, board, progress)
+    board = Board(
+        asked.board,
+        *columns_and_rows(asked.size),
+        asked.square,
+        asked.marker,
+        asked.separation,
+        asked.dictionary or ("" if asked.board == "chessboard" else "4X4_50"),
+        asked.legacy,
+    )
+    photos = find_photos(asked.photos)
+    names, views, blank, size = _views(photos, board)
     if not views:
         raise CalibrationError(
             f"none of the {len(photos)} photos shows the board: check --board, --size and "
@@ -60,7 +62,7 @@ def calibrate_photos(
         "photos_without_board": blank,
         "photos_left_out": far_off,
     }
-    write_camera_info(out, found.camera, name, notes)
+    write_camera_info(out, found.camera, asked.name, notes)
     draw_coverage(picture, found, views, names)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"

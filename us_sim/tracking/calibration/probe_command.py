@@ -14,6 +14,7 @@ from us_sim.geometry.se3 import interpolate
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
 from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
 from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
+from us_sim.tracking.calibration.settings import ProbeSettings
 from us_sim.tracking.calibration.transform_file import read_transform, write_transform
 
 __all__ = ["calibrate_image"]
@@ -23,53 +24,36 @@ _POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "q
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated
 
 
-def calibrate_image(
-    sightings_file: Path,
-    phantom_file: Path | None,
-    recording: Path | None,
-    name: str | None,
-    registration: Path | None,
-    origin: tuple[float, float],
-    spacing: tuple[float, float] | None,
-    out: Path,
-) -> str:
+def calibrate_image(asked: ProbeSettings) -> str:
     """Find where the image lies on the probe and write it; returns a sentence with the result.
-
-    Args:
-        sightings_file: CSV with feature, column, row, and the body's pose (x, y, z, qx, qy, qz,
-            qw) or, with a recording, the time in s.
-        phantom_file: its points or wires; without it every feature is a point at an unknown place.
-        recording: of the body's poses.
-        name: of the body's poses in it.
-        registration: from the poses' frame to the phantom's.
-        origin: column and row of the pixel at the middle of the transducer's face.
-        spacing: m, between columns and between rows, where known.
-        out: file to write.
 
     Raises:
         UsSimError: the files cannot be read or do not determine the image's place.
     """
-    to_phantom = read_transform(registration) if registration else Pose()
-    if recording is None:
-        seen = _with_poses(sightings_file, to_phantom)
+    out = asked.out
+    to_phantom = read_transform(asked.registration) if asked.registration else Pose()
+    if asked.recording is None:
+        seen = _with_poses(asked.sightings, to_phantom)
     else:
-        seen = _with_times(sightings_file, recording, name, to_phantom)
-    phantom = _features(phantom_file) if phantom_file else {}
+        seen = _with_times(asked.sightings, asked.recording, asked.pose, to_phantom)
+    phantom = _features(asked.phantom) if asked.phantom else {}
     unknown = sorted({sighting.feature for sighting in seen} - set(phantom))
     if phantom and unknown:
         raise CalibrationError(
-            f"{phantom_file}: has no {unknown[0]}, which {sightings_file} shows; its features are "
-            f"{', '.join(phantom)}"
+            f"{asked.phantom}: has no {unknown[0]}, which {asked.sightings} shows; its features "
+            f"are {', '.join(phantom)}"
         )
-    found = calibrate_probe(seen, phantom, spacing=None if spacing is None else np.array(spacing))
+    found = calibrate_probe(
+        seen, phantom, spacing=None if asked.pixel is None else np.array(asked.pixel)
+    )
     deviations = np.sqrt(np.diag(found.covariance))
     rejected = int((~found.inliers).sum())
     write_transform(
         out,
-        found.probe_pose(*origin),
+        found.probe_pose(*asked.origin),
         from_frame="probe",
         to_frame="body",
-        method=f"probe calibration, {sightings_file.name}",
+        method=f"probe calibration, {asked.sightings.name}",
         residuals={
             "rms": found.rms,  # m
             "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
@@ -78,7 +62,7 @@ def calibrate_image(
         },
         more={
             "pixel_spacing": found.spacing,  # m, between columns and between rows
-            "origin_pixel": list(origin),  # column, row
+            "origin_pixel": list(asked.origin),  # column, row
             "image_to_body": found.image_to_body,  # m, from (column, row, 0, 1)
             "standard_deviations": {
                 "position": deviations[:3],  # m, of pixel (0, 0)

@@ -21,6 +21,7 @@ from us_sim.tracking.calibration.recorded_motion import (
     seconds_of,
 )
 from us_sim.tracking.calibration.report_picture import draw_offset
+from us_sim.tracking.calibration.settings import ClockSettings, LandmarkSettings, PivotSettings
 from us_sim.tracking.calibration.time_offset import find_time_offset
 from us_sim.tracking.calibration.transform_file import (
     read_transform,
@@ -33,20 +34,21 @@ __all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
 _TABLES = {".csv", ".txt", ".xml"}
 
 
-def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
+def calibrate_tip(asked: PivotSettings) -> str:
     """Find a stylus' tip and write it; returns a sentence with the result.
 
     Raises:
         UsSimError: the recording cannot be read or does not determine the tip.
     """
-    motion = read_motion(recording, name)
-    found = calibrate_pivot(motion.poses)
+    out = asked.out
+    motion = read_motion(asked.recording, asked.pose)
+    found = calibrate_pivot(poses_of(motion))
     write_transform(
         out,
         Pose(found.tip),
         from_frame="tip",
         to_frame=motion.topic,
-        method=f"pivot about one point, {recording.name}",
+        method=f"pivot about one point, {asked.recording.name}",
         residuals={"rms": found.rms, "poses": len(found.inliers), "rejected": found.rejected},
         more={
             "standard_deviations": {"position": found.deviations},  # m
@@ -62,34 +64,16 @@ def calibrate_tip(recording: Path, name: str | None, out: Path) -> str:
     )
 
 
-def calibrate_registration(
-    known_file: Path,
-    measured_file: Path,
-    tip: Path | None,
-    name: str | None,
-    to: str,
-    out: Path,
-    *,
-    invert: bool = False,
-) -> str:
+def calibrate_registration(asked: LandmarkSettings) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
     Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
     in the same way when inverted.
 
-    Args:
-        known_file: CSV or Plus' XML.
-        measured_file: the same landmarks in the device's frame, or a recording of the stylus that
-            touched them in the file's order.
-        tip: the stylus' tip, for a recording.
-        name: of the stylus' poses in it.
-        to: name of the known landmarks' frame.
-        out: file to write.
-        invert: write the pose of the known landmarks' frame in the measured ones'.
-
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
     """
+    known_file, measured_file, to, out = asked.known, asked.measured, asked.to, asked.out
     known = read_landmarks(known_file)
     if measured_file.suffix.lower() in _TABLES:
         measured, frame = read_landmarks(measured_file), "tracker"
@@ -100,12 +84,12 @@ def calibrate_registration(
                 f"landmarks alike"
             )
     else:
-        measured, frame = _touched(list(known), measured_file, tip, name)
+        measured, frame = _touched(list(known), measured_file, asked.tip, asked.pose)
         names = list(known)
     theirs = np.array([measured[landmark] for landmark in names])
     ours = np.array([known[landmark] for landmark in names])
     found = register_landmarks(theirs, ours, names)
-    if invert:
+    if asked.invert:
         found, frame, to = register_landmarks(ours, theirs, names), to, frame
     left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
     write_transform(
@@ -137,42 +121,27 @@ def calibrate_registration(
     )
 
 
-def calibrate_clock(
-    moving_file: Path,
-    fixed_file: Path,
-    names: tuple[str | None, str | None],
-    largest: float,
-    out: Path,
-    *,
-    images: bool = False,
-    progress: Callable[[float, str], None] | None = None,
-) -> str:
+def calibrate_clock(asked: ClockSettings) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
-    Args:
-        moving_file: recording of the device.
-        fixed_file: recording of what is right: poses, or images of a line.
-        names: of the poses in both.
-        largest: s, the largest offset to believe.
-        out: file to write; a picture goes beside it.
-        images: take the fixed recording's images even where it has poses.
-        progress: told the fraction of the images that is done, and what is looked for.
+    A picture of both signals goes beside the file.
 
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
     """
+    out = asked.out
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    moving = read_signal(moving_file, names[0], progress=progress)
-    fixed = read_signal(fixed_file, names[1], images=images, progress=progress)
-    found = find_time_offset(moving, fixed, largest=largest)
+    moving = read_signal(asked.moving, asked.pose)
+    fixed = read_signal(asked.fixed, asked.fixed_pose or asked.pose, images=asked.images)
+    found = find_time_offset(moving, fixed, largest=asked.largest)
     write_calibration(
         out,
         {
             "time_offset": found.offset,  # s, to add to the device's stamps
             "standard_deviation": found.deviation,  # s
-            "method": f"correlation of {moving_file.name} with {fixed_file.name}",
+            "method": f"correlation of {asked.moving.name} with {asked.fixed.name}",
             "residuals": {
                 "correlation": found.correlation,
                 "unexplained": found.residual,  # of the fixed signal's standard deviation

@@ -26,11 +26,14 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody
+from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS, MARKER_SIZE, columns_and_rows
 
-__all__ = ["PAPERS", "Sheet", "print_markers", "sheets"]
+__all__ = ["PAPERS", "PrintSettings", "Sheet", "print_markers", "sheets"]
 
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height in mm."""
@@ -42,6 +45,45 @@ _FLAT = 1e-5  # m
 _DOTS = 300  # per inch, of a picture
 _CHECKED_DOTS = 200
 _TOLERANCE = 0.05  # mm, between where a marker is and where it is seen on the sheet
+
+
+@dataclass(frozen=True)
+class PrintSettings(Settings):
+    """What is printed on what: each field is an option of ``us-sim print-marker``."""
+
+    error = TrackingError
+
+    id: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
+    board: str | None = setting(
+        description="a board in place of one marker", choices=BOARDS_OF_MARKERS, default=None
+    )
+    size: str | None = setting(description="a board's columns and rows: 5x7", default=None)
+    marker: float = setting(MARKER_SIZE, "edge of a marker: '40 mm'", default=0.04)
+    square: float | None = setting(MARKER_SIZE, "edge of a ChArUco board's square", default=None)
+    separation: float | None = setting(MARKER_SIZE, "between the markers of a grid", default=None)
+    dictionary: str = setting(description="that the markers are of", default="4X4_50")
+    paper: str = setting(description="of the sheets", choices=tuple(PAPERS), default="A4")
+
+    def check(self) -> None:
+        """Refuse a board that is not said enough of."""
+        needed = {"charuco": ("size", "square"), "grid": ("size", "separation")}
+        for name in needed.get(self.board or "", ()):
+            if getattr(self, name) is None:
+                raise TrackingError(f"--board {self.board} needs --{name}")
+
+    def body(self) -> RigidBody:
+        """The marker or the board.
+
+        Raises:
+            TrackingError: it is impossible, or the dictionary has too few markers.
+        """
+        if self.board is None:
+            return RigidBody.single(self.dictionary, self.id, self.marker)
+        size = columns_and_rows(self.size or "")
+        if self.board == "charuco":
+            lengths = (self.square or 0.0, self.marker)
+            return RigidBody.charuco(self.dictionary, *size, *lengths)
+        return RigidBody.grid(self.dictionary, *size, self.marker, self.separation or 0.0)
 
 
 @dataclass(frozen=True, eq=False)

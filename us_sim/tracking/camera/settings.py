@@ -20,7 +20,17 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["DICTIONARIES", "MARKER_SIZE", "CameraSettings"]
+__all__ = [
+    "BOARDS_OF_MARKERS",
+    "DICTIONARIES",
+    "MARKER_SIZE",
+    "CameraSettings",
+    "columns_and_rows",
+]
+
+BOARDS_OF_MARKERS = ("charuco", "grid")
+"""Kinds of flat boards that carry markers."""
+
 
 DICTIONARIES = (
     *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
@@ -87,3 +97,15 @@ class CameraSettings(Settings):
         default=0.0,
         description="time from the middle of the exposure to the image's stamp",
     )
+
+
+def columns_and_rows(size: str) -> tuple[int, int]:
+    """The numbers in a board's size, which a person writes as ``5x7``.
+
+    Raises:
+        TrackingError: it is written otherwise.
+    """
+    columns, _, rows = size.lower().partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise TrackingError(f"--size {size}: write columns and rows, e.g. 5x7")
+    return int(columns), int(rows)

@@ -1,0 +1,49 @@
+"""The command `us-sim demo`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from us_sim.command.scene_options import add_network_option, add_scene_options, node_parameters
+
+__all__ = ["add_demo"]
+
+
+def add_demo(commands: Any) -> None:
+    """Add the command to `us-sim`'s."""
+    demo = commands.add_parser("demo", help="press on the virtual arm; images, summary, recording")
+    demo.add_argument(
+        "scene",
+        nargs="?",
+        help="scene file or name; default: upper_arm, or upper_arm_camera with --source camera",
+    )
+    demo.add_argument(
+        "--source",
+        choices=("path", "camera"),
+        help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
+        "default: camera where the scene's tracker is one",
+    )
+    demo.add_argument(
+        "--out",
+        type=Path,
+        default=Path("us_sim_demo"),
+        help="folder to write to; default: %(default)s",
+    )
+    add_scene_options(demo)
+    add_network_option(demo)
+    demo.set_defaults(command=_demo)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from us_sim.run.live import demo
+
+    return demo(
+        args.scene or ("upper_arm_camera" if args.source == "camera" else "upper_arm"),
+        args.volume,
+        args.out,
+        node_parameters(args.param),
+        network=args.network,
+        source=args.source,
+    )

@@ -1,0 +1,68 @@
+"""The command `us-sim run`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from us_sim.command.scene_options import add_network_option, add_scene_options, node_parameters
+from us_sim.command.setting_options import add_setting_options, read_settings
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.share import find_bag
+
+__all__ = ["add_run"]
+
+
+@dataclass(frozen=True)
+class _Run(Settings):
+    """What becomes of a run."""
+
+    record: Path | None = setting(description="record the session to this MCAP", default=None)
+    duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
+
+    def check(self) -> None:
+        """Refuse a recording that cannot be made, before anything is started."""
+        if self.record is not None and self.record.suffix != ".mcap":
+            raise self.refused("record", f"{self.record}: must be a file that ends in .mcap")
+        if self.record is not None and self.record.exists():
+            raise self.refused("record", f"{self.record}: exists already; choose another name")
+
+
+def add_run(commands: Any) -> None:
+    """Add the command to `us-sim`'s."""
+    run = commands.add_parser("run", help="run the nodes of a scene until Ctrl-C")
+    run.add_argument("scene", help="scene file, or name of an installed one")
+    add_setting_options(run, _Run)
+    run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
+    run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
+    add_scene_options(run)
+    add_network_option(run)
+    run.set_defaults(command=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from us_sim.run.live import dry_run, run
+    from us_sim.scene.reading import load_scene
+
+    asked = read_settings(args, _Run)
+    scene = load_scene(args.scene, volume=args.volume)
+    parameters = node_parameters(args.param)
+    if args.dry_run:
+        from us_sim.scene.readable_files import check_files
+
+        checked = check_files(scene)
+        print(dry_run(scene, parameters, record=asked.record, path=args.path))
+        if checked:
+            print(f"readable  {', '.join(checked)}")
+        return 0
+    return run(
+        scene,
+        parameters,
+        record=asked.record,
+        path=args.path,
+        duration=asked.duration,
+        network=args.network,
+    )

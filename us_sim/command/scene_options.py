@@ -1,0 +1,48 @@
+"""Options of the commands that use a scene."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from us_sim.errors import UsSimError
+
+__all__ = ["add_network_option", "add_scene_options", "node_parameters"]
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Another volume, and parameters of the scene's nodes."""
+    parser.add_argument(
+        "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
+    )
+    parser.add_argument(
+        "--param",
+        action="append",
+        default=[],
+        metavar="NODE.NAME=VALUE",
+        help="set a node's parameter; may be given again",
+    )
+
+
+def add_network_option(parser: argparse.ArgumentParser) -> None:
+    """Whether other machines are talked to."""
+    parser.add_argument("--network", action="store_true", help="talk beyond this host")
+
+
+def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
+    """What ``--param`` sets: values by name, by node.
+
+    Raises:
+        UsSimError: a text is not written ``node.name=value``.
+    """
+    parameters: dict[str, dict[str, str]] = {}
+    for text in texts:
+        target, equals, value = text.partition("=")
+        node, dot, name = target.partition(".")
+        if not (equals and dot and node and name):
+            raise UsSimError(
+                f"--param {text}: write NODE.NAME=VALUE, e.g. tissue_deformer.solver=msds"
+            )
+        parameters.setdefault(node, {})[name] = value
+    return parameters

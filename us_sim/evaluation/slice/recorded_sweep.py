@@ -1,0 +1,27 @@
+"""A recorded sweep that images are compared with: each field is an option of the command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from us_sim.errors import SettingsError
+from us_sim.settings.setting import Settings, setting
+
+__all__ = ["RecordedSweep"]
+
+
+@dataclass(frozen=True)
+class RecordedSweep(Settings):
+    """Both files, or none of them."""
+
+    volume: Path | None = setting(description="volume compounded from --sweep", default=None)
+    sweep: Path | None = setting(description="tracked sweep to compare images with", default=None)
+
+    def check(self) -> None:
+        """Refuse one file without the other."""
+        if (self.volume is None) != (self.sweep is None):
+            raise SettingsError(
+                "--volume and --sweep belong together: give the tracked sweep and the volume that "
+                "was compounded from it"
+            )
