@@ -89,8 +89,8 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
 
 def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type: ignore[no-untyped-def]
     for name, area in areas.area.items():
-        share = area / area[areas.rest] * 100
-        axes.plot(areas.time, share, color=COLOURS.get(name), label=f"{name} lumen", lw=2)
+        percent = area / area[areas.rest] * 100
+        axes.plot(areas.time, percent, color=COLOURS[name], label=f"{name} lumen", lw=2)
     axes.set_ylabel("area, % of rest")
     axes.set_xlabel("time, s")
     axes.set_ylim(bottom=0)

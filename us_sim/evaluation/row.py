@@ -49,10 +49,12 @@ class Row:
         return ", ".join(self.cells[:2])
 
     def _cell(self, value: object) -> str:
-        if not isinstance(value, float):
-            return "" if value is None else str(value)
-        if np.isnan(value):
+        if value is None or (isinstance(value, float) and np.isnan(value)):
             return ""
+        if isinstance(value, bool):
+            return str(value).lower()
+        if not isinstance(value, float):
+            return str(value)
         if self.decimals is not None:
             return str(round(value, self.decimals))
         return f"{value:.{self.digits}g}"

@@ -82,7 +82,7 @@ PLANES = Named(
 
 @dataclass(frozen=True)
 class Frame:
-    """What a slicer is given for one image."""
+    """What a slicer needs for one image."""
 
     nodes: NDArray[np.float64]  # (N, 3) m, deformed
     plane: SlicePlane

@@ -38,18 +38,10 @@ _SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)  # s, of timing the main case
 
 
 def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None) -> int:
-    """Measure, write slice.csv, the pictures and slice.md, and print the table.
+    """Write slice.csv, the pictures and slice.md, as `us_sim.evaluation` says.
 
-    Args:
-        out: folder to write to; made if it is not there.
-        quick: fewer cases, timed more shortly.
-        recorded: a tracked sweep, and its volume, whose frames are compared with images of it.
-
-    Returns:
-        0, or 1 when a method failed; its row says how, and the others are there.
-
-    Raises:
-        UsSimError: the folder cannot be written or holds a report, or the sweep cannot be read.
+    A quick run has fewer cases, timed more shortly. The frames of a recorded sweep are compared
+    with images of its volume, if there is one.
     """
     folder = ReportFolder("slice", out, quick)
     comparison = _compared(recorded, out, quick)

@@ -6,12 +6,12 @@ along each axis and prints the most bytes that the process ever held.
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+
+from us_sim.evaluation.own_process import start_module
 
 __all__ = ["peak_memory"]
 
@@ -21,14 +21,8 @@ def peak_memory(side: int) -> int | None:
 
     They include the volume, Python and every library. None where the system does not tell.
     """
-    run = subprocess.run(
-        [sys.executable, "-m", "us_sim.evaluation.slice.memory", str(side)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-    )
-    return int(run.stdout) if run.returncode == 0 and run.stdout.strip().isdigit() else None
+    said, _ = start_module("us_sim.evaluation.slice.memory", str(side)).communicate()
+    return int(said) if said.strip().isdigit() else None
 
 
 def _cut(side: int) -> None:

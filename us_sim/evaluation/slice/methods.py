@@ -32,7 +32,7 @@ class SlicingMethod:
     name: str
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
-    threads: tuple[int, ...]  # that it is given
+    threads: tuple[int, ...]  # numbers of threads that it is timed with
     is_vtk: bool = False
 
     @property

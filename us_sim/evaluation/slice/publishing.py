@@ -7,48 +7,34 @@ and publishing a message.
 
 from __future__ import annotations
 
-import os
 import statistics
 import subprocess
 import sys
 import time
+
+from us_sim.evaluation.own_process import start_module
 
 __all__ = ["publishing_ms"]
 
 _IMAGES = 180
 _RATE = 60.0  # Hz
 _LONGEST = 60.0  # s, after which nothing is waited for
-_WATCH = "watch"
+_MODULE, _WATCH = "us_sim.evaluation.slice.publishing", "watch"
 _NODE, _TOPIC = "slice_publishing", "us_sim_slice_publishing/image"
 
 
 def publishing_ms(side: int) -> float | None:
     """ms of a process that sends an image of ``side`` × ``side`` pixels; None where none went."""
-    path = os.pathsep.join(part for part in sys.path if part)
-    environment = {**os.environ, "PYTHONPATH": path}
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    command = [sys.executable, "-m", "us_sim.evaluation.slice.publishing"]
-    watcher = subprocess.Popen(
-        [*command, _WATCH], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    watcher = start_module(_MODULE, _WATCH)
+    sender = start_module(_MODULE, str(side))
     try:
-        run = subprocess.run(
-            [*command, str(side)],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=environment,
-            timeout=2 * _LONGEST,
-        )
-    except subprocess.TimeoutExpired:
+        return float(sender.communicate(timeout=2 * _LONGEST)[0])
+    except (subprocess.TimeoutExpired, ValueError):
         return None
     finally:
-        watcher.kill()
-        watcher.wait()
-    try:
-        return float(run.stdout)
-    except ValueError:
-        return None
+        for process in (watcher, sender):
+            process.kill()
+            process.wait()
 
 
 def _watch() -> None:

@@ -206,7 +206,7 @@ def _vtk_apart(points: Sequence[Point]) -> list[str]:
         "## VTK's two parts",
         "`vtkProbeFilter` finds the pixels in the deformed `vtkUnstructuredGrid` and interpolates "
         "the rest coordinates of its nodes (filter); another samples the volume there (sampling). "
-        "The mesh is given in the image's own coordinates, for the filter ignores an image's "
+        "The mesh is in the image's own coordinates, for the filter ignores an image's "
         "direction. VTK's wheels use one thread unless told otherwise.",
         markdown_table(("size", "filter, CPU ms", "sampling, CPU ms"), rows),
     ]

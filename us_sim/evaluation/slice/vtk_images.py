@@ -1,7 +1,7 @@
 """The same images by VTK, as a user of VTK would make them, to compare with.
 
 `vtkProbeFilter` finds the pixels in the deformed mesh, whose nodes carry their coordinates at
-rest, and interpolates those; a second one samples the volume there. The mesh is given to it in
+rest, and interpolates those; a second one samples the volume there. The mesh is passed to it in
 columns, rows and heights over the image, since it ignores an image's direction matrix; that is
 also its fast method, which goes through the cells instead of searching one for each pixel.
 """

@@ -50,17 +50,10 @@ class _Task:
 
 
 def evaluate_stability(out: Path, quick: bool) -> int:
-    """Run all cases on all methods and write stability.csv, stability.md and the maps into ``out``.
+    """Write stability.csv, the maps and stability.md, as `us_sim.evaluation` says.
 
-    Args:
-        out: a folder, made when it is not there.
-        quick: fewer cases.
-
-    Returns:
-        0, or 1 when a case was not finite, bounded or truthful, or refused for no reason.
-
-    Raises:
-        UsSimError: the folder cannot be written or holds a report.
+    A quick run has fewer cases. A case has failed that was not finite, bounded or truthful, or was
+    refused for no reason.
     """
     folder = ReportFolder("stability", out, quick)
     tasks = list(_tasks(quick))

@@ -54,6 +54,9 @@ _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
 _QUASI_STATIC_FRAMES, _DYNAMIC_FRAMES = 40, 150
 """Frames after the release, of methods without masses and of those with them."""
 
+_RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
+"""What only a case that was not refused has."""
+
 _RECOVERED = 1e-4  # of the thickness; a tissue that is so near its rest has come back
 
 
@@ -110,21 +113,17 @@ class Tried(Row):
             if not method.is_explicit:
                 varied |= {"stabilisation": None}
         failed = [f"FAILED: {trial.failure}"] if trial.failure else []
-        ran: dict[str, object] = {
-            "recovered_mm": trial.recovered_mm,
-            "residual_reported": trial.residual_reported,
-            "residual_checked": trial.residual_checked,
-            "truthful": str(trial.truthful).lower(),
-        }
+
+        def ran(name: str) -> object:
+            return None if trial.refused else getattr(trial, name)
+
         return {
             "method": self.method,
             **(varied | {"case": self.name}),
-            "recovery_frames": None if trial.refused else trial.recovery_frames,
+            "recovery_frames": ran("recovery_frames"),
             "dt_limit_predicted": trial.step_limit_predicted,
             "dt_limit_observed": trial.step_limit_observed,
-            "finite": None if trial.refused else str(trial.finite).lower(),
-            "bounded": None if trial.refused else str(trial.bounded).lower(),
-            **(dict.fromkeys(ran) if trial.refused else ran),
+            **{name: ran(name) for name in _RAN},
             "action": " | ".join([*failed, *trial.actions[:3]]),
         }
 

@@ -30,7 +30,7 @@ Every case is a small tissue (4 to 150 nodes), a collider and a motion of it, an
 - *bounded*: no node is ever farther from its rest than three times the mesh's diagonal, the depth
   and the collider together; a part that nothing holds may also drift off by ten times its size.
 - *back to rest*: at the end, the farthest node is within 1e-4 of the thickness from its rest (parts
-  that nothing holds: after a rigid motion). Quasi-static methods are given 40 frames, the others
+  that nothing holds: after a rigid motion). Quasi-static methods have 40 frames for it, the others
   150, whatever their time step is: 20 steps of 1 µs, or damping of 1000 times critical, leave no
   time to come back, which is physics and not counted as a failure. *frames* is the median number
   of frames until then.

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-import logging
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.cache import Form, kept
 from us_sim.evaluation.tissue import neo_hookean_hexahedra, reference, two_level
 from us_sim.evaluation.tissue.cases import Scene
 from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import Solution, solve_contact
 from us_sim.geometry.pose import Pose
-from us_sim.volume.phantom_cache import cache_folder
 
 __all__ = ["Reference", "kept_reference"]
 
 _STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
 
-_logger = logging.getLogger(__name__)
+_ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")
+"""What is kept of a solution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,27 +81,23 @@ def _kept(
     scene: Scene, size: float, start: Solution | None, progress: Callable[[float, str], None]
 ) -> Solution:
     planes = scene.reference_planes(size)
-    file = cache_folder() / f"reference-{_hash(scene, planes)}.npz"
-    names = ("displacement", "pressure", "force", "volume", "penetration")
-    try:
-        with np.load(file) as kept:
-            block = NeoHookeanHexahedra(planes, scene.material)
-            displacement, pressure, force, volume, penetration = (kept[name] for name in names)
-            return Solution(block, displacement, pressure, force, float(volume), float(penetration))
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        _logger.warning("%s cannot be used (%s), so it is made again", file, error)
-    poses = [scene.path[-1]] if start is not None else _approach(scene)
-    solution = solve_contact(planes, scene.material, scene.collider, poses, start, progress)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as partial:
-            np.savez(partial, **{name: getattr(solution, name) for name in names})
-        os.replace(partial.name, file)
-    except OSError as error:
-        _logger.warning("%s cannot be written (%s), so it is not kept", file, error)
-    return solution
+
+    def pack(solution: Solution) -> tuple[dict[str, NDArray], dict[str, Any]]:
+        return (
+            {name: getattr(solution, name) for name in _ARRAYS},
+            {name: getattr(solution, name) for name in _NUMBERS},
+        )
+
+    def unpack(arrays: dict[str, Any], numbers: dict[str, Any]) -> Solution:
+        block = NeoHookeanHexahedra(planes, scene.material)
+        return Solution(block, **arrays, **{name: numbers[name] for name in _NUMBERS})
+
+    def make() -> Solution:
+        poses = [scene.path[-1]] if start is not None else _approach(scene)
+        return solve_contact(planes, scene.material, scene.collider, poses, start, progress)
+
+    form = Form("reference.json", pack, unpack)
+    return kept(f"reference-{_hash(scene, planes)}", form, make)
 
 
 def _approach(scene: Scene) -> list[Pose]:

@@ -34,7 +34,7 @@ def _elasticity(u, v, w):  # type: ignore[no-untyped-def]
 
 
 class LinearEquations:
-    """Hooke's law on linear tetrahedra, with the nodes' share of the bulk stiffness.
+    """Hooke's law on linear tetrahedra, with the part of the bulk stiffness that acts at nodes.
 
     Args:
         model: of one material throughout.

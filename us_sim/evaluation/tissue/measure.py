@@ -80,18 +80,10 @@ def plan(quick: bool) -> list[Trial]:
 
 
 def evaluate_tissue(out: Path, quick: bool) -> int:
-    """Measure, write tissue.csv, the plots and tissue.md, and print the table.
+    """Write tissue.csv, the plots and tissue.md, as `us_sim.evaluation` says.
 
-    Args:
-        out: folder to write to; made if it is not there.
-        quick: fewer scenes, meshes and settings, and a coarser reference.
-
-    Returns:
-        0, or 1 when a method failed; its row says how, and the others are there.
-
-    Raises:
-        UsSimError: the folder cannot be written or holds a report, or no reference can be
-            computed.
+    A quick run has fewer scenes, meshes and settings, and a coarser reference. It raises UsSimError
+    too where no reference can be computed.
     """
     folder = ReportFolder("tissue", out, quick)
     trials = plan(quick)

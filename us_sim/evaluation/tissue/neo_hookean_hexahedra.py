@@ -39,11 +39,10 @@ except ImportError as error:
 
 __all__ = ["NeoHookeanHexahedra"]
 
-# Elements whose stiffness is computed at once; bounds the memory.
-_BATCH = 128
+_BATCH = 128  # elements whose stiffness is computed at once, which bounds the memory
 
-# The sign of each permutation of three axes.
 _SIGN = np.zeros((3, 3, 3))
+"""The sign of each permutation of three axes."""
 _SIGN[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _SIGN[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 

@@ -88,7 +88,7 @@ class MarkerKind:
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
     body: Callable[[], RigidBody]
-    front: tuple[float, float, float] | None = None  # not given, the first marker's normal
+    front: tuple[float, float, float] | None = None  # None: the first marker's normal
 
 
 _ALL = (

@@ -2,7 +2,7 @@
 
 Bodies of markers are rendered as a camera sees them at known poses
 (`us_sim.tracking.camera.rendered_views`), in short sequences as a hand moves them, and tracked as
-`probe_tracker` does it. Filters are held against the path that they are given with noise.
+`probe_tracker` does it. Filters are compared with the path to which noise was added for them.
 """
 
 from __future__ import annotations
@@ -26,17 +26,9 @@ _MORE = 3  # times as many sequences of the cases that the targets are about
 
 
 def evaluate_tracking(out: Path, quick: bool) -> int:
-    """Measure, write tracking.csv, filters.csv, the pictures and tracking.md, print the table.
+    """Write tracking.csv, filters.csv, the pictures and tracking.md, as `us_sim.evaluation` says.
 
-    Args:
-        out: folder to write to; made if it is not there.
-        quick: fewer distances, angles and views.
-
-    Returns:
-        0, or 1 when a case failed; its row says how, and the others are there.
-
-    Raises:
-        UsSimError: the folder cannot be written, or holds a report.
+    A quick run has fewer distances, angles and views.
     """
     folder = ReportFolder("tracking", out, quick)
     bench = Bench()

@@ -32,7 +32,7 @@ from us_sim.tracking.measurement import Measurement
 
 __all__ = ["Bench", "Point", "View", "mirrored", "visible"]
 
-_FLIP = 5.0  # degrees; a body that is turned by less is not the wrong way round
+_FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
 
 
@@ -87,14 +87,14 @@ class Point(Row):
             "p95_mm": self.error(95),
             "median_deg": self.turned(50),
             "p95_deg": self.turned(95),
-            "ms_median": self.ms,
-            "ms_first": self.ms_first,
+            "ms_median": _percentile([view.ms for view in self.views], 50),
+            "ms_first": _percentile([view.ms for view in self.views if view.first], 50),
             "cpu_ms_median": self.cpu_ms,
             "detector_cpu_ms": self.detector_cpu_ms,
             "pose_cpu_ms": self.pose_cpu_ms,
             "markers_used": _mean([view.used for view in found]),
             "expected_mm": _percentile([view.expected_mm for view in found], 50),
-            "within_95": self.within,
+            "within_95": _mean([view.inside for view in found]),
             "failure": self.failure,
         }
 
@@ -114,24 +114,9 @@ class Point(Row):
         return sum(view.flipped for view in self.views)
 
     @property
-    def ms(self) -> float:
-        """Wall clock of an image, median."""
-        return _percentile([view.ms for view in self.views], 50)
-
-    @property
-    def ms_first(self) -> float:
-        """That of images of which nothing was known before."""
-        return _percentile([view.ms for view in self.views if view.first], 50)
-
-    @property
     def cpu_ms(self) -> float:
         """Processor time of an image, median."""
         return _percentile([view.cpu_ms for view in self.views], 50)
-
-    @property
-    def within(self) -> float:
-        """Fraction of the errors inside the ellipsoid that should hold 95 % of them."""
-        return _mean([view.inside for view in self.found])
 
     def error(self, percent: float) -> float:
         """mm, percentile of the position's error."""
@@ -234,7 +219,7 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
 
 
 def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
-    """The pose that a plane seen from afar may be taken for: tilted the other way.
+    """The pose that a plane seen from afar may be taken for: tilted to the other side.
 
     Args:
         pose: of the body in ``camera_optical``.

@@ -18,10 +18,12 @@ from us_sim.evaluation.tracking.plots import (
     plot_run_time,
     plot_views,
 )
-from us_sim.evaluation.tracking.points import Point
+from us_sim.evaluation.tracking.points import Point, View
 from us_sim.evaluation.tracking.targets import targets
 
 __all__ = ["table", "write_report"]
+
+_OF_VIEWS = ("views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
 
 
 def table(points: Sequence[Point]) -> str:
@@ -65,7 +67,7 @@ def _parts(
         "![Error against distance and angle](tracking_error.png)",
         _bodies(points),
         "The position's error is of the body's middle. Flipped is a pose that is nearer to the "
-        "true one's mirror image, tilted the other way about the line of sight, and off by more "
+        "true one's mirror image, tilted to the other side of the line of sight, and off by more "
         "than 5°.",
         "## Error against run time",
         "![Error against run time](tracking_run_time.png)",
@@ -99,7 +101,7 @@ def _parts(
 
 
 def _bodies(points: Sequence[Point]) -> str:
-    head = ("body", "image", "m", "views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
+    head = ("body", "image", "m", *_OF_VIEWS)
     rows = []
     plain = [p for p in points if p.case.condition == "plain" and p.views]
     for name in MARKERS:
@@ -113,17 +115,19 @@ def _bodies(points: Sequence[Point]) -> str:
                 ]
                 if not mine:
                     continue
-                found = [view for view in mine if view.detected]
-                rows.append(
-                    (
-                        *(name, size, f"{distance:g}", f"{len(mine)}"),
-                        _percent(len(found), len(mine)),
-                        f"{sum(view.flipped for view in mine)}",
-                        *_percentiles([view.mm for view in found]),
-                        *_percentiles([view.degrees for view in found]),
-                    )
-                )
+                rows.append((name, size, f"{distance:g}", *_cells(mine)))
     return markdown_table(head, rows)
+
+
+def _cells(views: Sequence[View]) -> tuple[str, ...]:
+    """The cells of the columns `_OF_VIEWS`."""
+    found = [view for view in views if view.detected]
+    return (
+        *(f"{len(views)}", _percent(len(found), len(views))),
+        f"{sum(view.flipped for view in views)}",
+        *_percentiles([view.mm for view in found]),
+        *_percentiles([view.degrees for view in found]),
+    )
 
 
 def _times(points: Sequence[Point]) -> str:
@@ -145,7 +149,7 @@ def _times(points: Sequence[Point]) -> str:
 
 
 def _conditions(points: Sequence[Point]) -> str:
-    head = ("body", "condition", "views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
+    head = ("body", "condition", *_OF_VIEWS)
     rows = []
     for name in MARKERS:
         for condition in CONDITIONS:
@@ -156,15 +160,7 @@ def _conditions(points: Sequence[Point]) -> str:
                 and (p.case.image_size, p.case.distance) == (SMALL, 0.4)
                 for view in p.views
             ]
-            found = [view for view in mine if view.detected]
-            rows.append(
-                (
-                    *(name, condition, f"{len(mine)}", _percent(len(found), len(mine))),
-                    f"{sum(view.flipped for view in mine)}",
-                    *_percentiles([view.mm for view in found]),
-                    *_percentiles([view.degrees for view in found]),
-                )
-            )
+            rows.append((name, condition, *_cells(mine)))
     return markdown_table(head, rows)
 
 
