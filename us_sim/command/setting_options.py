@@ -79,7 +79,7 @@ def _add(
     unit = rule.quantity.unit if rule.quantity else ""
     names = ", ".join(rule.choice.names if rule.choice else rule.choices)
     told: dict[str, Any] = {"type": Path} if kind is Path else {}
-    told["help"] = rule.description + (f", {unit}" if unit else "") + (names and f": {names}")
+    told["help"] = rule.description + (names and f": {names}")
     if get_origin(kind) is tuple:
         told["nargs"] = "+" if Ellipsis in get_args(kind) else len(get_args(kind))
     required = field.default is dataclasses.MISSING
@@ -88,6 +88,6 @@ def _add(
         return
     if not required:
         told["default"] = argparse.SUPPRESS
-        told["help"] += f"; default: {field.default}" if field.default else ""
+        told["help"] += f"; default: {field.default} {unit}".rstrip() if field.default else ""
     named = "FILE" if kind is Path else "N" if rule.quantity else "NAME"
     parser.add_argument(option, metavar=unit.upper() or named, required=required, **told)

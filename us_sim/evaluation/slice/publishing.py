@@ -34,7 +34,7 @@ def publishing_ms(side: int) -> float | None:
     finally:
         for process in (watcher, sender):
             process.kill()
-            process.wait()
+            process.communicate()
 
 
 def _watch() -> None:

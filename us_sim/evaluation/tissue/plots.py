@@ -97,6 +97,8 @@ def _sizes(axes: Axes, points: Sequence[Point], value: Callable[[Point], float])
     for name, method in TISSUE_METHODS.items():
         mine = sorted((p for p in points if p.method == name), key=lambda p: p.nodes)
         mine = [p for p in mine if np.isfinite(value(p)) and value(p) > 0]
+        if not mine:
+            continue
         power = exponent({p.nodes: value(p) for p in mine})
         axes.plot(
             [p.nodes for p in mine],
@@ -112,6 +114,7 @@ def _sizes(axes: Axes, points: Sequence[Point], value: Callable[[Point], float])
     plain(axes)
     sizes = sorted({p.nodes for p in points})
     axes.set_xticks(sizes, [f"{n:,}" for n in sizes])
+    axes.tick_params(labelsize=7.5)
     axes.xaxis.set_minor_formatter(NullFormatter())
     key_beside(axes)
 
