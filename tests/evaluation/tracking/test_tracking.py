@@ -7,7 +7,7 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.evaluation.tracking import measure as tracking
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case, marker
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case
 from us_sim.evaluation.tracking.filters import FILTER_METHODS, delay, filter_point, filter_trials
 from us_sim.evaluation.tracking.points import Bench, Point, View, mirrored, visible
 from us_sim.evaluation.tracking.targets import targets
@@ -29,18 +29,18 @@ def bench():
 @pytest.mark.parametrize("name", MARKERS)
 @pytest.mark.parametrize(("distance", "angle"), [(0.4, 0.0), (0.9, 60.0)])
 def test_a_case_looks_from_where_it_says(name, distance, angle):
-    body = marker(name).body
+    body = MARKERS[name].body
     pose = Case(name, "640x480", distance, angle).sequence(3)[2]
     middle = pose.apply(body.centres.mean(axis=0)[None])[0]
     assert np.linalg.norm(middle) == pytest.approx(distance)
-    cosine = -(pose.rotation @ marker(name).front) @ middle / distance
+    cosine = -(pose.rotation @ MARKERS[name].front) @ middle / distance
     assert np.degrees(np.arccos(min(1.0, cosine))) == pytest.approx(angle, abs=1e-4)
 
 
 def test_four_markers_of_the_rigid_body_face_the_camera():
     for number in range(5):
         for pose in Case(RIGID_BODY, "640x480", 0.4, 0.0).sequence(number):
-            assert visible(marker(RIGID_BODY), pose) == 4
+            assert visible(MARKERS[RIGID_BODY], pose) == 4
 
 
 def test_the_mirror_image_of_a_tilted_plane_is_tilted_the_other_way():

@@ -13,7 +13,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +36,7 @@ __all__ = [
     "SMALL",
     "Case",
     "Marker",
-    "MarkerKind",
     "cases",
-    "marker",
 ]
 
 SMALL, LARGE = WEBCAMS  # images, by their sizes
@@ -73,72 +71,52 @@ CONDITIONS = Named(
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A body of markers and the side of it that the camera is before at an angle of 0."""
-
-    body: RigidBody
-    front: NDArray[np.float64]  # (3,) unit, towards the camera
-
-
-@dataclass(frozen=True)
-class MarkerKind:
-    """What is known of a kind of body: how a report names and draws it, and how it is made."""
+    """A body of markers: how a report names and draws it, and how it is made."""
 
     name: str
     words: str
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
-    body: Callable[[], RigidBody]
-    front: tuple[float, float, float] | None = None  # None: the first marker's normal
+    make: Callable[[], RigidBody]
+    facing: tuple[float, float, float] | None = None  # as `front`; None: the first marker's normal
+
+    @cached_property
+    def body(self) -> RigidBody:
+        """Made once."""
+        return self.make()
+
+    @cached_property
+    def front(self) -> NDArray[np.float64]:
+        """(3,) unit, of the side that the camera is before at an angle of 0."""
+        return self.body.normals[0] if self.facing is None else np.array(self.facing)
 
 
 _ALL = (
-    MarkerKind(
-        SINGLE,
-        "one ArUco marker of 40 mm",
-        "#D55E00",
-        "D",
+    Marker(
+        *(SINGLE, "one ArUco marker of 40 mm", "#D55E00", "D"),
         lambda: RigidBody.single("4X4_50", 7, 0.04),
     ),
-    MarkerKind(
-        "apriltag_40mm",
-        "one AprilTag of 40 mm",
-        "#E69F00",
-        "v",
+    Marker(
+        *("apriltag_40mm", "one AprilTag of 40 mm", "#E69F00", "v"),
         lambda: RigidBody.single("APRILTAG_36h11", 7, 0.04),
     ),
-    MarkerKind(
-        "charuco_board",
-        "ChArUco, 5 × 4 squares of 24 mm with markers of 18 mm",
-        "#0072B2",
-        "o",
+    Marker(
+        *("charuco_board", "ChArUco, 5 × 4 squares of 24 mm, markers of 18 mm", "#0072B2", "o"),
         lambda: RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018),
     ),
-    MarkerKind(
-        "grid_board",
-        "4 × 3 ArUco markers of 24 mm, 6 mm apart",
-        "#009E73",
-        "s",
+    Marker(
+        *("grid_board", "4 × 3 ArUco markers of 24 mm, 6 mm apart", "#009E73", "s"),
         lambda: RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006),
     ),
-    MarkerKind(
-        RIGID_BODY,
-        "6 markers of 30 mm on three facets, 4 of them visible at 0°",
-        "#CC79A7",
-        "^",
+    Marker(
+        *(RIGID_BODY, "6 markers of 30 mm on three facets, 4 visible at 0°", "#CC79A7", "^"),
         lambda: read_rigid_body(shared_path("config/markers/probe_grip.yaml")),
         # Between its middle facet and the one to the right: these two are seen, at 30° each.
-        front=(0.5, 0.0, math.sqrt(0.75)),
+        facing=(0.5, 0.0, math.sqrt(0.75)),
     ),
 )
-MARKERS = Named("body of markers", {kind.name: kind for kind in _ALL})
+MARKERS = Named("body of markers", {marker.name: marker for marker in _ALL})
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
-
-
-@lru_cache
-def marker(name: str) -> Marker:
-    """One of the bodies of `MARKERS`, made once."""
-    body, front = MARKERS[name].body(), MARKERS[name].front
-    return Marker(body, body.normals[0] if front is None else np.array(front))
 
 
 @dataclass(frozen=True)
@@ -154,7 +132,7 @@ class Case:
     def sequence(self, number: int) -> list[Pose]:
         """Poses of the body in ``camera_optical``, `FRAMES` of them; the middle one as asked."""
         random = np.random.default_rng([zlib.crc32(repr(self).encode()), number])
-        camera, seen = WEBCAMS[self.image_size], marker(self.marker)
+        camera, seen = WEBCAMS[self.image_size], MARKERS[self.marker]
         size = np.array([camera.width, camera.height])
         pixel = size * (0.5 + random.uniform(-0.12, 0.12, 2))
         place = np.append(camera.rays(pixel[None])[0], 1.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, marker
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
 __all__ = ["draw_views"]
@@ -18,13 +18,13 @@ _TITLE = 22  # pixels
 
 def draw_views(file: Path) -> None:
     """Write a picture with a row for each condition and a column for each body."""
-    rooms = {name: RenderedView(WEBCAMS[SMALL], marker(name).body) for name in MARKERS}
+    rooms = {name: RenderedView(WEBCAMS[SMALL], MARKERS[name].body) for name in MARKERS}
     rows = []
     for condition, (settings, _) in CONDITIONS.items():
         cells = []
         for name in MARKERS:
             case = Case(name, SMALL, 0.4, 30.0, condition)
-            seen = marker(name)
+            seen = MARKERS[name]
             pose = case.sequence(0)[0]
             image = rooms[name].render(pose, settings, 3, case.motion(0))
             middle = WEBCAMS[SMALL].project(pose.apply(seen.body.centres.mean(axis=0)[None]))[0]

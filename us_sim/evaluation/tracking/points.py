@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.row import Row
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, Marker, marker
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, Marker
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_between
 from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
@@ -140,7 +140,7 @@ class Bench:
 
     def point(self, case: Case, sequences: int) -> Point:
         """What so many sequences of images show."""
-        seen, camera = marker(case.marker), WEBCAMS[case.image_size]
+        seen, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
         if key not in self._rooms:
             self._rooms = {key: RenderedView(camera, seen.body)}
