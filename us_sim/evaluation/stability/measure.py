@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,8 +79,7 @@ def _tasks(quick: bool) -> Iterator[_Task]:
 
 def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list[Tried]:
     """All tasks, in processes of their own, in order."""
-    chunks = [tasks[i : i + _CHUNK] for i in range(0, len(tasks), _CHUNK)]
-    results: dict[int, list[Trial]] = {}
+    tried: list[Tried] = []
     with (
         tempfile.TemporaryDirectory(prefix="us-sim-stability-") as cache,
         ProcessPoolExecutor(
@@ -90,24 +89,16 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
             initargs=(cache,),
         ) as pool,
     ):
-        waiting: dict[Future[list[Trial]], int] = {
-            pool.submit(_run_chunk, chunk): number for number, chunk in enumerate(chunks)
-        }
-        counted = 0
-        for future in as_completed(waiting):
-            number = waiting[future]
-            try:
-                results[number] = future.result()
-            except BrokenProcessPool as error:
-                unknown = sorted({task.method for task in chunks[number]})
-                raise SolverError(
-                    f"a process died while it tried {' and '.join(unknown)}: run it again with "
-                    f"PYTHONFAULTHANDLER=1 to see where"
-                ) from error
-            counted += len(chunks[number])
-            progress(counted, chunks[number][-1].method)
-    trials = [trial for number in range(len(chunks)) for trial in results[number]]
-    return [_tried(task, trial) for task, trial in zip(tasks, trials, strict=True)]
+        try:
+            for task, trial in zip(tasks, pool.map(_try, tasks, chunksize=_CHUNK), strict=True):
+                tried.append(_tried(task, trial))
+                progress(len(tried), task.method)
+        except BrokenProcessPool as error:
+            raise SolverError(
+                f"a process died while it tried {tasks[len(tried)].method}, or what comes after "
+                f"it: run it again with PYTHONFAULTHANDLER=1 to see where"
+            ) from error
+    return tried
 
 
 def _tried(task: _Task, trial: Trial) -> Tried:
@@ -122,12 +113,6 @@ def _prepare(cache: str) -> None:
     threadpool_limits(1)
 
 
-def _run_chunk(tasks: Sequence[_Task]) -> list[Trial]:
-    for method in {task.method for task in tasks}:
-        _warm_up(method)
-    return [_try(task) for task in tasks]
-
-
 @lru_cache
 def _warm_up(method: str) -> None:
     """Once in a process, so that no frame's time contains a compilation."""
@@ -135,6 +120,7 @@ def _warm_up(method: str) -> None:
 
 
 def _try(task: _Task) -> Trial:
+    _warm_up(task.method)
     if isinstance(task.case, str):
         return refusal_of(task.method, task.case)
     trial = try_case(task.method, task.case)
