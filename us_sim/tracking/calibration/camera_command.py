@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,7 @@ from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.board import Board, BoardView
 from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
 from us_sim.tracking.calibration.report_picture import draw_coverage
-from us_sim.tracking.calibration.settings import CameraSettings
+from us_sim.tracking.calibration.settings import CameraSettings, Progress
 from us_sim.tracking.camera.info import write_camera_info
 from us_sim.tracking.camera.settings import columns_and_rows
 
@@ -24,11 +24,12 @@ __all__ = ["calibrate_photos", "find_photos"]
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-def calibrate_photos(asked: CameraSettings) -> str:
+def calibrate_photos(asked: CameraSettings, progress: Progress | None = None) -> str:
     """Calibrate a camera and write its info and a picture; returns a sentence with the result.
 
     Args:
         asked: the photos, what they show, the camera's name, and the file to write.
+        progress: told the fraction of the photos that is done, and how many show the board.
 
     Raises:
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
@@ -48,7 +49,7 @@ def calibrate_photos(asked: CameraSettings) -> str:
         asked.legacy,
     )
     photos = find_photos(asked.photos)
-    names, views, blank, size = _views(photos, board)
+    names, views, blank, size = _views(photos, board, progress)
     if not views:
         raise CalibrationError(
             f"none of the {len(photos)} photos shows the board: check --board, --size and "
@@ -109,7 +110,7 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
 
 
 def _views(
-    photos: Sequence[Path], board: Board, progress: Callable[[float, str], None] | None
+    photos: Sequence[Path], board: Board, progress: Progress | None
 ) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
     """Names and views of the photos that show the board, names of those that do not, the size."""
     names, views, blank = [], [], []

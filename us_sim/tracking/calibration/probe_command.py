@@ -14,7 +14,7 @@ from us_sim.geometry.se3 import interpolate
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
 from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
 from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
-from us_sim.tracking.calibration.settings import ProbeSettings
+from us_sim.tracking.calibration.settings import ProbeSettings, Progress
 from us_sim.tracking.calibration.transform_file import read_transform, write_transform
 
 __all__ = ["calibrate_image"]
@@ -24,7 +24,7 @@ _POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "q
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated
 
 
-def calibrate_image(asked: ProbeSettings) -> str:
+def calibrate_image(asked: ProbeSettings, _: Progress | None = None) -> str:
     """Find where the image lies on the probe and write it; returns a sentence with the result.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,12 @@ from us_sim.tracking.calibration.recorded_motion import (
     seconds_of,
 )
 from us_sim.tracking.calibration.report_picture import draw_offset
-from us_sim.tracking.calibration.settings import ClockSettings, LandmarkSettings, PivotSettings
+from us_sim.tracking.calibration.settings import (
+    ClockSettings,
+    LandmarkSettings,
+    PivotSettings,
+    Progress,
+)
 from us_sim.tracking.calibration.time_offset import find_time_offset
 from us_sim.tracking.calibration.transform_file import (
     read_transform,
@@ -34,7 +38,7 @@ __all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
 _TABLES = {".csv", ".txt", ".xml"}
 
 
-def calibrate_tip(asked: PivotSettings) -> str:
+def calibrate_tip(asked: PivotSettings, _: Progress | None = None) -> str:
     """Find a stylus' tip and write it; returns a sentence with the result.
 
     Raises:
@@ -42,7 +46,7 @@ def calibrate_tip(asked: PivotSettings) -> str:
     """
     out = asked.out
     motion = read_motion(asked.recording, asked.pose)
-    found = calibrate_pivot(poses_of(motion))
+    found = calibrate_pivot(motion.poses)
     write_transform(
         out,
         Pose(found.tip),
@@ -64,7 +68,7 @@ def calibrate_tip(asked: PivotSettings) -> str:
     )
 
 
-def calibrate_registration(asked: LandmarkSettings) -> str:
+def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
     Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
@@ -121,7 +125,7 @@ def calibrate_registration(asked: LandmarkSettings) -> str:
     )
 
 
-def calibrate_clock(asked: ClockSettings) -> str:
+def calibrate_clock(asked: ClockSettings, progress: Progress | None = None) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
     A picture of both signals goes beside the file.
@@ -133,8 +137,9 @@ def calibrate_clock(asked: ClockSettings) -> str:
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    moving = read_signal(asked.moving, asked.pose)
-    fixed = read_signal(asked.fixed, asked.fixed_pose or asked.pose, images=asked.images)
+    moving = read_signal(asked.moving, asked.pose, progress=progress)
+    name = asked.fixed_pose or asked.pose
+    fixed = read_signal(asked.fixed, name, images=asked.images, progress=progress)
     found = find_time_offset(moving, fixed, largest=asked.largest)
     write_calibration(
         out,

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS
+
+Progress = Callable[[float, str], None]
+"""What a calibration tells the fraction that is done, and what is being done."""
 
 __all__ = [
     "BOARDS",
@@ -23,6 +27,7 @@ __all__ = [
     "LandmarkSettings",
     "PivotSettings",
     "ProbeSettings",
+    "Progress",
 ]
 
 BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
