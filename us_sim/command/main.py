@@ -14,6 +14,7 @@ from us_sim.command.demo import add_demo
 from us_sim.command.evaluate import add_evaluate
 from us_sim.command.play import add_play
 from us_sim.command.print_marker import add_print_marker
+from us_sim.command.reference import add_reference
 from us_sim.command.render import add_render
 from us_sim.command.run import add_run
 from us_sim.errors import UsSimError
@@ -30,7 +31,7 @@ def main(args: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (add_demo, add_run, add_render, add_play, add_bag):
         add(commands)
-    for add in (add_calibrate, add_print_marker, add_evaluate):
+    for add in (add_calibrate, add_print_marker, add_evaluate, add_reference):
         add(commands)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
