@@ -23,7 +23,7 @@ _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".
 
 
 def calibrate_photos(
-    given: Sequence[str],
+    patterns: Sequence[str],
     board: Board,
     out: Path,
     name: str,
@@ -32,8 +32,8 @@ def calibrate_photos(
     """Calibrate a camera and write its info and a picture; returns a sentence with the result.
 
     Args:
-        given: files, folders and patterns.
-        board: what the photos show.
+        patterns: names of files and folders, and glob patterns.
+        board: the board that the photos show.
         out: YAML file to write; the picture goes beside it.
         name: of the camera.
         progress: told the fraction of the photos that is done, and how many show the board.
@@ -45,7 +45,7 @@ def calibrate_photos(
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    photos = find_photos(given)
+    photos = find_photos(patterns)
     names, views, blank, size = _views(photos, board, progress)
     if not views:
         raise CalibrationError(
@@ -77,14 +77,14 @@ def calibrate_photos(
     )
 
 
-def find_photos(given: Sequence[str]) -> list[Path]:
+def find_photos(patterns: Sequence[str]) -> list[Path]:
     """The files that are named, lie in named folders or match patterns, in natural order.
 
     Raises:
         CalibrationError: a name stands for no photo.
     """
     photos: dict[Path, None] = {}
-    for text in given:
+    for text in patterns:
         path = Path(text).expanduser()
         if path.is_file():
             photos[path] = None
@@ -101,7 +101,7 @@ def find_photos(given: Sequence[str]) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[bool, int, str]]:
-    """2.jpg before 10.jpg."""
+    """A sort key that puts 2.jpg before 10.jpg."""
     parts = re.findall(r"\d+|\D+", str(path))
     return [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
 
@@ -150,7 +150,7 @@ def _notes(
     names: Sequence[str],
     views: Sequence[BoardView],
 ) -> dict[str, object]:
-    """What the file says besides the camera; ROS' readers pass it over."""
+    """What the file says in addition to the camera; ROS' readers ignore it."""
     return {
         "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
         "residuals": {
@@ -160,6 +160,6 @@ def _notes(
         },
         "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
         "largest_tilt": found.tilt,  # rad, between two boards
-        "reach": found.reach,  # of the way from the image's middle to its corners
+        "reach": found.reach,  # fraction of the distance from the image's middle to its corners
         "note": found.note,
     }

@@ -74,8 +74,8 @@ def calibrate_registration(
 ) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
-    Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
-    in the same way when inverted.
+    Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
+    calibration when inverted.
 
     Args:
         known_file: CSV or Plus' XML.
@@ -151,7 +151,7 @@ def calibrate_clock(
 
     Args:
         moving_file: recording of the device.
-        fixed_file: recording of what is right: poses, or images of a line.
+        fixed_file: recording with the right stamps: poses, or images of a line.
         names: of the poses in both.
         largest: s, the largest offset to believe.
         out: file to write; a picture goes beside it.

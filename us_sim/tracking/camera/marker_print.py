@@ -46,7 +46,7 @@ _TOLERANCE = 0.05  # mm, between where a marker is and where it is seen on the s
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """What is black on one sheet of paper; mm from its upper left corner, x right, y down."""
+    """The print on one sheet of paper; mm from its upper left corner, x right, y down."""
 
     body: RigidBody
     paper: str
@@ -194,7 +194,7 @@ def _cell(body: RigidBody, corners: NDArray[np.float64]) -> float:
 
 
 def _cells(name: str, number: int, corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Runs of black cells of a marker whose corners (4, 2) are given, row by row."""
+    """Runs of black cells, row by row, of a marker with corners (4, 2)."""
     bits = dictionary(name).markerSize + 2
     code = np.asarray(cv2.aruco.generateImageMarker(dictionary(name), number, bits)) == 0
     runs = []
