@@ -13,16 +13,16 @@ def test_the_pose_along_a_way_is_the_product_of_its_matrices():
         pose = Pose(random.normal(size=3), random.normal(size=4))
         tree.place(f"{number + 1}", f"{number}", pose)
         product = product @ pose.matrix
-    np.testing.assert_allclose(tree.pose(tree.way("5", "0")).matrix, product, atol=1e-12)
+    np.testing.assert_allclose(tree.pose(tree.chain("5", "0")).matrix, product, atol=1e-12)
 
 
 def test_frames_that_do_not_meet_or_go_round_have_no_way():
     tree = FrameTree()
     tree.place("a", "b", Pose())
     tree.place("b", "a", Pose())
-    assert tree.way("a", "world") is None
-    assert tree.way("nowhere", "world") is None
-    assert tree.way("world", "world") == []
+    assert tree.chain("a", "world") is None
+    assert tree.chain("nowhere", "world") is None
+    assert tree.chain("world", "world") == []
 
 
 def test_a_flood_of_frames_ends():

@@ -1,6 +1,6 @@
-"""The probe's shape where it touches the patient, shared by tissue and skin.
+"""The probe's shape where it touches the patient: one for tissue and skin.
 
-How far points are from it is `us_sim.geometry.collider_distance`.
+`us_sim.geometry.collider_distance` computes how far points are from it.
 
 >>> from us_sim.geometry.collider import RoundedBox
 >>> RoundedBox(length="46 mm", width="14 mm", height="40 mm", rounding="4 mm").offset_box

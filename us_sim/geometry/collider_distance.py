@@ -90,7 +90,7 @@ def curved_box_distance(box, grip, x, y, z):
     sy = 1.0 if y >= 0 else -1.0
     dx = sx * x - box[0]
     dy = sy * y - box[1]
-    # The way to the core in the plane of the image: its length, negative inside, and direction.
+    # Distance to the core in the plane of the image, negative inside, and its direction.
     if above > 0.0 and sx * x * end <= box[0] * above:  # the arc is nearer than its ends
         reach = math.sqrt(x * x + above * above)
         across, ux, uz = reach - radius, x / reach, above / reach

@@ -17,19 +17,19 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """The four outward faces of a positively oriented tetrahedron."""
 
 MOST_NODES = 2**21
-"""So many nodes at most, so that the three of a face fit into one 64-bit number."""
+"""Most nodes of a mesh, so that the three of a face fit into one 64-bit number."""
 
 
 def face_order(
     tetrahedra: NDArray[np.integer],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Faces brought together with the faces of the same three nodes.
+    """Face numbers in an order that groups the faces of the same three nodes.
 
     Face f of tetrahedron t, ``FACES[f]``, has the number 4 t + f.
 
     Returns:
-        (4M,) face numbers, those of the same nodes in a row and ascending; and for each set of
-        same faces where its row starts, and how many they are.
+        (4M,) face numbers, those of the same nodes one after the other and ascending; and for
+        each such group where it starts, and how many faces it has.
     """
     faces = np.sort(tetrahedra[:, FACES].reshape(-1, 3).astype(np.int64), axis=1)
     keys = faces[:, 0] << 42 | faces[:, 1] << 21 | faces[:, 2]

@@ -1,4 +1,4 @@
-"""Where one frame lies in another, as files write it down.
+"""The pose of one frame in another, as files write it down.
 
 >>> from us_sim.geometry.placement import Placement
 >>> Placement(position=["10 mm", 0, 0]).pose.position
@@ -32,7 +32,7 @@ class Placement(Settings):
     )
 
     def check(self) -> None:
-        """Refuse a quaternion that is none."""
+        """Refuse a quaternion that is no rotation."""
         if math.hypot(*self.orientation) < 1e-6:
             raise self.refused(
                 "orientation", "is zero, so it is no orientation: give [0, 0, 0, 1] for none"

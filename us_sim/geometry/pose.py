@@ -102,7 +102,7 @@ class Pose:
         return Pose(-self.rotation.T @ self.position, self.orientation * [-1.0, -1.0, -1.0, 1.0])
 
     def __matmul__(self, other: Pose) -> Pose:
-        """First ``other``, then this transform."""
+        """The transform that does ``other`` first, then this."""
         x1, y1, z1, w1 = self.orientation
         x2, y2, z2, w2 = other.orientation
         product = [

@@ -6,8 +6,8 @@ A twist is (6,): translation (m), then rotation (rad), the order of a measuremen
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.geometry import se3
 >>> quarter_turn = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2]))
->>> half_way = se3.interpolate(Pose(), quarter_turn, 0.5)
->>> np.degrees(se3.log(half_way)[5]).round(6).item(), half_way.position.round(6).tolist()
+>>> middle = se3.interpolate(Pose(), quarter_turn, 0.5)
+>>> np.degrees(se3.log(middle)[5]).round(6).item(), middle.position.round(6).tolist()
 (45.0, [0.0, 0.0, 0.05])
 """
 
@@ -57,11 +57,11 @@ def adjoint(pose: Pose) -> NDArray[np.float64]:
     return matrix
 
 
-def interpolate(first: Pose, second: Pose, part: float) -> Pose:
-    """The pose at a part (0 to 1) of the way: straight, and turning evenly the shorter way."""
-    turn = part * rotation_between(first.orientation, second.orientation)
+def interpolate(first: Pose, second: Pose, fraction: float) -> Pose:
+    """The pose at a fraction (0 to 1) of the path, which is straight and takes the shorter turn."""
+    turn = fraction * rotation_between(first.orientation, second.orientation)
     return Pose(
-        first.position + part * (second.position - first.position),
+        first.position + fraction * (second.position - first.position),
         product(rotation_exp(turn), first.orientation),
     )
 

@@ -1,4 +1,4 @@
-"""Reading one MCAP file, also one that was cut off: what was written before the cut is recovered.
+"""Reading one MCAP file. Of a file that was cut off, what was written before the cut is recovered.
 
 A whole file is read by the index in its summary. Without one (the recorder was killed, the disk
 ran full, the copy broke off) the records are walked from the start up to the first that is not
@@ -50,7 +50,7 @@ _DAMAGE = (
     StopIteration,
     MemoryError,
 )
-"""What the parsers raise when the bytes are not what they should be."""
+"""Errors that the parsers raise for damaged bytes."""
 
 
 class _Run(NamedTuple):
@@ -66,7 +66,7 @@ class McapFile:
 
     Args:
         path: the file.
-        label: what errors call it, where that is not its path.
+        label: its name in errors, where that is not its path.
 
     Raises:
         BagError: the file is empty, no MCAP, or of a topic with two types.

@@ -1,4 +1,4 @@
-"""What ``metadata.yaml`` says about a bag (version 9, ROS 2 Jazzy), written to the letter.
+"""The ``metadata.yaml`` of a bag (version 9), written to the letter as ROS 2 Jazzy does.
 
 >>> from us_sim.recording.metadata import BagMetadata, FileEntry
 >>> empty = BagMetadata(files=(FileEntry("session.mcap"),))

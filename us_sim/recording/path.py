@@ -45,7 +45,7 @@ class ProbePath:
     stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
     positions: NDArray[np.float64]  # (K, 3) m, frame frame_id
     orientations: NDArray[np.float64]  # (K, 4) x, y, z, w as recorded, not normalised
-    log_times: NDArray[np.int64] = field(  # (K,) ns since the epoch; the stamps when not given
+    log_times: NDArray[np.int64] = field(  # (K,) ns since the epoch; the stamps by default
         default_factory=lambda: np.empty(0, np.int64)
     )
     rejected: int = 0  # poses of the topic left out: not finite, or without an orientation
@@ -72,7 +72,7 @@ class ProbePath:
 
     @property
     def poses(self) -> list[Pose]:
-        """All of them, as `pose` gives them."""
+        """All poses, as `pose` returns them."""
         return [self.pose(index) for index in range(len(self))]
 
     @property
@@ -88,7 +88,7 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
 
     Args:
         path: any bag that ``read_bag`` reads, or a recording.
-        topic: its name, with or without the leading slash; when not given, the bag's only
+        topic: its name, with or without the leading slash; by default the bag's only
             PoseStamped topic, or among several the one named ``tracker/pose``. In a recording, a
             transform (``ProbeToReference``).
 
@@ -121,7 +121,7 @@ def write_path(
     Args:
         file: as ``BagWriter`` takes it.
         path: recorded at its log times.
-        qos: what the topic's publisher offers; reliable, keep last 10 when not given.
+        qos: what the topic's publisher offers; reliable, keep last 10 by default.
         sidecar: False leaves ``metadata.yaml`` away.
 
     Raises:
@@ -154,7 +154,7 @@ def _serialized(
 
 
 def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
-    """The topic asked for, or the bag's only one with poses, or a session's tracker poses."""
+    """The topic of that name, or the bag's only one with poses, or a session's tracker poses."""
     if name is not None:
         topic = bag.topic(name)
         if topic.type_name != POSE_STAMPED:

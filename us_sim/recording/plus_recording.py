@@ -40,15 +40,15 @@ from us_sim.recording.path import ProbePath
 from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
 from us_sim.volume.stored_size import metaimage_header
 
-__all__ = ["TrackerRecording", "Way", "read_tracker_recording"]
+__all__ = ["TrackerRecording", "TransformChain", "read_tracker_recording"]
 
 _METRES = 1e-3  # the format holds millimetres
 _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
 
 
 @dataclass(frozen=True)
-class Way:
-    """Transforms that lead to a reference frame, each forwards or inverted."""
+class TransformChain:
+    """Transforms that lead to a reference frame one after the other, each forwards or inverted."""
 
     reference: str
     steps: tuple[tuple[str, bool], ...]
@@ -68,16 +68,16 @@ class TrackerRecording:
     def __len__(self) -> int:
         return len(self.times)
 
-    def way(self, name: str, reference: str | None = None) -> Way:
-        """From a body to a reference frame, by the fewest transforms.
+    def chain(self, name: str, reference: str | None = None) -> TransformChain:
+        """The chain of the fewest transforms from a body to a reference frame.
 
         Args:
             name: of a transform (``StylusToTracker``), also one that others make up
                 (``StylusToReference``), or of a body (``Stylus``).
-            reference: a frame (``Reference``); not given, that of the body's own transform.
+            reference: a frame (``Reference``); by default that of the body's own transform.
 
         Raises:
-            TrackingError: the recording has no such transform, or no way to the reference.
+            TrackingError: the recording has no such transform, or no chain to the reference.
         """
         body, end = _ends(name)
         if reference is None and end and name not in self.transforms:
@@ -85,18 +85,18 @@ class TrackerRecording:
         own = [key for key in self.transforms if _ends(key)[0] == body]
         if reference is None and name in self.transforms:
             own = [name]
-        way = None
+        chain = None
         if reference is not None:
-            way = _fewest(self._steps(), body, reference)
+            chain = _fewest(self._steps(), body, reference)
         elif len(own) == 1:
-            way = Way(_ends(own[0])[1], ((own[0], True),))
-        if way is None:
+            chain = TransformChain(_ends(own[0])[1], ((own[0], True),))
+        if chain is None:
             to = f" to {reference}" if reference else ""
             several = "several transforms lead" if len(own) > 1 else "no transform leads"
             raise TrackingError(
                 f"{self.path}: {several} from {name}{to}; name one of {', '.join(self.transforms)}"
             )
-        return way
+        return chain
 
     def poses(
         self, name: str, reference: str | None = None
@@ -104,15 +104,15 @@ class TrackerRecording:
         """A body's poses in a reference frame (K, 4, 4) m, and which are valid (K,); nan elsewhere.
 
         Args:
-            name: as in :meth:`way`.
-            reference: as in :meth:`way`.
+            name: as in :meth:`chain`.
+            reference: as in :meth:`chain`.
 
         Raises:
-            TrackingError: see :meth:`way`.
+            TrackingError: see :meth:`chain`.
         """
         matrices = np.broadcast_to(np.eye(4), (len(self), 4, 4))
         valid = np.ones(len(self), dtype=bool)
-        for key, forward in self.way(name, reference).steps:
+        for key, forward in self.chain(name, reference).steps:
             step = self.transforms[key]
             matrices = (step if forward else _inverse(step)) @ matrices
             valid &= self.valid[key]
@@ -124,11 +124,11 @@ class TrackerRecording:
         Its stamps are the recorder's clock.
 
         Args:
-            name: as in :meth:`way`; not given, the recording's only transform.
-            reference: as in :meth:`way`.
+            name: as in :meth:`chain`; by default the recording's only transform.
+            reference: as in :meth:`chain`.
 
         Raises:
-            TrackingError: see :meth:`way`; or the name is missing, or no pose is valid.
+            TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.
         """
         if name is None:
             if len(self.transforms) != 1:
@@ -136,9 +136,9 @@ class TrackerRecording:
                     f"{self.path}: has several transforms; name one of {', '.join(self.transforms)}"
                 )
             (name,) = self.transforms
-        way = self.way(name, reference)
+        chain = self.chain(name, reference)
         matrices, valid = self.poses(name, reference)
-        why = self.why(key for key, _ in way.steps)
+        why = self.why(key for key, _ in chain.steps)
         if not valid.any():
             raise TrackingError(
                 f"{self.path}: none of the {len(self)} poses of {name} is valid{why}"
@@ -148,7 +148,7 @@ class TrackerRecording:
         count = self.untimed + len(self)
         return ProbePath(
             topic=name,
-            frame_id=way.reference,
+            frame_id=chain.reference,
             stamps=np.round(self.times[valid] * 1e9).astype(np.int64),
             positions=np.array([pose.position for pose in poses]),
             orientations=np.array([pose.orientation for pose in poses]),
@@ -157,7 +157,7 @@ class TrackerRecording:
         )
 
     def why(self, names: Iterable[str]) -> str:
-        """In brackets, for a person: what was left out of these transforms; empty when nothing."""
+        """The samples of these transforms that were left out, in brackets, or an empty text."""
         said = [
             f"{count} with {reason}"
             for name in names
@@ -244,7 +244,7 @@ def _read(
     identity = (matrices == np.eye(4)).all(axis=(1, 2))
     moved = np.isfinite(matrices[:, 0, 0]) & ~identity
     if identity.any() and moved.any():
-        # No measurement is exactly that: it is what Plus fills in for a body it has not seen.
+        # No measurement is exactly that: Plus fills it in for a body it has not seen.
         matrices[identity] = np.nan
         reasons["an identity among poses that are none"] = int(identity.sum())
     return matrices, reasons
@@ -252,7 +252,7 @@ def _read(
 
 def _header(path: Path) -> dict[str, str]:
     try:
-        # Told by its first bytes, so that a vast file of another kind is not read as a header.
+        # The first bytes tell, so that a vast file of another kind is not read as a header.
         with path.open("rb") as file:
             if b"=" not in file.read(256):
                 raise TrackingError(f"{path}: is no tracker recording (.igs.mha) of Plus")
@@ -296,7 +296,7 @@ def _rigid(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of rigid transforms (K, 4, 4)."""
+    """The inverses of rigid transforms (K, 4, 4)."""
     inverse = np.zeros_like(matrices)
     inverse[:, :3, :3] = matrices[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("kij,kj->ki", inverse[:, :3, :3], matrices[:, :3, 3])
@@ -310,16 +310,18 @@ def _ends(name: str) -> tuple[str, str]:
     return start, end
 
 
-def _fewest(steps: Mapping[str, list[tuple[str, str, bool]]], start: str, goal: str) -> Way | None:
-    """The shortest way from one frame to another; None where there is none."""
-    ways: dict[str, tuple[tuple[str, bool], ...]] = {start: ()}
+def _fewest(
+    steps: Mapping[str, list[tuple[str, str, bool]]], start: str, goal: str
+) -> TransformChain | None:
+    """The shortest chain from one frame to another; None where there is none."""
+    chains: dict[str, tuple[tuple[str, bool], ...]] = {start: ()}
     waiting = deque([start])
     while waiting:
         frame = waiting.popleft()
-        if frame == goal and ways[frame]:
-            return Way(goal, ways[frame])
+        if frame == goal and chains[frame]:
+            return TransformChain(goal, chains[frame])
         for end, key, forward in steps.get(frame, []):
-            if end not in ways:
-                ways[end] = (*ways[frame], (key, forward))
+            if end not in chains:
+                chains[end] = (*chains[frame], (key, forward))
                 waiting.append(end)
     return None

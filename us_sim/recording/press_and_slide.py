@@ -31,7 +31,8 @@ _ROCK = np.array([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]])  # degre
 _PRESS = np.array(
     [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]],
 )
-"""Fractions: of the hover height above the skin where negative, of the depth where positive."""
+"""Height as a fraction: of the hover height above the skin if negative, of the depth if
+positive."""
 
 
 def press_and_slide(
@@ -44,7 +45,7 @@ def press_and_slide(
 
     Args:
         rate: poses per second.
-        duration: s; the phases keep their shares of it.
+        duration: s; the phases keep their fractions of it.
         depth: m, of the press below the skin.
         hover: m, height above the skin before and after.
 
@@ -77,8 +78,8 @@ def _minimum_jerk(keys: NDArray[np.float64], times: NDArray[np.float64]) -> NDAr
     """(K,) values at times (K,) s, at rest at each of the keys (N, 2) and outside of them."""
     at, values = keys.T
     left = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
-    share = np.clip((times - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
-    blend = share**3 * (10 - 15 * share + 6 * share**2)
+    fraction = np.clip((times - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
+    blend = fraction**3 * (10 - 15 * fraction + 6 * fraction**2)
     return values[left] + blend * (values[left + 1] - values[left])
 
 

@@ -131,8 +131,8 @@ def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tupl
     """The profiles of a bag of any version: YAML text, or the list that it parses to.
 
     Args:
-        document: the text or the list; nothing at all stands for no profiles.
-        where: what errors begin with.
+        document: the text or the list; None or an empty text means no profiles.
+        where: the beginning of errors.
 
     Raises:
         BagError: the text is not YAML, or not a list of profiles.
@@ -153,7 +153,7 @@ def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tupl
 
 
 def _policy_name(policy: str, value: Any) -> str:
-    """Lower-case name of a policy given as a name, a number or an enum member."""
+    """Lower-case name of a policy that is a name, a number or an enum member."""
     names = _POLICIES[policy]
     name = getattr(value, "name", value)
     if isinstance(name, str):

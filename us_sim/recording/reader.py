@@ -81,7 +81,7 @@ class Bag:
 
     @property
     def note(self) -> str:
-        """What is wrong with a bag that was not ended properly; empty when whole."""
+        """The fault of a bag that was not closed properly; empty when whole."""
         return "; ".join(storage.note for storage in self._storages if storage.note)
 
     def topic(self, name: str) -> BagTopic:
@@ -130,14 +130,14 @@ class Bag:
         try:
             return store.deserialize_cdr(message.data, topic.type_name)
         except Exception as error:
-            # Generated decoders raise whatever wrong bytes lead them to.
+            # Generated decoders may raise anything when the bytes are wrong.
             raise BagError(
                 f"{self.path} holds a message on {topic.name} at {message.log_time} ns that is no "
                 f"{topic.type_name}: {error}"
             ) from None
 
     def summary(self) -> dict[str, Any]:
-        """What ``us-sim bag info`` shows, in types that JSON has; times in ns since the epoch."""
+        """The content of ``us-sim bag info`` in JSON's types; times in ns since the epoch."""
         start, end = self.start, self.end
         return {
             "path": str(self.path),

@@ -22,7 +22,7 @@ class SqliteFile:
 
     Args:
         path: the file.
-        label: what errors call it, where that is not its path.
+        label: its name in errors, where that is not its path.
 
     Raises:
         BagError: the file is damaged, or without the tables of rosbag2.

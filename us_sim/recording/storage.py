@@ -1,4 +1,4 @@
-"""The files of a bag: which they are, and what reads each, told by its first bytes."""
+"""The files of a bag, and the reader of each by its first bytes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Storage(Protocol):
     topics: tuple[BagTopic, ...]
     start: int | None  # ns, lowest log time; None without messages
     end: int | None  # ns, highest log time
-    note: str  # what is wrong with a file that was not ended properly; empty when whole
+    note: str  # the fault of a file that was not closed properly; empty when whole
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times."""
@@ -66,7 +66,7 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     """The files that a bag consists of, in their order, and its ``metadata.yaml`` if it has one.
 
     Raises:
-        BagError: there are none, some are missing, or it is open which of several to read.
+        BagError: there are none, some are missing, or several could be meant.
     """
     if path.is_file():
         return [path], None
@@ -87,7 +87,7 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
 
 
 def open_storage(file: Path, scratch: Scratch) -> Storage:
-    """What reads a file, by its first bytes and whatever its name.
+    """The reader of a file by its first bytes, whatever its name.
 
     Raises:
         BagError: the file is empty, no bag, or damaged.

@@ -48,8 +48,8 @@ class _Channel:
 class BagWriter:
     """Writes one bag: an MCAP file and, when it is closed, its ``metadata.yaml``.
 
-    What is written reaches the operating system at the latest when a message comes that is a
-    second younger, or with :meth:`flush`, and from then on survives the end of the process.
+    A message reaches the operating system at the latest when one comes that is a second younger,
+    or with :meth:`flush`, and then survives the end of the process.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -132,8 +132,8 @@ class BagWriter:
             topic: full name.
             type_name: ``package/msg/Type``.
             qos: what its publishers offer, in any form that ``QosProfile.of`` takes.
-            type_hash: RIHS01 hash; computed from the definition when not given.
-            schema: ``ros2msg`` text; the installed or the Jazzy definition when not given.
+            type_hash: RIHS01 hash; computed from the definition by default.
+            schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
 
         Raises:
             BagError: the type is unknown, differs from before, or the bag is closed.
@@ -177,7 +177,7 @@ class BagWriter:
             topic: added before.
             cdr: the message with its encapsulation header, as it came from the wire.
             log_time_ns: ns since the epoch, when it was received.
-            publish_time_ns: ns since the epoch, when it was sent; the log time when not given.
+            publish_time_ns: ns since the epoch, when it was sent; the log time by default.
 
         Raises:
             BagError: the topic is unknown, a time is negative, the bag is closed, or the disk is

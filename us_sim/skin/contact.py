@@ -1,4 +1,4 @@
-"""Contact of particles with the probe on its way, as the rigid limit of the paper's repulsion.
+"""Contact of particles with the moving probe, as the rigid limit of the paper's repulsion.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
@@ -24,18 +24,18 @@ __all__ = ["push_out"]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def push_out(x, v, normal, touched, box, start, end, share):
+def push_out(x, v, normal, touched, box, start, end, fraction):
     """Puts particles inside the collider on its surface; returns how many.
 
-    The probe is ``share`` of the way from ``start`` to ``end``. ``touched`` (N,) and ``normal``
-    (N, 3) tell which particles, and the collider's outward normals there.
+    The probe is at ``fraction`` of the path from ``start`` to ``end``. ``touched`` (N,) and
+    ``normal`` (N, 3) tell which particles, and the collider's outward normals there.
     """
-    same_way = start[3] * end[3] + start[4] * end[4] + start[5] * end[5] + start[6] * end[6] >= 0.0
-    sign = 1.0 if same_way else -1.0
-    qx = start[3] + share * (sign * end[3] - start[3])
-    qy = start[4] + share * (sign * end[4] - start[4])
-    qz = start[5] + share * (sign * end[5] - start[5])
-    qw = start[6] + share * (sign * end[6] - start[6])
+    cosine = start[3] * end[3] + start[4] * end[4] + start[5] * end[5] + start[6] * end[6]
+    sign = 1.0 if cosine >= 0.0 else -1.0
+    qx = start[3] + fraction * (sign * end[3] - start[3])
+    qy = start[4] + fraction * (sign * end[4] - start[4])
+    qz = start[5] + fraction * (sign * end[5] - start[5])
+    qw = start[6] + fraction * (sign * end[6] - start[6])
     scale = 2.0 / (qx * qx + qy * qy + qz * qz + qw * qw)
     r00 = 1.0 - scale * (qy * qy + qz * qz)
     r01 = scale * (qx * qy - qw * qz)
@@ -46,10 +46,10 @@ def push_out(x, v, normal, touched, box, start, end, share):
     r20 = scale * (qx * qz - qw * qy)
     r21 = scale * (qy * qz + qw * qx)
     r22 = 1.0 - scale * (qx * qx + qy * qy)
-    px = start[0] + share * (end[0] - start[0])
-    py = start[1] + share * (end[1] - start[1])
-    pz = start[2] + share * (end[2] - start[2])
-    # The whole body lies within this distance of its middle.
+    px = start[0] + fraction * (end[0] - start[0])
+    py = start[1] + fraction * (end[1] - start[1])
+    pz = start[2] + fraction * (end[2] - start[2])
+    # The whole collider lies within this distance of its middle.
     middle = box[2] + box[3]
     reach = box[3] + np.sqrt(box[0] ** 2 + box[1] ** 2 + box[2] ** 2)
     contacts = 0

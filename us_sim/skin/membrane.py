@@ -1,7 +1,7 @@
 """The skin as a membrane of springs, anchored to its shape at rest (the paper, section V).
 
 Edges of the surface are springs; each vertex is a particle that a spring of zero length and a
-damper tie to its place at rest. The probe's repulsion is taken to its rigid limit: a particle
+damper tie to its rest position. The probe's repulsion is taken to its rigid limit: a particle
 inside the collider is put on its surface and loses its velocity into it, so that no particle is
 ever inside. Particles move by symplectic Euler (the paper, equations 3 to 5).
 
@@ -45,7 +45,7 @@ CONTACT_TOLERANCE = 1e-9
 """No vertex is deeper inside the collider than this, m."""
 
 _SAFETY = 0.7
-"""Fraction of the linear system's greatest stable step that is used. Near 1, folded skin with
+"""Fraction of the linear system's longest stable step that is used. Near 1, folded skin with
 hardly any damping was seen to gain energy from frame to frame."""
 
 _SETTLED = 1e-7
@@ -66,7 +66,7 @@ class SkinDeformation:
 
     vertices: NDArray[np.float64]  # (N, 3), m, frame patient
     normals: NDArray[np.float64]  # (N, 3), unit, out of the body
-    residual: float  # unbalanced force, of the force that the anchors bear; 0 at rest
+    residual: float  # unbalanced force over the force that the anchors bear; 0 at rest
     action: str  # what was done for stability, '' when nothing
 
 
@@ -76,7 +76,7 @@ class SkinMembrane:
     Args:
         surface: at rest.
         collider: the probe's shape.
-        settings: see `MembraneSettings`. Where the mass of a vertex is raised, or a far movement
+        settings: see `MembraneSettings`. Where the mass of a vertex is raised, or a long movement
             of the probe takes more steps, every deformation's ``action`` says so.
     """
 
@@ -102,13 +102,13 @@ class SkinMembrane:
         self._rest_tension = np.ascontiguousarray(at_rest * settings.prestrain)
 
         valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
-        # Gershgorin: no mode is stiffer than twice a particle's springs and its anchor.
+        # Gershgorin's bound: no mode is stiffer than twice a particle's springs plus its anchor.
         stiffest = 2.0 * self._stiffness * valence + self._anchor
         density_mass = settings.density * surface.vertex_areas
         lightest = stiffest * (self._time_step / (2.0 * _SAFETY)) ** 2
         self.mass: NDArray[np.float64] = np.maximum(density_mass, lightest)  # (N,), kg
         self.step_limit = float(2.0 * np.sqrt(np.min(density_mass / stiffest)))
-        """s, the greatest stable step with the masses that ``density`` gives."""
+        """s, the longest stable step with the masses that follow from ``density``."""
         self._decay = 2.0 * settings.damping * np.sqrt(self._anchor / self.mass)
         self._scaling = ""
         if (self.mass > density_mass).any():
@@ -163,7 +163,7 @@ class SkinMembrane:
     def deform(self, pose: Pose | None) -> SkinDeformation:
         """The skin one frame later, with the probe moved to ``pose``, or away where it is None.
 
-        With the probe where it was and the membrane settled, this is the latest result as it is.
+        With an unmoved probe and a settled membrane, this is the latest result unchanged.
         """
         if self._settled and _same(pose, self._pose):
             return self._latest
@@ -216,7 +216,7 @@ class SkinMembrane:
         return self._latest
 
     def _approach(self, pose: Pose | None) -> tuple[Pose | None, int, str]:
-        """Where the probe comes from, the steps it takes on the way, and a note on them.
+        """Where the probe comes from, the number of steps that it takes, and a note on them.
 
         A probe that appears inside the skin would push particles out on its far side. So it comes
         along its axis from where it touches nothing, in steps that are short against its body.

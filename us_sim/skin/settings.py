@@ -1,4 +1,4 @@
-"""What can be set of the skin: the surface, and the membrane that it is."""
+"""The settings of the skin: its surface, and the membrane that the surface is."""
 
 from __future__ import annotations
 

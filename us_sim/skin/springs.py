@@ -22,8 +22,8 @@ from numba import njit
 __all__ = ["SHORTEST", "spring_energy", "spring_forces"]
 
 SHORTEST = 0.5
-"""Of its natural length: below it a spring's force falls to zero with its length. A spring that
-turns over would otherwise change its force at once, and no step would be stable."""
+"""Fraction of its natural length below which a spring's force falls to zero with its length. The
+force of a spring that turns over would otherwise jump, and no step would be stable."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -55,7 +55,7 @@ def spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spring_energy(x, v, rest, edges, natural_length, rest_tension, stiffness, anchor, mass):
-    """J, of motion, anchors and springs, less that of the springs at rest."""
+    """J, energy of motion, anchors and springs, less that of the springs at rest."""
     total = 0.0
     for i in range(len(x)):
         for a in range(3):

@@ -41,26 +41,26 @@ class TriangleSurface:
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
-        given = np.asarray(self.triangles)
+        corners = np.asarray(self.triangles)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
             raise MeshError(f"surface vertices have shape {vertices.shape}: give (N, 3)")
         finite = np.isfinite(vertices).all(axis=1)
         if not finite.all():
             bad = int(np.argmin(finite))
             raise MeshError(f"surface vertex {bad} is not finite: {vertices[bad].tolist()}")
-        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "iu":
+        if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
             raise MeshError(
-                f"surface triangles have shape {given.shape} and type {given.dtype}: give (T, 3) "
-                f"integers"
+                f"surface triangles have shape {corners.shape} and type {corners.dtype}: give "
+                f"(T, 3) integers"
             )
-        if not given.size:
+        if not corners.size:
             raise MeshError("the surface has no triangle: give one at least")
-        if given.min() < 0 or given.max() >= len(vertices):
+        if corners.min() < 0 or corners.max() >= len(vertices):
             raise MeshError(
-                f"surface triangles name vertices {given.min()} to {given.max()}, but there are "
-                f"only {len(vertices)}"
+                f"surface triangles name vertices {corners.min()} to {corners.max()}, but there "
+                f"are only {len(vertices)}"
             )
-        triangles = np.array(given, dtype=np.int32, order="C")
+        triangles = np.array(corners, dtype=np.int32, order="C")
         twice = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
         if twice.any():
             bad = int(np.argmax(twice))
@@ -88,9 +88,9 @@ class TriangleSurface:
         """(N,) m², a third of the area of each triangle at a vertex."""
         a, b, c = self.vertices[self.triangles.T]
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-        shares = np.zeros(len(self.vertices))
-        np.add.at(shares, self.triangles, areas[:, None] / 3)
-        return shares
+        around = np.zeros(len(self.vertices))
+        np.add.at(around, self.triangles, areas[:, None] / 3)
+        return around
 
 
 def plane_surface(size: tuple[float, float], spacing: float) -> TriangleSurface:

@@ -39,15 +39,15 @@ _BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 
 
 
 class BMode:
-    """Makes B-mode images: cuts slices and forms the picture, with as much as the settings ask.
+    """Makes B-mode images: cuts slices and forms the picture as the settings ask.
 
     Args:
         volume: in frame ``patient``.
         probe: its geometry; may be set to another one later.
         imaging: the console's settings.
         method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
-        threads: among which a slice is shared.
-        settings: of the method's own class, or None for those by default.
+        threads: number of threads that cut a slice.
+        settings: of the method's own class, or None for the defaults.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class BMode:
         return self._slicer.skipped if self._slicer else 0
 
     def use(self, probe: Probe, imaging: Imaging) -> None:
-        """Another probe, or other settings, from the next image on."""
+        """Use another probe, or other settings, from the next image on."""
         self._probe = probe
         self._formation = ImageFormation(probe, imaging)
 
@@ -88,7 +88,7 @@ class BMode:
         """Load what images with these settings will use, so that the first is not late.
 
         Raises:
-            ProbeError: they do not go together.
+            ProbeError: probe and settings do not go together.
         """
         warm_up(self._method, self._threads)
         formation = ImageFormation(probe, imaging)
@@ -100,10 +100,10 @@ class BMode:
         formation.form([blank for _ in formation.planes(Pose())], coupling)
 
     def carry(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
-        """Have the volume carried by this mesh: (N, 3) m at rest, and (M, 4) indices into them.
+        """Let this mesh carry the volume: (N, 3) m at rest, and (M, 4) indices into them.
 
         Raises:
-            MeshError: the mesh cannot be used; then what was carried before still is.
+            MeshError: the mesh cannot be used; then the one before still carries the volume.
         """
         slicer = create_slicer(
             self._method,
@@ -154,7 +154,7 @@ class BMode:
         return self._slicer.image(nodes, plane)
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
-        """What the transducer's face can touch: the tissue, or the box of a volume without."""
+        """The surface that the face can touch: the tissue's, or a box around a volume without."""
         if self._surface is None:
             from us_sim.slicing.formation.coupling import ContactSurface
 

@@ -31,7 +31,7 @@ class Deformation:
 
 @dataclass(frozen=True, eq=False)
 class TissueState:
-    """What a solver needs of another one to go on from where it is."""
+    """What a solver needs to go on from where another one is."""
 
     displacement: NDArray[np.float64]  # (N, 3), m
     velocity: NDArray[np.float64]  # (N, 3), m/s

@@ -1,4 +1,4 @@
-"""What every tissue solver is given: mesh, materials, what is held, and what the probe can touch.
+"""The tissue that solvers deform: mesh, materials, fixed nodes, and nodes the probe can touch.
 
 >>> from us_sim.tissue.model import TissueModel
 >>> model = TissueModel.block()
@@ -31,7 +31,7 @@ _SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 
 @dataclass(frozen=True, eq=False)
 class TissueModel:
-    """A tissue ready to be pressed.
+    """A tissue and the probe that can press it.
 
     A node that is both held and reachable stays where it is; the probe passes through it.
 
@@ -60,8 +60,8 @@ class TissueModel:
         Args:
             size: m, along x, y and z.
             nodes: of its mesh, along x, y and z.
-            material: soft tissue, when not given.
-            collider: a sphere of 30 mm radius, when not given.
+            material: soft tissue by default.
+            collider: a sphere of 30 mm radius by default.
             held: names of the faces that are fixed, as `face_nodes` takes them. The probe can
                 touch the top.
         """

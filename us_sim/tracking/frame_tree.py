@@ -1,13 +1,13 @@
-"""Frames and their parents, as `tf` tells them, and the way from one up to another.
+"""Frames and their parents, as `tf` tells them, and the chain from one up to another.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.frame_tree import FrameTree
 >>> tree = FrameTree()
 >>> tree.place("tool", "base", Pose([0.0, 0.0, 0.2])), tree.place("tip", "tool", Pose([0.1, 0, 0]))
 (True, True)
->>> tree.way("tip", "base")
+>>> tree.chain("tip", "base")
 ['tip', 'tool']
->>> tree.pose(tree.way("tip", "base")).position
+>>> tree.pose(tree.chain("tip", "base")).position
 array([0.1, 0. , 0.2])
 """
 
@@ -20,7 +20,7 @@ from us_sim.geometry.pose import Pose
 __all__ = ["FrameTree"]
 
 _MOST = 1000
-"""Frames kept; a tree of more is somebody's mistake."""
+"""Most frames kept; a tree of more is somebody's mistake."""
 
 
 class FrameTree:
@@ -39,7 +39,7 @@ class FrameTree:
         self._parents[frame] = parent, pose
         return True
 
-    def way(self, frame: str, top: str) -> list[str] | None:
+    def chain(self, frame: str, top: str) -> list[str] | None:
         """The frames from ``frame`` up to below ``top``; None when they do not meet."""
         frames: list[str] = []
         while frame != top:
@@ -49,9 +49,9 @@ class FrameTree:
             frame = self._parents[frame][0]
         return frames
 
-    def pose(self, way: Sequence[str]) -> Pose:
-        """The pose of a way's first frame in the parent of its last."""
+    def pose(self, chain: Sequence[str]) -> Pose:
+        """The pose of a chain's first frame in the parent of its last frame."""
         pose = Pose()
-        for frame in way:
+        for frame in chain:
             pose = self._parents[frame][1] @ pose
         return pose

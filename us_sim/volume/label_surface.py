@@ -125,7 +125,7 @@ def _enclosed(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) ->
 def _voxels_of(
     volume: Volume, label: int, within: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Where a label is, in the smallest block around it, and that block's first voxel (3,)."""
+    """A label's mask in the smallest block around it, and that block's first voxel (3,)."""
     if volume.labels is None:
         raise VolumeError("the volume has no labels, so nothing in it has a surface: segment it")
     mask = volume.labels == label

@@ -28,7 +28,7 @@ def label_area(
         label_image: (rows, columns) labels.
         label: the label's number.
         pixel_area: m², of one pixel.
-        largest_part: count only the largest connected part (pixels that share an edge), so that
+        largest_part: count only the largest connected part (pixels with an edge in common), so that
             stray pixels of a structure's other branches do not add up.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Procedural phantoms: labelled ultrasound volumes made from a seed, and kept once made.
+"""Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
 
 >>> from us_sim.volume.phantom import upper_arm
 >>> arm = upper_arm(seed=1, voxel_size=2e-3)
@@ -28,8 +28,8 @@ __all__ = ["cached_phantom", "upper_arm"]
 Progress = Callable[[float, str], None]
 
 _GENERATOR = 1
-"""Raised whenever a change here, or in what this calls, changes a phantom's bytes: it is part of
-the cache's key."""
+"""Part of the cache's key: raise it when a change here, or in what this calls, changes a phantom's
+bytes."""
 
 _NOISE_FLOOR = -68.0  # dB at the skin
 _NOISE_GAIN = 160.0  # dB/m, as the time gain amplifies noise too
@@ -103,7 +103,7 @@ def cached_phantom(
 ) -> Volume:
     """A phantom from the user's cache folder, made there first if it is not in it yet.
 
-    Its arrays are memory-mapped, so processes share them. Processes that ask at once wait for
+    Its arrays are memory-mapped, one copy for all processes. Processes that ask at once wait for
     the one that makes it; a damaged entry is made again, and a warning is logged.
 
     Args:

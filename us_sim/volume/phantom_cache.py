@@ -1,4 +1,4 @@
-"""Volumes kept in the user's cache folder, memory-mapped and shared by processes.
+"""Volumes in the user's cache folder, memory-mapped by all processes that use them.
 
 >>> import os, tempfile
 >>> from us_sim.volume.phantom_cache import kept_volume
@@ -28,10 +28,10 @@ __all__ = ["cache_folder", "kept_volume"]
 def kept_volume(
     key: str, make: Callable[[], Volume], waiting: Callable[[], None] | None = None
 ) -> Volume:
-    """The labelled volume kept under a key, made and kept first if it is not there.
+    """The labelled volume cached under a key, made first if it is not there.
 
     Args:
-        key: a file name that says all that decides the volume's bytes.
+        key: a file name that contains everything on which the volume's bytes depend.
         make: makes the volume; called by one process at a time.
         waiting: called every half second while another process makes it.
     """

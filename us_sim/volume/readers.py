@@ -59,13 +59,13 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Where a volume file's voxels are: (4, 4) from their indices to m, from its header alone.
 
     Raises:
-        VolumeError: as `read_volume`, but for what only the voxels tell.
+        VolumeError: as `read_volume`, except for faults of the voxels.
     """
     return _header(Path(path))[1]
 
 
 def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
-    """What is to be read, and its placement."""
+    """The reader of a file, its header read, and the placement of the volume."""
     if not path.exists():
         raise VolumeError(f"{path}: there is no such file")
     if not path.is_file():
@@ -136,9 +136,9 @@ def _grey_values(path: Path, stored: NDArray[np.generic]) -> NDArray[np.uint8]:
     for k, plane in enumerate(stored):
         # Halves, since the whole range of a float64 image may exceed what float64 can hold.
         height = plane.astype(np.float64) / 2 - low / 2
-        share = height / (high / 2 - low / 2) if high > low else np.zeros_like(height)
-        share = np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-        grey[:, :, k] = np.floor(share * 255.0 + 0.5).T
+        level = height / (high / 2 - low / 2) if high > low else np.zeros_like(height)
+        level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+        grey[:, :, k] = np.floor(level * 255.0 + 0.5).T
     return grey
 
 

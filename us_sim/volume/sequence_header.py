@@ -1,4 +1,4 @@
-"""What the header of a sequence file of Plus says of each frame: transforms, status, time.
+"""The fields of each frame in the header of a sequence file of Plus: transforms, status, time.
 
 >>> from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
 >>> header = {"NDims": "3", "Seq_Frame0003_Timestamp": "0.5"}
@@ -62,7 +62,7 @@ def frame_time(fields: Mapping[str, str]) -> float:
     """When the frame was recorded, s of the recorder's clock.
 
     Raises:
-        ValueError: it does not say, or not as a finite number.
+        ValueError: the time is missing or no finite number.
     """
     try:
         time = float(fields["Timestamp"])

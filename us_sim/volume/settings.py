@@ -1,4 +1,4 @@
-"""What a scene says of its ultrasound volume."""
+"""The settings of the ultrasound volume in a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["SEED", "VOXEL_SIZE", "VolumeSettings"]
 
 SEED = Quantity("number", 0, 2**31)
 VOXEL_SIZE = Quantity("length", 2e-4, 5e-3)
-"""Of a phantom; the finest takes 1.1 GB while it is made."""
+"""Voxel size of a phantom; the finest takes 1.1 GB while it is made."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class VolumeSettings(Settings):
     )
 
     def check(self) -> None:
-        """One of both."""
+        """Refuse both a file and a phantom, or neither."""
         if self.file and self.phantom:
             raise self.refused("", "has both `file` and `phantom`; keep one")
         if not self.file and not self.phantom:

@@ -1,4 +1,4 @@
-"""Speckle: the envelope of what many unresolved scatterers send back, and its display.
+"""Speckle: the envelope of the echoes of many unresolved scatterers, and its display.
 
 Each voxel holds a complex, normally distributed echo: the sum of many scatterers of random phase.
 A Gaussian point spread correlates neighbours, and the envelope of the sum is Rayleigh distributed
@@ -75,9 +75,9 @@ def echo_envelope(
         specular: (i, j, k) echo of one phase, of smooth interfaces.
         voxel_size: m.
         depth: (k,) m, of each plane of voxels.
-        point_spread: what one scatterer looks like; voxels within its reach of the outer faces
-            see fewer scatterers, so give that much more and crop.
-        random: where the scatterers come from.
+        point_spread: the image of one scatterer; voxels within its reach of the outer faces see
+            fewer scatterers, so pass a block larger by that reach and crop.
+        random: source of the scatterers.
     """
     square = np.zeros(diffuse.shape, dtype=np.float32)
     for phase in ("in phase", "quadrature"):

@@ -49,7 +49,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Images of a moving probe and where each was taken; the images stay in the file."""
+    """Images of a moving probe with the pose of each; the images stay in the file."""
 
     path: Path
     columns: int
@@ -98,7 +98,7 @@ def read_sweep(path: Path, *, tracked: bool = True) -> Sweep:
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file; give a sequence (.igs.mha) of Plus")
-    # Told by its first bytes, so that a vast file of another kind is not read as a header.
+    # The first bytes tell, so that a vast file of another kind is not read as a header.
     with path.open("rb") as file:
         if b"=" not in file.read(256):
             raise VolumeError(f"{path}: is no MetaImage; give a sequence (.igs.mha) of Plus")
@@ -196,7 +196,7 @@ def _nothing_usable(
 
 @dataclass(frozen=True)
 class _Data:
-    """Where the images lie, one after another: in the file after its header, or in another."""
+    """The place of the images, one after another: in the file after its header, or in another."""
 
     path: Path
     first: int  # byte

@@ -1,4 +1,5 @@
-"""Random textures of tissue: smooth noise given in metres, and the thin sheets of its zero set.
+"""Random textures of tissue: smooth noise with lengths in metres, and the thin sheets where it is
+0.
 
 The noise is fixed by its seed and its lengths alone, so the same tissue comes out of every voxel
 size.
@@ -29,9 +30,9 @@ class SmoothNoise:
     A tensor product cubic B-spline with normally distributed coefficients.
 
     Args:
-        random: where the coefficients come from.
-        block: (2, 3) m, lower and upper corner of where it will be sampled; beyond them the
-            outermost coefficients go on.
+        random: source of the coefficients.
+        block: (2, 3) m, lower and upper corner of the block to be sampled; the outermost
+            coefficients continue beyond it.
         lengths: (x, y, z) m, between coefficients: features are about twice as long.
     """
 
@@ -88,7 +89,7 @@ def sheets(
         beam along z: the squared cosine of the angle between its normal and z.
     """
     slope_x, slope_z = np.gradient(noise, *steps)
-    # Where the noise is flat at zero there is no sheet but a blot: limit how flat it may count.
+    # Where the noise is flat at zero the sheet would be a blot: bound the slope from below.
     square = slope_x**2 + slope_z**2
     square = np.maximum(square, 0.05 * square.mean())
     return np.exp(-(noise**2) / square / (2 * thickness**2)), slope_z**2 / square

@@ -30,7 +30,7 @@ class Tube:
     phase: float = 0.0  # rad, of the swing at y = 0
 
     def middle(self, y: float) -> tuple[float, float]:
-        """Where (x, z) m the centre line passes y."""
+        """(x, z) m of the centre line at y."""
         angle = 2 * np.pi * y / _WAVELENGTH + self.phase
         return (
             self.centre[0] + self.swing[0] * float(np.sin(angle)),

@@ -1,4 +1,4 @@
-"""The anatomy of a virtual upper arm: what lies where, and how it echoes.
+"""The anatomy of a virtual upper arm: its structures, and how they echo.
 
 A block of the inner side of the arm, the skin at z = 0, vessels and humerus along y. Proportions
 follow what ultrasound shows at mid-arm: the brachial artery between a vein and the median nerve,
@@ -31,7 +31,7 @@ UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
 """Lower and upper corner of the block in frame ``patient``, m."""
 
 _MARGIN = np.array([[-5e-3], [5e-3]])
-"""Texture goes on this far beyond the block, m: echoes at its edges come from there too."""
+"""Texture continues this far beyond the block, m: echoes at its edges come from there too."""
 
 UPPER_ARM_LABELS = {
     "skin": 1,
@@ -84,10 +84,10 @@ class ArmSection:
         self.diffuse[where] = echo[where]
         self.specular[where] = 0.0
 
-    def interface(self, profile: NDArray[np.float64], level: float, share: float = 0.7) -> None:
-        """Add an echoing surface: a share of it smooth, the rest rough and so speckled."""
-        np.maximum(self.specular, share * _echo(level) * profile, out=self.specular)
-        np.maximum(self.diffuse, (1 - share) * _echo(level) * profile, out=self.diffuse)
+    def interface(self, profile: NDArray[np.float64], level: float, smooth: float = 0.7) -> None:
+        """Add an echoing surface: a fraction ``smooth`` is specular, the rest speckled."""
+        np.maximum(self.specular, smooth * _echo(level) * profile, out=self.specular)
+        np.maximum(self.diffuse, (1 - smooth) * _echo(level) * profile, out=self.diffuse)
 
 
 class UpperArm:
@@ -139,7 +139,7 @@ class UpperArm:
         return section
 
     def _layers(self, section: ArmSection) -> None:
-        """Fat with its septa, and the skin over it."""
+        """Add fat with its septa, and the skin over it."""
         x, y, z = section.x, section.y, section.depth
         border = 1.8e-3 + 0.08e-3 * self._skin_border.line(x, y)[:, None]
         below = z[None, :] - border
@@ -152,7 +152,7 @@ class UpperArm:
         section.interface(_sheet(below, 0.15e-3), -15.0)
 
     def _muscles(self, section: ArmSection) -> None:
-        """Biceps, brachialis and triceps under the fascia, with the septa between them."""
+        """Add biceps, brachialis and triceps under the fascia, with the septa between them."""
         x, y, z = section.x, section.y, section.depth
         fascia = 7.0e-3 + 0.6e-3 * self._fascia_shape.line(x, y)[:, None]
         # Septa wave along the arm, and from place to place between the muscles they part.
@@ -186,7 +186,7 @@ class UpperArm:
         section.interface(_sheet(under_biceps, 0.2e-3) * ~triceps * (0.4 + 0.6 * patchy), -13.0)
 
     def _bundle(self, section: ArmSection) -> None:
-        """Artery, vein and nerve in bright connective tissue."""
+        """Add artery, vein and nerve in bright connective tissue."""
         x, y, z = section.x, section.y, section.depth
         walls = [tube.distance(x, y, z) for tube in (self.artery, self.vein, self.nerve)]
         near = np.maximum(np.min([distance for distance, _ in walls], axis=0), 0.0)
@@ -202,7 +202,7 @@ class UpperArm:
         distance: NDArray[np.float64],
         normal_z: NDArray[np.float64],
     ) -> None:
-        """Dark fascicles in a bright honeycomb."""
+        """Add a nerve: dark fascicles in a bright honeycomb."""
         section.fill("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
         section.interface(_sheet(distance, 0.15e-3) * (0.3 + 0.7 * normal_z**2), -14.0)
         (middle_x, middle_z), (radius_x, radius_z) = self.nerve.middle(section.y), self.nerve.radii
@@ -212,7 +212,7 @@ class UpperArm:
             section.diffuse[squares_x[:, None] + squares_z < 1.0] = _echo(-48.0)
 
     def _bone(self, section: ArmSection) -> None:
-        """The humerus: a bright line where it faces the beam, and what little rings behind it."""
+        """Add the humerus: a bright line where it faces the beam, and faint echoes behind it."""
         x, y, z = section.x, section.y, section.depth
         distance, normal_z = self.humerus.distance(x, y, z)
         distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse
@@ -235,14 +235,14 @@ def _vessel(
     wall: float,
     level: float,
 ) -> None:
-    """An almost echo-free lumen, and a wall that echoes where it lies across the beam."""
+    """Add a vessel: an almost echo-free lumen, and a wall that echoes where it faces the beam."""
     section.fill(label, distance < 0.0, np.full(distance.shape, _echo(-60.0)))
     facing = 0.08 + 0.92 * normal_z**4
     section.interface(_sheet(distance - wall, wall) * facing * (distance >= 0.0), level)
 
 
 def _attenuate(section: ArmSection) -> None:
-    """Loss along the beam less the time gain, and the side lobes, which no lumen is free of."""
+    """Apply the loss along the beam less the time gain, and side lobes, also in lumens."""
     step_x, step_z = section.steps
     loss = _ATTENUATION[section.labels] * (section.z > 0.0) * step_z
     loss = np.cumsum(loss, axis=1) - 0.5 * loss - _TIME_GAIN * section.depth

@@ -27,7 +27,7 @@ class Volume:
     """Grey values on a regular grid; the centre of voxel (i, j, k) lies at that whole index.
 
     The arrays are kept as read-only views, without a copy where they are already C-contiguous,
-    so several processes can share one memory-mapped volume.
+    so several processes can use one memory-mapped volume.
 
     Args:
         intensities: (i, j, k) uint8, axis 0 along the grid's x.

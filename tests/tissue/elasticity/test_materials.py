@@ -39,7 +39,7 @@ def test_plane_through_a_tetrahedron_cuts_off_the_analytic_fraction():
         assert fractions.sum() == pytest.approx(1.0)
 
 
-def test_layers_of_a_block_keep_their_share_of_the_volume():
+def test_layers_of_a_block_keep_their_fraction_of_the_volume():
     labels = voxels()
     labels[:, :, 37:] = 2
     mesh = block_mesh((20, 10, 10))
@@ -80,10 +80,10 @@ def test_constants_are_averaged_by_volume():
     averaged = average_over_labels(mesh, labels, INDEX, {1: FAT, 2: MUSCLE, 9: FAT})
     assert averaged.young_modulus[5:] == pytest.approx(np.full(5, 3e3))
     # The cell astride x = 0 is half of each, its tetrahedra more or less.
-    share = mesh.volumes[:5] / mesh.volumes[:5].sum()
-    assert averaged.young_modulus[:5] @ share == pytest.approx(7.5e3, rel=0.01)
-    assert averaged.poisson_ratio[:5] @ share == pytest.approx(0.47, rel=0.01)
-    assert averaged.density[:5] @ share == pytest.approx(1005.0, rel=0.01)
+    fraction = mesh.volumes[:5] / mesh.volumes[:5].sum()
+    assert averaged.young_modulus[:5] @ fraction == pytest.approx(7.5e3, rel=0.01)
+    assert averaged.poisson_ratio[:5] @ fraction == pytest.approx(0.47, rel=0.01)
+    assert averaged.density[:5] @ fraction == pytest.approx(1005.0, rel=0.01)
 
 
 def test_the_same_input_gives_the_same_bytes():

@@ -7,11 +7,11 @@ from skfem.helpers import ddot, det, grad, identity, inv, transpose
 from tissue_block import block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients, stiffness
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
 CELLS = box_mesh([-0.02, -0.008, 0.004, 0.02], [0.0, 0.01, 0.03], [0.0, 0.005, 0.02, 0.03])
@@ -26,7 +26,7 @@ def uniform(ratio, mesh=CELLS, modulus=10e3):
 
 
 def mixed(mesh=CELLS, decades=2.0):
-    """Moduli over so many decades, some tetrahedra with a nodal share and some without."""
+    """Moduli over so many decades, some tetrahedra with a nodal part and some without."""
     rng = np.random.default_rng(5)
     count = len(mesh.tetrahedra)
     return TissueMaterials(
@@ -140,21 +140,21 @@ def test_at_rest_it_is_hookes_law(mesh, ratio):
 def test_at_rest_it_is_linear_elasticity_with_averaged_pressure(mesh):
     materials = mixed()
     tissue = NeoHookean(mesh, materials, np.float64)
-    shares = bulk_shares(materials)
+    split = volumetric_split(materials)
     gradients = shape_gradients(mesh)
     # Hooke's law with lambda = element - mu, and C d d' with d the mean divergence around a node.
     expected = np.zeros((3, COUNT, 3, COUNT))
     divergence = np.zeros((len(mesh.tetrahedra), 3, COUNT))
     for t, nodes in enumerate(mesh.tetrahedra):
-        shear, volume = shares.shear[t], mesh.volumes[t]
+        shear, volume = split.shear[t], mesh.volumes[t]
         divergence[t][:, nodes] = gradients[t].T
         for a in range(4):
             for b in range(4):
                 ga, gb = gradients[t, a], gradients[t, b]
-                block = (shares.element[t] - shear) * np.outer(ga, gb) + shear * np.outer(gb, ga)
+                block = (split.element[t] - shear) * np.outer(ga, gb) + shear * np.outer(gb, ga)
                 block += shear * ga @ gb * np.eye(3)
                 expected[:, nodes[a], :, nodes[b]] += volume * block
-    weight = shares.nodal * mesh.volumes / 4
+    weight = split.nodal * mesh.volumes / 4
     for node in range(COUNT):
         around = np.flatnonzero((mesh.tetrahedra == node).any(axis=1))
         total = weight[around].sum()
@@ -167,10 +167,10 @@ def test_at_rest_it_is_linear_elasticity_with_averaged_pressure(mesh):
     np.testing.assert_allclose(tissue.diagonal_blocks()[[0, 3, 5]], diagonal, rtol=1e-12)
 
 
-def test_up_to_a_ratio_of_two_fifths_the_nodes_have_no_share():
-    assert not bulk_shares(uniform(0.4)).nodal.any()
+def test_up_to_a_ratio_of_two_fifths_the_nodes_have_no_part():
+    assert not volumetric_split(uniform(0.4)).nodal.any()
     # Of lambda + mu = 10 mu at 0.45, five stay with the tetrahedra.
-    np.testing.assert_allclose(bulk_shares(uniform(0.45)).nodal, 5 * 10e3 / 2.9)
+    np.testing.assert_allclose(volumetric_split(uniform(0.45)).nodal, 5 * 10e3 / 2.9)
 
 
 @BOTH

@@ -13,10 +13,10 @@ from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import TissueState
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem import Fem
@@ -52,12 +52,12 @@ def smallest_volume_ratio(model, nodes):
 
 def energy(model, nodes):
     """As the solver's docstring says it, in NumPy."""
-    mesh, shares = model.mesh, bulk_shares(model.materials)
+    mesh, split = model.mesh, volumetric_split(model.materials)
     gradient = deformation_gradients(mesh, nodes)
     growth = np.linalg.det(gradient) - 1
-    density = shares.shear * (((gradient**2).sum((1, 2)) - 3) / 2 - growth)
-    density += shares.element * growth**2 / 2
-    weight = np.repeat(shares.nodal * mesh.volumes / 4, 4)
+    density = split.shear * (((gradient**2).sum((1, 2)) - 3) / 2 - growth)
+    density += split.element * growth**2 / 2
+    weight = np.repeat(split.nodal * mesh.volumes / 4, 4)
     total = np.bincount(mesh.tetrahedra.ravel(), weight)
     mean = np.bincount(mesh.tetrahedra.ravel(), weight * np.repeat(growth, 4))
     averaged = np.divide(mean**2, total, out=np.zeros_like(total), where=total > 0).sum() / 2

@@ -20,7 +20,7 @@ from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import ddot, div, sym_grad
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["LinearEquations"]
@@ -43,8 +43,8 @@ class LinearEquations:
     def __init__(self, model: TissueModel) -> None:
         self._model = model
         mesh = MeshTet(*map(np.ascontiguousarray, (model.mesh.nodes.T, model.mesh.tetrahedra.T)))
-        shares = bulk_shares(model.materials)
-        shear, element = float(shares.shear[0]), float(shares.element[0])
+        split = volumetric_split(model.materials)
+        shear, element = float(split.shear[0]), float(split.element[0])
         vectors = Basis(mesh, ElementVector(ElementTetP1()))
         self._matrix = _elasticity.assemble(vectors, shear=shear, rest=element - shear).tocsr()
 
@@ -66,7 +66,7 @@ class LinearEquations:
         volume = around.sum(axis=1)
         self._average = (diags_array(1 / volume) @ around @ divergence).tocsr()
         self._spread = self._average.T.tocsr()
-        self._nodal = float(shares.nodal[0]) * volume  # (N,) Pa m3
+        self._nodal = float(split.nodal[0]) * volume  # (N,) Pa m3
 
     def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) N, that hold the tissue at a displacement (N, 3) m."""

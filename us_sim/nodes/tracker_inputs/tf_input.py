@@ -58,7 +58,7 @@ class TfInput(TrackerInput):
     def _take_static(self, message: TFMessage) -> None:
         """Keep what does not move; a way of nothing else makes no poses."""
         self._fixed |= self._keep(message)
-        chain = self._tree.way(self._body, self._frame)
+        chain = self._tree.chain(self._body, self._frame)
         if chain is not None and self._fixed.issuperset(chain):
             self._device.refuse(
                 "frame",
@@ -83,7 +83,7 @@ class TfInput(TrackerInput):
     def _take(self, message: TFMessage) -> None:
         moved = self._keep(message)
         self._fixed -= moved
-        chain = self._tree.way(self._body, self._frame)
+        chain = self._tree.chain(self._body, self._frame)
         if chain is None:
             self._device.refuse(
                 "frame",

@@ -64,7 +64,7 @@ def adjugate(place, n0, n1, n2, n3):
 def is_solid(determinant, pixel_volume, rest_determinant):
     """Whether a tetrahedron is neither inverted nor flat.
 
-    ``pixel_volume`` is m³ of a unit of the determinant, ``rest_determinant`` is m³.
+    ``pixel_volume`` is m³ per unit of the determinant, ``rest_determinant`` is m³.
     """
     size = determinant * pixel_volume * np.sign(rest_determinant)
     return size > _FLAT * abs(rest_determinant)

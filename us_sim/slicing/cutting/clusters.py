@@ -1,4 +1,4 @@
-"""Which tetrahedra of a mesh an image may meet, found without looking at each of them.
+"""A quick selection of the tetrahedra that an image may meet, by clusters of neighbours.
 
 Tetrahedra that are near each other at rest stay near each other. They are kept in clusters, and a
 cluster whose nodes all lie beyond one and the same side of the image is left out as a whole.
@@ -28,11 +28,12 @@ from us_sim.slicing.probe.plane import SlicePlane
 __all__ = ["ON_PLANE", "Clusters"]
 
 ON_PLANE = 1e-9
-"""Pixels that a node may lie off the plane and still be taken as on it: rounding."""
+"""Pixels off the plane within which a node counts as on it: rounding."""
 
 _SIZE = 128
-"""Tetrahedra of a cluster: few enough to follow the plane, many enough to share their nodes."""
-_BLOCK = 256  # nodes that are looked at together
+"""Tetrahedra of a cluster: few enough to follow the plane, many enough to have most nodes in
+common."""
+_BLOCK = 256  # nodes that are tested together
 _MARGIN = 1e-3
 """Pixels beyond the image's border at which a tetrahedron may be left out."""
 
@@ -44,7 +45,7 @@ class Clusters:
         rest_nodes: (N, 3) m. tetrahedra: (M, 4) int32.
     """
 
-    order: NDArray[np.intp]  # (M,) which of the given tetrahedra each one is
+    order: NDArray[np.intp]  # (M,) index of each one in ``tetrahedra`` as passed
     tetrahedra: NDArray[np.int32]  # (M, 4), in that order
 
     def __init__(self, rest_nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]) -> None:
@@ -55,7 +56,7 @@ class Clusters:
         once = np.unique(cluster * count + self.tetrahedra.ravel())
         clusters = -(-len(tetrahedra) // _SIZE)
         starts = np.searchsorted(once // count, np.arange(clusters + 1))
-        # Repeating its first node, each cluster has a multiple of four: they are looked at so.
+        # Nodes are tested by fours: each cluster repeats its first one up to a multiple of four.
         missing = -np.diff(starts) % 4
         once = np.insert(
             once, np.repeat(starts[:-1], missing), np.repeat(once[starts[:-1]], missing)
@@ -146,7 +147,7 @@ def _find_sides(nodes, to_pixel, right, bottom, sides):
     y = np.empty(_BLOCK)
     z = np.empty(_BLOCK)
     unusable = 0
-    # Coordinates are parted first: together with the rest that is half as fast.
+    # Coordinates are separated first: in one loop with the rest it is half as fast.
     for start in range(0, len(nodes), _BLOCK):
         count = min(_BLOCK, len(nodes) - start)
         for k in range(count):

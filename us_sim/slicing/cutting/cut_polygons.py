@@ -2,12 +2,11 @@
 
 A node on the plane counts as above it, so that every cut is a triangle or a quadrilateral between
 crossings of the plane with edges of the mesh. A crossing is computed from its edge alone and
-always from the upper node down: tetrahedra that share an edge have the very same corner, and those
-that share a face the very same side.
+always from the upper node down. So tetrahedra with an edge in common have the very same corner, and
+those with a face in common the very same side.
 
-That rule leaves out what only touches the plane from above. Where the mesh ends its surface
-belongs to it, so the cuts of its outer faces are kept too, as outlines: triangles, segments or
-points, closed.
+That rule leaves out what only touches the plane from above. The mesh includes its outer surface, so
+the cuts of its outer faces are kept too, as closed outlines: triangles, segments or points.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
 
 _STEEP = 1e3
-"""Voxels a pixel beyond which a map is so steep that rounding may lead it out of the volume."""
+"""Voxels per pixel beyond which a map is so steep that rounding may lead it out of the volume."""
 _MARGIN = 1e-6
-"""Pixels by which a cut may lie outside the image and still be looked at."""
+"""Pixels by which a cut may lie outside the image and still be considered."""
 
 
 class Cuts(NamedTuple):
-    """Room for what an image cuts; of each array only the first entries are in use.
+    """Room for the cuts of an image; of each array only the first entries are in use.
 
     A cut may have no polygon: then it is only there for its outlines.
     """
@@ -49,7 +48,7 @@ class Cuts(NamedTuple):
     maps: NDArray[np.float64]  # (cuts, 3, 3) from (1, column, row) to rest, voxel indices
     corners: NDArray[np.float64]  # (cuts, 4, 2) column and row, in turn around the polygon
     sides: NDArray[np.int8]  # (cuts,) 3 or 4, or 0 without a polygon
-    inside: NDArray[np.bool_]  # (cuts,) the map leads to among the voxels' centres
+    inside: NDArray[np.bool_]  # (cuts,) the map leads to points among the voxels' centres
     outlines: NDArray[np.float64]  # (outlines, 3, 2) column and row
     points: NDArray[np.int8]  # (outlines,) how many of the three there are
     owner: NDArray[np.int32]  # (outlines,) which cut it closes
@@ -81,7 +80,7 @@ def cut_tetrahedra(
 
     Args:
         near: (K,) tetrahedra to cut. nodes: (N, 3) m. to_pixel: (3, 4) from m to column, row and
-            height. pixel_volume: m³ of a unit of those.
+            height. pixel_volume: m³ per unit of those.
         neighbours: (M, 4) the tetrahedron beyond each face, -1 where the mesh ends.
         determinants: (M,) m³, six times the volumes at rest. rest_index: (N, 3) voxels.
         within: (M,) bool, which tetrahedra lie well among the voxels' centres at rest.

@@ -72,7 +72,7 @@ def _cell(pixel, size, count):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row, elements, outside):
-    """Locates the pixels of rows ``first_row`` to ``end_row - 1``; a band is never shared.
+    """Locates the pixels of rows ``first_row`` to ``end_row - 1``; a thread has whole bands.
 
     Args:
         barycentric: (E, 4, 3); starts, members, band, cell: as `cells` returns them.
@@ -86,8 +86,8 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
     for row in range(first_row, end_row):
         line = elements[row]
         lists = (row // band) * across
-        # The first row of a band has no row above to take hints from: then the result does not
-        # depend on how bands are shared among threads.
+        # The first row of a band takes no hints from the row above, so that the result does not
+        # depend on how bands are divided among threads.
         hinted = row % band != 0
         above = elements[row - 1] if hinted else line
         any_outside = False

@@ -1,8 +1,8 @@
 """Images of deformed tissue by locating every pixel on its own: the naive method, and the oracle.
 
 Every pixel is tried in every tetrahedron whose cut has it in its bounding box, in float64 and
-without any knowledge of its neighbours; the first that holds it says where it lay at rest. Slow,
-but there is little in it that could be wrong, so that the other methods are held against it.
+without any knowledge of its neighbours; the first that holds it says where it lay at rest. This is
+slow, but there is little in it that could be wrong: the other methods are tested against it.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import label_voxels
-from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import SLACK
@@ -69,11 +69,11 @@ class PerPixel(Slicer):
         inside, index = self._voxels(nodes, plane)
         lower = np.minimum(index.astype(np.int64), np.maximum(np.array(self._volume.shape) - 2, 0))
         upper = np.minimum(lower + 1, np.array(self._volume.shape) - 1)
-        way = index - lower
+        offset = index - lower
         grey = np.zeros(len(index))
         for side in np.ndindex(2, 2, 2):
             corner = np.where(side, upper, lower)
-            weight = np.where(side, way, 1.0 - way).prod(axis=1)
+            weight = np.where(side, offset, 1.0 - offset).prod(axis=1)
             grey += weight * self._volume.intensities[tuple(corner.T)]
         image = np.zeros(inside.shape, dtype=np.uint8)
         image[inside] = np.floor(grey + 0.5)
@@ -116,14 +116,14 @@ class PerPixel(Slicer):
         corners = now @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
         first, last = _boxes(corners)
         met = ((last >= 0) & (first <= [plane.columns - 1, plane.rows - 1])).all(axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # of a solver that has blown up
+        with np.errstate(over="ignore", invalid="ignore"):  # nodes of a solver that has diverged
             size, rest_size = (np.linalg.det(x[:, 1:] - x[:, :1]) for x in (now, places))
         valid = size * np.sign(rest_size) > _FLAT * np.abs(rest_size)
         kept = met & valid
         first, last = (np.clip(x[kept], -1, 1e6).astype(np.int64) for x in (first, last))
         rest = np.full((plane.rows, plane.columns, 3), np.nan)
         locate = partial(_locate, corners[kept], places[kept], first, last, rest)
-        share_rows(self._threads, plane.rows, locate)
+        parallel_rows(self._threads, plane.rows, locate)
         return rest, int((met & ~valid).sum())
 
 
@@ -137,8 +137,8 @@ def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
     above, below = one[..., 2], other[..., 2]
     on_edge = (above > 0.0) & (below < 0.0)
     on_node = np.eye(4, dtype=np.bool_) & (np.abs(above) <= _ON_PLANE)
-    way = np.where(on_edge, above / np.where(on_edge, above - below, 1.0), 0.0)[..., None]
-    points = one[..., :2] + way * (other - one)[..., :2]
+    fraction = np.where(on_edge, above / np.where(on_edge, above - below, 1.0), 0.0)[..., None]
+    points = one[..., :2] + fraction * (other - one)[..., :2]
     margin = 1e-6 * (1.0 + np.abs(points))
     on_plane = (on_edge | on_node)[..., None]
     first = np.where(on_plane, points - margin, np.inf).min(axis=(1, 2))
@@ -166,7 +166,7 @@ def _locate(corners, places, first, last, rest, first_row, end_row):
                     continue
                 pixel[0] = column
                 pixel[1] = row
-                # A barycentric coordinate is the share of the volume with the pixel as a corner.
+                # A barycentric coordinate is the fraction of the volume with the pixel as a corner.
                 for k in range(4):
                     corner[k] = pixel
                     weights[k] = _six_volumes(corner) / size

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.slicing.cutting.location import BLACK
 from us_sim.slicing.cutting.rest_outline import NO_OUTLINE
-from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
 from us_sim.slicing.cutting.spans import END_SHIFT
 from us_sim.slicing.cutting.trilinear import inside_volume
@@ -53,14 +53,14 @@ __all__ = [
 def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
     """The image (rows, columns) on a plane through the volume as it is, without tissue.
 
-    It does not depend on the number of threads that share its rows.
+    It does not depend on the number of threads.
 
     Raises:
         VolumeError: the volume has too many voxels.
     """
     voxels, shape = grey_voxels(volume)
     runs = full_runs(plane) if plane.spans is None else plane.spans
-    # One map holds on whole rows, so that no pixel is left for what lies outside a mesh.
+    # One map holds on whole rows, so that no pixel is left to lie outside a mesh.
     spans = np.full((plane.rows, 1), plane.columns << END_SHIFT, dtype=np.int64)
     used = np.ones(plane.rows, dtype=np.int32)
     maps, inside = pixel_to_index(volume, plane)[None], np.zeros(1, dtype=np.bool_)
@@ -72,7 +72,7 @@ def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDAr
             first_row, end_row, image,
         )  # fmt: skip
 
-    share_rows(threads, plane.rows, draw)
+    parallel_rows(threads, plane.rows, draw)
     return image
 
 
@@ -88,7 +88,7 @@ def sample_labels(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDA
     if plane.spans is not None:
         elements[~plane.is_shown()] = BLACK
     image = np.empty(elements.shape, dtype=np.uint8)
-    share_rows(
+    parallel_rows(
         threads,
         plane.rows,
         lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),

@@ -29,7 +29,7 @@ class Outline(NamedTuple):
 
 
 NO_OUTLINE = Outline(np.empty((0, 3, 2)), np.empty(0, dtype=np.int8), np.empty(0, dtype=np.int8), 0)
-"""Of a mesh that is not there, or that need not be asked for."""
+"""The outline without a mesh, or where the mesh at rest does not matter."""
 
 
 class RestSurface:
@@ -109,7 +109,7 @@ def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, tur
 
 @njit(inline="always", error_model="numpy")
 def _turn(place, a, b, c, outline):
-    """How a face that crosses the plane, nodes on it taken as above, winds around what is right.
+    """How a face that crosses the plane winds around points right of it; nodes on it are above.
 
     The face's nodes turn counterclockwise as seen from outside the mesh.
     """

@@ -1,8 +1,8 @@
-"""Sharing the rows of an image among threads.
+"""The rows of an image divided into bands, one a thread.
 
->>> from us_sim.slicing.cutting.row_bands import share_rows
+>>> from us_sim.slicing.cutting.row_bands import parallel_rows
 >>> done = []
->>> share_rows(3, 10, lambda first, end: done.append((first, end)), band=2)
+>>> parallel_rows(3, 10, lambda first, end: done.append((first, end)), band=2)
 >>> sorted(done)
 [(0, 4), (4, 8), (8, 10)]
 """
@@ -16,35 +16,35 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["share_rows"]
+__all__ = ["parallel_rows"]
 
 
-def share_rows(
+def parallel_rows(
     threads: int, rows: int, work: Callable[[int, int], object], *, band: int = 1
 ) -> None:
-    """Do ``work(first_row, end_row)`` for all rows, one run of them a thread.
+    """Do ``work(first_row, end_row)`` for all rows in parallel, one run of them a thread.
 
     Args:
         work: a kernel that does not hold the interpreter's lock.
-        band: rows that are never parted: every run starts at a multiple of it.
+        band: rows that stay together: every run starts at a multiple of it.
 
     Raises:
         ValueError: fewer than one thread.
     """
     if threads < 1:
         raise ValueError(f"give at least one thread, not {threads}")
-    share = band * -(-rows // (band * threads))
+    rows_each = band * -(-rows // (band * threads))
     others = [
-        _pool(threads - 1).submit(work, first, min(first + share, rows))
-        for first in range(share, rows, share)
+        _pool(threads - 1).submit(work, first, min(first + rows_each, rows))
+        for first in range(rows_each, rows, rows_each)
     ]
     # The caller is a thread too: waking one fewer saves some 50 µs.
-    work(0, min(share, rows))
+    work(0, min(rows_each, rows))
     for other in others:
         other.result()
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """One for all images: its threads are only started when they are used."""
+    """The threads for all images, which are only started when they are used."""
     return ThreadPoolExecutor(threads, thread_name_prefix="rows")

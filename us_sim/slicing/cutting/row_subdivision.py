@@ -5,7 +5,7 @@ between do too, since it is convex, and the row runs linearly through the volume
 it is split in the middle. Lists of the tetrahedra in each region of the image keep the search
 short.
 
-Three things are done that the paper leaves open. Where both ends lie outside the mesh, the row
+The paper leaves three things open. Where both ends lie outside the mesh, the row
 between them is only taken as outside when no tetrahedron of the regions it crosses meets it. A
 pixel is first sought in the tetrahedra of its neighbours. And a pixel outside the deformed mesh
 shows the rigid volume only where the mesh was not at rest either: tissue that was pushed away
@@ -44,7 +44,7 @@ from us_sim.slicing.cutting.resampling import (
     sample_nearest,
     voxels_of,
 )
-from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import sample_linear
@@ -154,4 +154,4 @@ class RowSubdivision(Slicer):
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
         """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
-        share_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))
+        parallel_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))

@@ -41,7 +41,7 @@ from us_sim.slicing.cutting.resampling import (
     sample_nearest,
 )
 from us_sim.slicing.cutting.rest_outline import NO_OUTLINE, Outline, RestSurface
-from us_sim.slicing.cutting.row_bands import share_rows
+from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
@@ -103,14 +103,14 @@ class ScanConversion(Slicer):
                 self._used, runs, is_covered, *outline, first_row, end_row, image,
             )  # fmt: skip
 
-        share_rows(self._threads, plane.rows, draw)
+        parallel_rows(self._threads, plane.rows, draw)
         return image
 
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         voxels, shape = label_voxels(self._volume)
         elements, maps = self._locate(nodes, plane)
         image = np.empty(elements.shape, dtype=np.uint8)
-        share_rows(
+        parallel_rows(
             self._threads,
             plane.rows,
             lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
@@ -210,7 +210,7 @@ def _neighbours(
 ) -> NDArray[np.int32]:
     """(M, 4) the tetrahedron beyond the face opposite to each corner, -1 where there is none.
 
-    What is flat at rest is nobody's neighbour.
+    A tetrahedron that is flat at rest is nobody's neighbour.
     """
     solid = np.flatnonzero(determinants).astype(np.int32)
     order, starts, counts = face_order(tetrahedra[solid])

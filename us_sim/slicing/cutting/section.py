@@ -63,17 +63,18 @@ class RestMesh:
         self, nodes: ArrayLike, tetrahedra: ArrayLike, patient_to_index: NDArray[np.float64]
     ) -> None:
         self.nodes = finite_nodes(nodes, None)
-        given = np.asarray(tetrahedra)
-        if given.ndim != 2 or given.shape[1] != 4 or given.dtype.kind not in "iu":
+        corners = np.asarray(tetrahedra)
+        if corners.ndim != 2 or corners.shape[1] != 4 or corners.dtype.kind not in "iu":
             raise MeshError(
-                f"tetrahedra have shape {given.shape} and type {given.dtype}: give (M, 4) integers"
+                f"tetrahedra have shape {corners.shape} and type {corners.dtype}: give (M, 4) "
+                f"integers"
             )
-        if given.size and (given.min() < 0 or given.max() >= len(self.nodes)):
+        if corners.size and (corners.min() < 0 or corners.max() >= len(self.nodes)):
             raise MeshError(
-                f"tetrahedra name nodes {given.min()} to {given.max()}, but the mesh has only "
+                f"tetrahedra name nodes {corners.min()} to {corners.max()}, but the mesh has only "
                 f"{len(self.nodes)} nodes"
             )
-        self.tetrahedra = np.ascontiguousarray(given, dtype=np.int32)
+        self.tetrahedra = np.ascontiguousarray(corners, dtype=np.int32)
         corners = self.nodes[self.tetrahedra]
         self.determinants = np.linalg.det(corners[:, 1:] - corners[:, :1])
         self.rest_index = np.ascontiguousarray(
@@ -148,7 +149,7 @@ def _cut(nodes, tetrahedra, rest_index, determinants, to_pixel, pixel_volume, co
     Args:
         nodes: (N, 3) m. tetrahedra: (M, 4) int32. rest_index: (N, 3) voxels.
         determinants: (M,) m³, six times the signed volumes at rest.
-        to_pixel: (3, 4) from m to (column, row, height). pixel_volume: m³ of a unit of those.
+        to_pixel: (3, 4) from m to (column, row, height). pixel_volume: m³ per unit of those.
     """
     pixel = np.empty((len(nodes), 3))
     for n in range(len(nodes)):

@@ -1,4 +1,4 @@
-"""Two machine operations that numba has no words for, as LLVM has them on every processor.
+"""Two vector operations that numba lacks, in LLVM's instructions for every processor.
 
 >>> import numpy as np
 >>> from numba import njit
@@ -23,7 +23,7 @@ from numba.extending import intrinsic
 __all__ = ["LANES", "load_pairs", "write_ramp"]
 
 LANES = 16
-"""Numbers that are touched at once: an array has room for these beyond its last one."""
+"""Numbers that are read or written at once: arrays need room for as many beyond their last one."""
 
 _NUMBER = ir.IntType(32)
 _VECTOR = ir.VectorType(_NUMBER, LANES)
@@ -48,7 +48,7 @@ def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: An
         builder.store(builder.select(within, ramp, before), place).align = 1
         return context.get_dummy_value()
 
-    # Whatever the types of these, they are converted.
+    # Indices and numbers of any type are converted.
     numbers = [types.int32 for _ in (start, step, count)]
     return types.void(array, index, *numbers), generate
 
@@ -67,8 +67,8 @@ def _load_pairs(
         _, _, first, to_y, to_x, *_ = arguments
         origin = data(0)
         corners = [
-            builder.gep(origin, [way])
-            for way in (ir.Constant(_INDEX, 0), to_y, to_x, builder.add(to_x, to_y))
+            builder.gep(origin, [step])
+            for step in (ir.Constant(_INDEX, 0), to_y, to_x, builder.add(to_x, to_y))
         ]
         pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 4
         places = builder.gep(data(1), [first])
@@ -92,7 +92,7 @@ def _load_pairs(
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
-    """A vector of one and the same number."""
+    """A vector with the same number in every lane."""
     empty = ir.Constant(_VECTOR, ir.Undefined)
     one = builder.insert_element(empty, number, ir.Constant(_NUMBER, 0))
     return builder.shuffle_vector(one, empty, ir.Constant(_VECTOR, [0] * LANES))

@@ -22,7 +22,7 @@ __all__ = ["Slicer", "create_slicer", "warm_up"]
 class Slicer(ABC):
     """Cuts images from a volume that is carried by a deformed tetrahedral mesh.
 
-    A pixel in the deformed mesh (its surface included) shows what lies at its place at rest. One
+    A pixel in the deformed mesh (its surface included) shows the volume at its rest position. One
     outside shows the volume as it is, unless the mesh covers it at rest: tissue that was pushed
     away leaves black behind, not its ghost. Beyond the volume, and outside a plane's spans, all
     is black.
@@ -36,7 +36,7 @@ class Slicer(ABC):
     """Inverted or flat tetrahedra on the latest image, which were left out."""
 
     Settings: ClassVar[type[Settings]] = Settings
-    """What can be set of this method."""
+    """The class of this method's settings."""
 
     @abstractmethod
     def __init__(
@@ -51,7 +51,7 @@ class Slicer(ABC):
         """``rest_nodes`` (N, 3) m lie in the undeformed volume; ``tetrahedra`` (M, 4) index them.
 
         The image does not depend on the number of threads. ``settings`` are of the class's own
-        kind, or None for those by default.
+        kind, or None for the defaults.
         """
 
     @abstractmethod
@@ -113,7 +113,7 @@ def create_slicer(
 def warm_up(name: str, threads: int = 1) -> None:
     """Compile every kernel of a method, or load it from numba's cache, by cutting a tiny image.
 
-    Those for a volume without tissue too.
+    The kernels for a volume without tissue are included.
     """
     from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
     from us_sim.slicing.probe.probe import LinearProbe

@@ -22,14 +22,14 @@ from us_sim.slicing.cutting.trilinear import SLACK
 __all__ = ["INNER_MARGIN", "MOST_VOXELS", "MOST_VOXELS_A_SIDE", "fill_elements", "sample_spans"]
 
 _FRACTION = 17  # bits behind the point of a coordinate
-_DROPPED = 2  # of these bits, how many a blend leaves out
+_DROPPED = 2  # number of these bits that a blend leaves out
 _ONE = float(1 << _FRACTION)
 
 MOST_VOXELS_A_SIDE = 1 << 31 - _FRACTION
 MOST_VOXELS = 1 << 32
 
 INNER_MARGIN = 1e-3
-"""Voxels from the outermost centres within which coordinates need no care: their rounding."""
+"""Voxels from the outermost centres beyond which rounding cannot lead a coordinate outside."""
 
 _OPEN = -1  # first coordinate of a pixel that has not been written yet
 _NOWHERE = -2  # first coordinate of a pixel without a place at rest
@@ -54,12 +54,12 @@ def sample_spans(
         image: (rows, columns) uint8, filled here.
     """
     columns = image.shape[1]
-    # Lines of a multiple of 4096 bytes would make loads wait for stores that are not theirs.
+    # With lines of a multiple of 4096 bytes, loads would wait for stores to other lines.
     room = np.empty((11, (columns + LANES + 671) // 1024 * 1024 + 352), dtype=np.int32)
     x = room[0]
     y = room[1]
     z = room[2]
-    # Pixels are loaded in groups: where the last group ends beyond the row, from somewhere.
+    # Pixels are loaded in groups: the last one, beyond the row's end, needs valid places too.
     room[3] = 0
     winding = np.empty(columns + 1, dtype=np.int32)
     covered = np.empty(columns, dtype=np.bool_)
@@ -104,7 +104,7 @@ def fill_elements(
     """Which map holds at each pixel: fills ``elements`` (rows, columns) int32.
 
     Args:
-        rigid: the number of the map outside the mesh. black: what stands for no map.
+        rigid: the number of the map outside the mesh. black: the number for no map.
         spans … outline_number: as for `sample_spans`.
     """
     rows, columns = elements.shape
@@ -291,16 +291,16 @@ def _sample(voxels, shape, x, y, z, room, line):
 
 
 @njit(inline="always", error_model="numpy")
-def _blend_pair(pair, way):
-    """The grey value, in 64ths, that is ``way`` 32768ths of the way between the two of a pair."""
+def _blend_pair(pair, weight):
+    """The blend of a pair of grey values, in 64ths; ``weight`` is the second's, in 32768ths."""
     low = np.int16(pair & np.uint16(255))
     to_high = np.int16(np.int16(pair >> np.uint16(8)) - low)
-    step = np.int16((np.int32(np.int16(to_high << np.int16(7))) * np.int32(way)) >> np.int32(16))
+    step = np.int16((np.int32(np.int16(to_high << np.int16(7))) * np.int32(weight)) >> np.int32(16))
     return np.int16(np.int16(low << np.int16(6)) + step)
 
 
 @njit(inline="always", error_model="numpy")
-def _blend(low, high, way):
-    """The value that is ``way`` 32768ths of the way between two, all in 64ths."""
+def _blend(low, high, weight):
+    """The linear blend of two values, all in 64ths; ``weight`` is the higher's, in 32768ths."""
     to_high = np.int16(np.int16(high - low) << np.int16(1))
-    return np.int16(low + np.int16((np.int32(to_high) * np.int32(way)) >> np.int32(16)))
+    return np.int16(low + np.int16((np.int32(to_high) * np.int32(weight)) >> np.int32(16)))

@@ -13,8 +13,8 @@ from numba import njit
 __all__ = ["CUT_SHIFT", "END_SHIFT", "closed_columns", "convert_cuts", "up_to"]
 
 CUT_SHIFT, END_SHIFT = 26, 13
-"""Bits by which a span's cut and end are shifted in the one number that it is; its first column
-fills the lowest bits. A column is at most 4096."""
+"""A span is one number: bits by which its cut and its end are shifted there. The lowest bits are
+its first column. A column is at most 4096."""
 
 _CLOSE = 1e-8
 """Pixels from an outline within which a place is on it: rounding of positions."""
@@ -103,7 +103,7 @@ def _add(q, first, end, row, runs, kinds, spans, used):
     for k in range(kinds):
         a = max(first, np.int64(runs[line, k, 0]))
         b = min(end, np.int64(runs[line, k, 1]))
-        # An empty span is written too, and overwritten: faster than to ask.
+        # An empty span is written too, and overwritten: faster than to test for it.
         place = np.uint64(used[line])
         if place < np.uint64(spans.shape[1]):
             spans[line, place] = np.int64(q) << CUT_SHIFT | b << END_SHIFT | a

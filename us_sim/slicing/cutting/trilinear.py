@@ -172,7 +172,7 @@ def _blend_span(voxels, strides, first, end, nearest, wx, wy, wz, corners, line)
 
     The loads stand apart from the arithmetic, which is vectorised without them: two and a half
     times as fast. ``nearest`` (columns,) int64 are the lower corners, ``wx``, ``wy`` and ``wz``
-    (columns,) float32 the ways beyond them, and ``corners`` (8, columns) uint8 is room to work in.
+    (columns,) float32 the offsets from them, and ``corners`` (8, columns) uint8 is room to work in.
     """
     # All loops here count from 0 and the voxels' indices are unsigned: numba lets a signed index
     # count from the end, and a test for that keeps the loop from being vectorised.

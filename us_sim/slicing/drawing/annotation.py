@@ -1,4 +1,4 @@
-"""What is drawn over an ultrasound image: millimetres, the focus, outlines, and whether it is old.
+"""Drawing over an ultrasound image: scales, the focus, outlines, and a badge when it is not live.
 
 >>> import numpy as np
 >>> from us_sim.slicing.drawing.annotation import Annotation, Badge
@@ -31,7 +31,7 @@ _SCALE: Colour = (205, 215, 215)
 _FOCUS: Colour = (255, 210, 60)
 _SHADOW: Colour = (0, 0, 0)
 _FINE = 4
-"""Bits of a pixel's fraction with which outlines are drawn."""
+"""Bits of the fraction of a pixel in the coordinates of outlines."""
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom
 
@@ -102,7 +102,7 @@ class Annotation:
         return picture
 
     def _lay_out_depth(self, first: float, spacing: float) -> None:
-        """Ticks and labels along the right side, of depth below the face."""
+        """Lay out ticks and labels of depth below the face along the right side."""
         step, between = _steps(spacing, self._rows, 2.2 * self._text)
         edge = self._columns - 1
         for depth in _multiples(between, max(first - spacing, 0.0), first + self._rows * spacing):
@@ -118,7 +118,7 @@ class Annotation:
                 self._place(label, edge - self._text - 2 - label.width, top)
 
     def _lay_out_width(self, first: float, spacing: float) -> None:
-        """Ticks and labels along the bottom, of the way along the array from its middle."""
+        """Lay out ticks and labels of lateral distance from the middle along the bottom."""
         widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
         step, between = _steps(spacing, self._columns, 1.5 * widest)
         edge = self._rows - 1
@@ -136,7 +136,7 @@ class Annotation:
                 self._place(label, column - label.width // 2, above - 2 - label.height)
 
     def _lay_out_focus(self, row: int) -> None:
-        """A triangle that points at the depth scale."""
+        """Lay out a triangle that points at the focus on the depth scale."""
         if not 0 <= row < self._rows:
             return
         size = max(3, round(0.6 * self._text))
@@ -203,13 +203,13 @@ class Annotation:
 
 
 def _bright(colour: tuple[float, float, float]) -> Colour:
-    """0 to 255, and no darker than can be seen on black."""
-    red, green, blue = (round(255 * (0.25 + 0.75 * share)) for share in colour)
+    """The colour as 0 to 255, bright enough to be seen on black."""
+    red, green, blue = (round(255 * (0.25 + 0.75 * level)) for level in colour)
     return red, green, blue
 
 
 def _steps(spacing: float, count: int, pixels: float) -> tuple[float, float]:
-    """From label to label, at least that many pixels, and from tick to tick: m.
+    """Distances (m) of labels, at least that many pixels apart, and of ticks.
 
     Labels are 5, 10, 20, 50, … mm apart, in a very small image 1, 2, 5, … mm.
     """

@@ -20,22 +20,22 @@ from numpy.typing import NDArray
 __all__ = ["label_outlines"]
 
 _MOST = 64
-"""Outlines of one label: of more, the longest are taken."""
+"""Most outlines of one label; the longest are taken."""
 
 
 def label_outlines(
     labels: NDArray[np.uint8], label: int, *, least: float = 6.0, smoothing: float = 1.0
 ) -> list[NDArray[np.float64]]:
-    """Closed outlines of where ``labels`` is ``label``, holes too, the longest first.
+    """Closed outlines of the areas and holes of one label, the longest first.
 
     Args:
         labels: (rows, columns).
         least: pixels that an outline must enclose.
-        smoothing: about how many pixels the steps are long that are to be seen no more.
+        smoothing: pixels, about the length of the steps between pixels that are smoothed away.
 
     Returns:
-        Of each outline (P, 2) column and row, in pixels: between the pixels that have the label
-        and those that have not, at most about half of ``smoothing`` apart.
+        (P, 2) column and row of each outline, in pixels, between pixels with the label and those
+        without, the points at most about half of ``smoothing`` apart.
     """
     mask = cv2.inRange(labels, (float(label),), (float(label),))
     left, top, width, height = cv2.boundingRect(mask)

@@ -31,7 +31,7 @@ _CAPITAL = 21
 """Height of a capital letter of OpenCV's font at scale 1, px, without its strokes."""
 
 _HALO = 2
-"""Pixels around the letters."""
+"""Width of the halo around letters, px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,13 @@ def lettering(text: str, height: int, colour: Colour) -> Label:
     padded = np.pad(letters, _HALO)
     halo = cv2.GaussianBlur(cv2.dilate(padded, np.ones((3, 3), np.uint8)), (3, 3), 0.0)
     opacity = np.maximum(padded, 0.8 * halo)
-    share = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
-    colours = np.rint(share[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
+    letters = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
+    colours = np.rint(letters[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
     return Label(colours, opacity)
 
 
 def _letters(text: str, height: int) -> NDArray[np.float32]:
-    """How much of each pixel the letters cover, cropped to them."""
+    """The fraction of each pixel that the letters cover, cropped to them."""
     large = _FINER * height
     letters = _cropped(text, large, _scale(large))
     rows, columns = (-(-side // _FINER) for side in letters.shape)

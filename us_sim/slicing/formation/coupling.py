@@ -28,21 +28,21 @@ GEL_FILM = (0.15e-3, 0.3e-3)
 """m: gel fills gaps between face and skin up to the first; from the second on there is air."""
 
 GEL_BEAD = 0.2
-"""How much wider a gap the gel fills, of the way that the face is pressed in beside it.
+"""Gap that gel fills in addition to `GEL_FILM`, over the depth of the face below the skin at rest.
 
-Gel that is squeezed out gathers in the wedge where skin leaves a pressed face. It is also as far
-as the triangles of a coarse mesh stand off a face that its nodes touch.
+Gel that is squeezed out gathers in the wedge where skin leaves a pressed face. The triangles of a
+coarse mesh stand off a face that their nodes touch by as much.
 """
 
 LIGHT_CONTACT = 0.2
 """Coupling where the face just touches: 14 dB less than in full contact, there and back."""
 
 FULL_PRESS = 1e-3
-"""m: how far the face must be pressed beyond touching until hairs and creases are closed."""
+"""m: depth of the face below the skin at rest at which hairs and creases are closed."""
 
 
 class ContactSurface:
-    """The outer surface of what the face can touch.
+    """The outer surface of the body that the face can touch.
 
     Args:
         rest_nodes: (N, 3) m, frame ``patient``.
@@ -73,7 +73,7 @@ class ContactSurface:
         self._triangles = corners
 
     def coupling(self, nodes: ArrayLike, probe: Probe, pose: Pose) -> NDArray[np.float32]:
-        """(lines,) the share of an echo's amplitude that gets through: 0 in air, 1 in full contact.
+        """(lines,) the fraction of an echo's amplitude transmitted: 0 in air, 1 in full contact.
 
         Args:
             nodes: (N, 3) m, where the surface's nodes are now.
@@ -91,7 +91,7 @@ class ContactSurface:
     def gaps(
         self, nodes: ArrayLike, probe: Probe, pose: Pose
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How far each line runs from the face to the surface, and how far it is pressed there.
+        """Gap between face and surface along each line, and how far the face is pressed in there.
 
         Args:
             nodes: (N, 3) m, where the surface's nodes are now.
@@ -125,18 +125,18 @@ class ContactSurface:
         return gap, press
 
 
-def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 0 to 1 as ``share`` does, without a kink at either."""
-    share = np.clip(share, 0.0, 1.0)
-    return share * share * (3.0 - 2.0 * share)
+def _smooth(ramp: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The ramp clipped to 0 and 1 without a kink at either (the smoothstep polynomial)."""
+    ramp = np.clip(ramp, 0.0, 1.0)
+    return ramp * ramp * (3.0 - 2.0 * ramp)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, press):
-    """Where each beam enters the surface: last before the face if it is inside, else first after.
+    """Where each beam enters the surface: last before the face if that is inside, else first after.
 
-    Folds of a surface that was pushed hard overlap, so what counts is how often a beam has
-    entered more than it has left, not what it did last.
+    Folds of a surface that was pushed hard overlap. So the face is inside if the beam entered the
+    surface more often than it left it, whatever it did last.
 
     Args:
         nodes, rest: (N, 3); triangles (T, 3), normals outward.
@@ -182,9 +182,9 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
             d = (c + 1) % 3
             ya, yb = point[c, 1], point[d, 1]
             if (ya >= 0.0) != (yb >= 0.0):
-                share = ya / (ya - yb)
+                fraction = ya / (ya - yb)
                 for q, axis in enumerate((0, 2, 3, 4)):
-                    ends[found, q] = point[c, axis] + share * (point[d, axis] - point[c, axis])
+                    ends[found, q] = point[c, axis] + fraction * (point[d, axis] - point[c, axis])
                 found += 1
         # The normal's x and z, of any length.
         ux, uy, uz = (
@@ -206,22 +206,22 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
             b = (ends[1, 0] - x0) * z - (ends[1, 1] - z0) * x
             if (a >= 0.0) == (b >= 0.0):
                 continue
-            share = a / (a - b)
-            way = (ends[0, 0] + share * (ends[1, 0] - ends[0, 0]) - x0) * x + (
-                ends[0, 1] + share * (ends[1, 1] - ends[0, 1]) - z0
+            fraction = a / (a - b)
+            distance = (ends[0, 0] + fraction * (ends[1, 0] - ends[0, 0]) - x0) * x + (
+                ends[0, 1] + fraction * (ends[1, 1] - ends[0, 1]) - z0
             ) * z
-            along = (ends[0, 2] + share * (ends[1, 2] - ends[0, 2])) * x + (
-                ends[0, 3] + share * (ends[1, 3] - ends[0, 3])
+            along = (ends[0, 2] + fraction * (ends[1, 2] - ends[0, 2])) * x + (
+                ends[0, 3] + fraction * (ends[1, 3] - ends[0, 3])
             ) * z
             inward = normal_x * x + normal_z * z < 0.0
-            if way <= 0.0:
+            if distance <= 0.0:
                 depth[line] += 1 if inward else -1
-                if inward and way > entered[line]:
-                    entered[line] = way
+                if inward and distance > entered[line]:
+                    entered[line] = distance
                     moved[line] = along
-            elif inward and way < gap[line]:
-                gap[line] = way
-                press[line] = along - way
+            elif inward and distance < gap[line]:
+                gap[line] = distance
+                press[line] = along - distance
     for line in range(lines):
         if depth[line] > 0:
             gap[line] = entered[line]

@@ -33,7 +33,7 @@ class Elevation:
     """Parallel slices and their weights, which follow the beam's hourglass in depth.
 
     At every depth the weights are a Gaussian's at the planes, its own width chosen such that
-    their variance is exactly the beam's: so few planes, a fixed distance apart, average a volume
+    their variance is exactly the beam's. So a few planes, a fixed distance apart, average a volume
     that is quadratic across the plane as the continuous beam does. (An even number has no plane in
     the middle and cannot be thinner than the innermost two are apart.) Grey values are averaged,
     as when images of neighbouring planes are compounded.
@@ -51,7 +51,7 @@ class Elevation:
         self._weights = np.ascontiguousarray(fixed.T)[:, depth_steps(probe)]
 
     def average(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-        """The image (rows, columns) of those on the planes (rows, columns)."""
+        """The weighted mean (rows, columns) of the images (rows, columns) on the planes."""
         total = np.full(images[0].size, _WHOLE // 2, dtype=np.uint32)
         for image, weights in zip(images, self._weights, strict=True):
             _add_weighted(image.reshape(-1), weights.reshape(-1), total)
@@ -83,7 +83,7 @@ def _gaussian(squares: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArr
 
 
 def _fixed_point(weights: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """The same in fixed point, symmetric and with the exact sum, so even tissue stays even."""
+    """The weights in fixed point, symmetric and with the exact sum: even tissue stays even."""
     half = weights.shape[1] // 2
     outer = np.round(weights[:, :half] * _WHOLE).astype(np.int64)
     if weights.shape[1] % 2:

@@ -1,8 +1,8 @@
 """From the level of an echo to a grey value: gain, time gain, dynamic range and grey map.
 
 A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
-and 0 is no echo, which no gain makes visible. So that nothing has no hard edge where gain lifts
-the faintest echoes, these fade to black over the last 4 dB above it.
+and 0 is no echo, which no gain makes visible. The faintest echoes fade to black over the
+last 4 dB above no echo, so that there is no hard edge where gain lifts them.
 
 >>> import numpy as np
 >>> from us_sim.slicing.formation.grey_levels import GreyLevels
@@ -51,14 +51,14 @@ class GreyLevels:
             gain = imaging.gain + np.interp(step_depths(probe), at, imaging.time_gain)
         grey = np.arange(256)
         level = grey / GREYS_PER_DECIBEL - ECHO_RANGE + gain[:, None]  # dB
-        share = np.clip(1.0 + level / imaging.dynamic_range, 0.0, 1.0)
+        ramp = np.clip(1.0 + level / imaging.dynamic_range, 0.0, 1.0)
         if imaging.grey_map == "soft":
-            share = share**_SOFT
+            ramp = ramp**_SOFT
         elif imaging.grey_map == "contrast":
-            share = share * share * (3.0 - 2.0 * share)
-        share -= share[:, :1] * np.maximum(1.0 - grey / _FADE, 0.0)
-        # Half way is up, also where the sum of decibels is a rounding error below it.
-        self._tables = np.floor(255.0 * share + (0.5 + 1e-9)).astype(np.uint8)
+            ramp = ramp * ramp * (3.0 - 2.0 * ramp)
+        ramp -= ramp[:, :1] * np.maximum(1.0 - grey / _FADE, 0.0)
+        # Halves are rounded up, also where the sum of decibels is a rounding error below one.
+        self._tables = np.floor(255.0 * ramp + (0.5 + 1e-9)).astype(np.uint8)
 
     def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The grey values (rows, columns) of echo levels (rows, columns)."""
@@ -79,6 +79,6 @@ def _look_up(image, table, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_up_by_step(image, steps, tables, out):
-    """Tables lie one after the other, 256 entries each."""
+    """Fills out; the tables of 256 entries lie one after the other."""
     for i in range(len(image)):
         out[i] = tables[np.uint32(steps[i]) << np.uint32(8) | np.uint32(image[i])]

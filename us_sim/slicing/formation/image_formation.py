@@ -36,14 +36,14 @@ __all__ = ["ImageFormation"]
 
 
 class ImageFormation:
-    """What happens between a slice and the picture, in the order in which echoes meet it.
+    """The stages between slices and the picture, in the order in which echoes meet them.
 
-    The beam's thickness, its width and the pulse's length; then air in front of the face; then
-    gain, dynamic range and grey map. It depends on nothing but its settings and its arguments.
+    They are the beam's thickness, its width and the pulse's length; then air in front of the face;
+    then gain, dynamic range and grey map. The result depends on settings and arguments only.
 
     Args:
         probe: its geometry.
-        imaging: the settings; what is at its default is not even imported.
+        imaging: the settings; a stage whose settings are at their defaults is not even imported.
     """
 
     def __init__(self, probe: Probe, imaging: Imaging) -> None:

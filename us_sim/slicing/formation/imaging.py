@@ -1,4 +1,4 @@
-"""How echoes become grey values: what a sonographer sets at the console.
+"""The settings of image formation: what a sonographer sets at the console.
 
 >>> from us_sim.slicing.formation.imaging import Imaging
 >>> Imaging(gain=6.0).gain
@@ -92,6 +92,6 @@ class Imaging(Settings):
 
     @property
     def changes_grey_levels(self) -> bool:
-        """Whether an echo is shown otherwise than by its own grey value in the volume."""
+        """Whether echoes are shown with grey values other than the volume's own."""
         plain = (0.0, ECHO_RANGE, "linear")
         return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)

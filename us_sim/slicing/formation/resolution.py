@@ -1,11 +1,12 @@
-"""What a point becomes: the width of the beam and the length of the pulse, at every depth.
+"""The point spread function: the width of the beam and the length of the pulse at every depth.
 
-Echoes are spread as power. What lies within a beam sends echoes of random phase, whose expected
-power is the sum of theirs (Wagner, Smith, Sandrik, Lopez 1983): so tissue keeps its brightness, a
-bright reflector smears over its dark surroundings as it does on a scanner, and a point is as wide
-as was asked 6 dB below its peak, where resolution is stated. Grey values are logarithms: spreading
-those would shrink what is bright and blacken what lies beside the dark. A volume of grey values
-holds no phases, so speckle finer than the beam becomes smoother, where a scanner's is coarser.
+Echoes are spread as power. Scatterers within a beam send echoes of random phase, whose expected
+power is the sum of theirs (Wagner, Smith, Sandrik, Lopez 1983). So tissue keeps its brightness, a
+bright reflector smears over its dark surroundings as it does on a scanner, and 6 dB below its peak,
+where resolution is stated, a point is as wide as the setting says. Grey values are logarithms:
+spreading those would shrink bright areas and blacken what lies beside dark ones. A volume of grey
+values holds no phases, so speckle finer than the beam becomes smoother, where a scanner's is
+coarser.
 
 >>> import numpy as np
 >>> from us_sim.slicing.formation.imaging import Imaging
@@ -35,8 +36,8 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 __all__ = ["Resolution"]
 
 _SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
-"""Standard deviation of an amplitude over the width at half its power: power is the square, and has
-a standard deviation √2 times less."""
+"""Standard deviation of an amplitude over the width at half its power. Power is the square of the
+amplitude, and its standard deviation is √2 times less."""
 
 _REACH = 3.0  # standard deviations after which the point spread counts as 0
 
@@ -96,7 +97,7 @@ class _Fan:
         widest = max(_length(probe.beam_starts), _length(ends))
         self.lines = max(2, math.ceil(widest / (_LINE_STEP * pixel)))
         self.samples = max(2, round(probe.depth / pixel))
-        # Where they lie among the probe's, whose outermost are half a line from the edge.
+        # Their coordinates among the probe's lines, whose outermost are half a line from the edge.
         number = np.arange(probe.lines)
         line = (np.arange(self.lines) + 0.5) * (probe.lines / self.lines) - 0.5
         starts, directions = (
@@ -114,11 +115,11 @@ class _Fan:
             ((z - top) / axial).astype(np.float32),
             cv2.CV_16SC2,
         )
-        line_of, way = probe.pixel_beams
-        shown = np.isfinite(way)
+        line_of, distance = probe.pixel_beams
+        shown = np.isfinite(distance)
         line_of = (line_of + 0.5) * (self.lines / probe.lines) - 0.5
         line_of = np.clip(line_of, 0, self.lines - 1)
-        sample = np.clip(way * (self.samples / probe.depth) - 0.5, 0, self.samples - 1)
+        sample = np.clip(distance * (self.samples / probe.depth) - 0.5, 0, self.samples - 1)
         self._to_pixels = cv2.convertMaps(
             np.where(shown, line_of, -9).astype(np.float32),
             np.where(shown, sample, -9).astype(np.float32),
@@ -144,7 +145,7 @@ def _remapped(image: NDArray[np.uint8], maps: Any, *, replicate: bool) -> NDArra
 
 
 def _length(points: NDArray[np.float64]) -> float:
-    """Of the line through points (n, 2), m, with half a step beyond its ends."""
+    """Length of the line through points (n, 2), m, with half a step beyond its ends."""
     count = len(points)
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return float(steps.sum()) * count / max(count - 1, 1)

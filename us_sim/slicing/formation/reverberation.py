@@ -1,11 +1,11 @@
-"""What lines show that are not, or badly, coupled to the skin: the face's own echoes.
+"""Echoes of the transducer's own face in lines that are badly coupled to the skin.
 
 Air reflects everything, so the pulse runs to and fro in the lens of the transducer: bright bands
 a lens apart, each weaker than the one before, and a haze below them.
 
-Of the tissue a line sees what the elements that form it are coupled to. They are the more the
-deeper it looks, so the shadow of a part of the face without contact reaches all depths, with an
-edge that is the softer the deeper. A line that is partly coupled is weaker by so many decibels.
+A line sees the tissue through the elements that form it, and deeper echoes are formed by more
+elements. So the shadow of a part of the face without contact reaches all depths, with an edge that
+gets softer with depth. A partly coupled line is weaker by the coupling in decibels.
 Of two echoes at one place the stronger is shown: their sum is 3 dB more at most.
 
 >>> import numpy as np
@@ -44,10 +44,10 @@ _GRAIN = (512, 192)  # the haze's, along and across the beams
 _PLACES = 1024  # along the face, at which coupling is tabulated
 _STEPS = 32  # of depth, likewise
 _F_NUMBER = 2.0  # depth over the length of face that looks there
-_APERTURE = (1.5e-3, 1 / 3)  # m, and part of the face: the least and the most that forms a line
+_APERTURE = (1.5e-3, 1 / 3)  # m, and fraction of the face: the least and the most that forms a line
 _FINEST = 4096  # entries of the table of losses
 _GREYS_PER_DECIBEL = 255.0 / ECHO_RANGE
-_SILENT = 255  # grey values of loss that leave nothing
+_SILENT = 255  # grey values of loss after which nothing is left
 
 
 class Reverberation:
@@ -78,9 +78,9 @@ class Reverberation:
 
 
 def _losses() -> NDArray[np.uint32]:
-    """(`_FINEST` + 1,) grey values lost, there and back, by an evenly spaced share of amplitude."""
-    share = np.maximum(np.arange(_FINEST + 1), 0.1) / _FINEST
-    lost = np.round(-40.0 * np.log10(share) * _GREYS_PER_DECIBEL)
+    """(`_FINEST` + 1,) grey values lost, there and back, at evenly spaced amplitude fractions."""
+    fraction = np.maximum(np.arange(_FINEST + 1), 0.1) / _FINEST
+    lost = np.round(-40.0 * np.log10(fraction) * _GREYS_PER_DECIBEL)
     return np.minimum(lost, _SILENT).astype(np.uint32)
 
 
@@ -88,7 +88,7 @@ _LOSSES = _losses()
 
 
 def _apertures(probe: Probe) -> NDArray[np.int64]:
-    """(`_STEPS`,) how much of the face, in places, forms a line at each step of depth."""
+    """(`_STEPS`,) length of the face, in places, that forms a line at each step of depth."""
     length = np.linalg.norm(np.diff(probe.beam_starts, axis=0), axis=1).sum()
     length = max(length * probe.lines / max(probe.lines - 1, 1), 1e-6)
     depth = (np.arange(_STEPS) + 0.5) * (probe.depth / _STEPS)
@@ -98,9 +98,9 @@ def _apertures(probe: Probe) -> NDArray[np.int64]:
 
 
 def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
-    """(rows, columns) levels of what a face in air shows, its first band at ``first`` dB."""
+    """(rows, columns) levels of the image of a face in air, its first band at ``first`` dB."""
     line, depth = np.nan_to_num(probe.pixel_beams)
-    # Elements differ a little; what differs is the same in every frame.
+    # Elements differ a little, in the same manner in every frame.
     random = np.random.Generator(np.random.PCG64(7))
     samples, lines = _GRAIN
     grain = random.random(_GRAIN, dtype=np.float32)
@@ -121,10 +121,10 @@ def _air_echoes(probe: Probe, first: float) -> NDArray[np.uint8]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lose(coupled, reach, losses, out):
-    """What tissue, and the face's own echo, lose at each step of depth and place along the face.
+    """The losses of tissue and of the face's own echo, at each step of depth and place of the face.
 
     Args:
-        coupled: (places,) share of the amplitude that gets through, one way.
+        coupled: (places,) fraction of the amplitude transmitted in one direction.
         reach: (steps,) places on either side whose elements form a line.
         losses: the table of losses.
         out: (steps, places), set: the tissue's loss, and that of the face's echo times 256.
@@ -138,11 +138,11 @@ def _lose(coupled, reach, losses, out):
     for step in range(len(reach)):
         for i in range(places):
             first, end = max(i - reach[step], 0), min(i + reach[step] + 1, places)
-            share = min((total[end] - total[first]) / (end - first), 1.0)
+            mean = min((total[end] - total[first]) / (end - first), 1.0)
             if step == 0:
-                # Of the nearest elements; squared, since little contact already quiets the lens.
-                own[i] = losses[np.int64((1.0 - share * share) ** 2 * finest + 0.5)] << 8
-            out[step, i] = own[i] | losses[np.int64(share * finest + 0.5)]
+                # By the nearest elements; squared, since little contact already quiets the lens.
+                own[i] = losses[np.int64((1.0 - mean * mean) ** 2 * finest + 0.5)] << 8
+            out[step, i] = own[i] | losses[np.int64(mean * finest + 0.5)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

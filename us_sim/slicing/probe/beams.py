@@ -1,4 +1,4 @@
-"""Depth along a probe's beams, and how wide a beam is there: what the parts of a picture share.
+"""Depth along a probe's beams, and the width of a beam there, for all parts of image formation.
 
 >>> from us_sim.slicing.probe.beams import beam_width
 >>> round(float(beam_width(0.0, 2e-3, focus=0.02)) * 1e3, 3)  # mm, at the face
@@ -17,11 +17,11 @@ from us_sim.slicing.probe.probe import Probe
 __all__ = ["DEPTH_STEPS", "beam_width", "depth_steps", "focus_of", "step_depths"]
 
 DEPTH_STEPS = 512
-"""Steps of depth in which what changes with it is tabulated."""
+"""Steps of depth in which tables of what changes with depth are made."""
 
 
 def focus_of(probe: Probe) -> float:
-    """Depth of the focus along the beams, m: half way where the probe does not say."""
+    """Depth of the focus along the beams, m; half the image's depth where the probe has none."""
     return 0.5 * probe.depth if probe.focus is None else probe.focus
 
 

@@ -82,8 +82,8 @@ class SectorProbe(Probe):
 
     All beams leave the middle of the face; that is how phased arrays scan, and the image begins
     in a point. With ``radius`` they radiate from a virtual apex so far behind the face instead,
-    through different places of it: the image begins with a flat edge on the face. Beams are
-    ``depth`` long from the face either way.
+    through different places of it: the image begins with a flat edge on the face. In both
+    cases beams are ``depth`` long from the face.
 
     Raises:
         ProbeError: a value is out of its range, or the face too small for the beams that ``radius``
@@ -128,7 +128,7 @@ class SectorProbe(Probe):
         self, x: NDArray[np.float64], z: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         below = z + self.radius
-        # What part of the way from the apex is in the tissue.
+        # Of the distance from the apex only the part beyond the face counts.
         return np.arctan2(x, below) / self.opening_angle + 0.5, np.hypot(x, below) * z / below
 
     def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -29,7 +29,7 @@ _MOST_PIXELS = 4096
 class SlicePlane:
     """A grid of pixel centres: ``origin + column * column_step + row * row_step``.
 
-    Every probe whose image is a flat grid of pixels gives one of these, whatever its beams.
+    Every probe's image is such a grid, whatever its beams.
 
     Args:
         spans: for an image that does not fill its grid, as a fan: up to two half-open runs of
@@ -95,7 +95,7 @@ class SlicePlane:
 
 
 def _runs_within(spans: NDArray[np.int32], rows: int, columns: int) -> NDArray[np.int32]:
-    """The spans as kernels take them, which do not look whether they stay within the image."""
+    """The spans as kernels take them, checked here to lie within the image, as kernels do not."""
     runs = np.ascontiguousarray(spans, dtype=np.int32)
     if runs.shape != (rows, 2, 2) or runs.min() < 0 or runs.max() > columns:
         raise ProbeError(

@@ -1,4 +1,4 @@
-"""Transducers: what part of the patient they image, as pixels and as beams.
+"""Transducers: the part of the patient that they image, as pixels and as beams.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.slicing.probe.probe import LinearProbe
@@ -62,7 +62,7 @@ def beam_focus() -> Any:
 
 
 _ROUNDING = 1e-9
-"""A pixel centre that lies on the outline, up to this part of a beam or of the lines, is in it."""
+"""Tolerance for pixel centres on the outline, over the depth and over the number of lines."""
 
 _BAND = 64  # rows
 
@@ -118,9 +118,10 @@ class Probe(Settings, ABC):
     def _beam(
         self, x: NDArray[np.float64], z: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Through points (m): which part of all lines, 0 to 1, and the way from the face (m).
+        """The beams through points (m): their place among all lines, 0 to 1, and the distance (m).
 
-        Outside what beams reach either is beyond its range.
+        The distance is along the beam from the face. Where no beam reaches, one of the two is out
+        of its range.
         """
 
     @abstractmethod
@@ -151,7 +152,7 @@ class Probe(Settings, ABC):
         matrix = np.zeros((4, 4))
         matrix[0, 0] = lateral
         matrix[2, 1] = axial
-        matrix[1, 2] = -1.0  # so that it is a rotation but for the scale: x, z and -y
+        matrix[1, 2] = -1.0  # so that it is a rotation times a scale: x, z and -y
         matrix[:, 3] = (0.5 * lateral - half_width, 0.0, 0.5 * axial + top, 1.0)
         return _kept(matrix)
 
@@ -167,15 +168,15 @@ class Probe(Settings, ABC):
 
     @cached_property
     def pixel_beams(self) -> NDArray[np.float32]:
-        """(2, rows, columns): each pixel's line coordinate, and its way (m) along that beam.
+        """(2, rows, columns): each pixel's line coordinate, and its distance (m) along that beam.
 
         The line coordinate is fractional between lines. NaN where no beam reaches.
         """
         beams = np.full((2, self.rows, self.columns), np.nan, dtype=np.float32)
-        for band, part, way, reached in self._bands():
+        for band, part, distance, reached in self._bands():
             line = part * self.lines - 0.5
             np.copyto(beams[0, band], line, where=reached, casting="same_kind")
-            np.copyto(beams[1, band], way, where=reached, casting="same_kind")
+            np.copyto(beams[1, band], distance, where=reached, casting="same_kind")
         return _kept(beams)
 
     @cached_property
@@ -183,9 +184,9 @@ class Probe(Settings, ABC):
         """(2, samples, lines): the column and row, fractional, of each sample of each beam."""
         lateral, axial = self.pixel_spacing
         half_width, top, _ = self._outline
-        way = (np.arange(self.samples)[:, None] + 0.5) * (self.depth / self.samples)
-        x = self.beam_starts[:, 0] + way * self.beam_directions[:, 0]
-        z = self.beam_starts[:, 1] + way * self.beam_directions[:, 1]
+        distance = (np.arange(self.samples)[:, None] + 0.5) * (self.depth / self.samples)
+        x = self.beam_starts[:, 0] + distance * self.beam_directions[:, 0]
+        z = self.beam_starts[:, 1] + distance * self.beam_directions[:, 1]
         pixels = np.stack([(x + half_width) / lateral, (z - top) / axial]) - 0.5
         return _kept(pixels.astype(np.float32))
 
@@ -214,8 +215,9 @@ class Probe(Settings, ABC):
     def _bands(
         self,
     ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
-        """Rows, what `_beam` says of their pixels, and which of these are reached; a few at a time
-        lest large images need many times their own memory.
+        """Bands of rows, with `_beam` of their pixels and which of these are reached.
+
+        A few rows at a time, so that a large image does not need many times its own memory.
         """
         lateral, axial = self.pixel_spacing
         half_width, top, _ = self._outline
@@ -223,10 +225,12 @@ class Probe(Settings, ABC):
         for first in range(0, self.rows, _BAND):
             band = slice(first, min(first + _BAND, self.rows))
             z = (np.arange(band.start, band.stop) + 0.5) * axial + top
-            part, way = self._beam(x[None, :], z[:, None])
+            part, distance = self._beam(x[None, :], z[:, None])
             reached = (part >= -_ROUNDING) & (part <= 1 + _ROUNDING)
-            reached &= (way >= -_ROUNDING * self.depth) & (way <= (1 + _ROUNDING) * self.depth)
-            yield band, part, way, reached
+            reached &= (distance >= -_ROUNDING * self.depth) & (
+                distance <= (1 + _ROUNDING) * self.depth
+            )
+            yield band, part, distance, reached
 
     @property
     def _line_parts(self) -> NDArray[np.float64]:
@@ -284,7 +288,7 @@ class LinearProbe(Probe):
 
 
 def _kept(array: Any) -> Any:
-    """The array, made read-only, since all share it."""
+    """The array, made read-only, since all callers get the same."""
     array.flags.writeable = False
     return array
 

@@ -24,21 +24,22 @@ from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out
 __all__ = ["ActiveSet"]
 
 _CLEARANCE = 1e-3
-"""A touched node is let go at once when the probe is this far from it and from its place at rest,
-m. To wait for its force to change sign would, after a jump, pull it far up first."""
+"""A touched node is let go at once when the probe is this far from it and from its rest position,
+m. Until the force changed sign, a probe that jumped away would pull the node along."""
 
 _NEAR = 1e-4
 """A node this near the probe counts as pushed when another solver's state is taken over, m."""
 
 _SKIRT = 0.25
-"""Part of the spacing by which a touched node must be beside the probe to be let go. Pressed down,
-a node at the rim moves sideways, would come up, and would be under the probe again without end."""
+"""Fraction of the spacing by which a touched node must be beside the probe to be let go. A node at
+the rim that is pressed down moves sideways; let go at once, it would come up, get under the probe
+again, and so on without end."""
 
 _DRIFT, _LITTLE_DRIFT = 1e-4, 1e-9  # m
 _TURN, _LITTLE_TURN = 0.05, 1e-7  # rad
-"""Errors of a touched node's prescribed displacement and of its normal, which become outdated as it
-slides along a curved surface: those renewed during the search, and those renewed at its end.
-Renewing starts the search anew."""
+"""Errors from which on a touched node's prescribed displacement and its normal are renewed, as they
+become outdated when it slides along a curved surface: during the search, and at its end. Renewing
+starts the search anew."""
 
 
 class ActiveSet:
@@ -65,7 +66,7 @@ class ActiveSet:
         self.push[:] = 0.0
 
     def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
-        """Take as touched what lies on the probe's surface; who is pulled leaves at a revision."""
+        """Take nodes on the probe's surface as touched; a revision lets go those it pulls."""
         gap, self.normal = self._gap(pose, self._rest + displacement)
         self.touched = gap < _NEAR
         self.push[:] = 0.0
@@ -78,7 +79,7 @@ class ActiveSet:
         exactly: bool = True,
         moved: bool = True,
     ) -> bool:
-        """Let go who is pulled, add who is entered, and move all touched nodes onto the probe.
+        """Let go nodes that are pulled, add those entered, and move touched ones onto the probe.
 
         Args:
             pose: of the probe, or None when none is near.
@@ -132,7 +133,7 @@ class ActiveSet:
         return np.where(self.touched[:, None], normal, 0.0)
 
     def weigh(self, force: NDArray[np.float64]) -> None:
-        """Take the forces (C, 3) N that hold the nodes; what is along the normal is the push."""
+        """Set the push: the part along the normal of the forces (C, 3) N that hold the nodes."""
         self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
 
     def _margin(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a linear prediction missed in the last frame, carried along with the probe to the next.
+"""The error of the last frame's linear prediction, carried along with the probe to the next frame.
 
 >>> import numpy as np
 >>> from us_sim.tissue.contact.carried_correction import CarriedCorrection
@@ -30,8 +30,9 @@ __all__ = ["CarriedCorrection"]
 class CarriedCorrection:
     """Guesses the nonlinear part of a frame's change from that of the frame before.
 
-    Under a probe that slides on as before, the same correction is due again, but as far on as the
-    probe is. Pressed down, the tissue goes with the probe, and the correction with the tissue.
+    Under a probe that slides on as before, the same correction is due again, displaced by the
+    slide. Where the probe presses down, the tissue goes with it, and the correction stays with the
+    tissue.
 
     Args:
         mesh: in frame ``patient``.
@@ -39,11 +40,11 @@ class CarriedCorrection:
 
     def __init__(self, mesh: TetrahedralMesh) -> None:
         self._tetrahedra = mesh.tetrahedra
-        share = np.zeros(len(mesh.nodes))
-        np.add.at(share, mesh.tetrahedra, mesh.volumes[:, None])
+        around = np.zeros(len(mesh.nodes))
+        np.add.at(around, mesh.tetrahedra, mesh.volumes[:, None])
         self._gradients = shape_gradients(mesh).astype(np.float32)
         self._volumes = mesh.volumes.astype(np.float32)
-        self._share = (1.0 / share).astype(np.float32)
+        self._inverse_volume = (1.0 / around).astype(np.float32)
         self.forget()
 
     def forget(self) -> None:
@@ -82,7 +83,7 @@ class CarriedCorrection:
                 self._volumes,
                 change,
             )
-            carried -= change * self._share
+            carried -= change * self._inverse_volume
         return likeness * carried
 
 

@@ -1,4 +1,4 @@
-"""Frictionless contact on a compliance: find pushes p >= 0 with gaps W p + g >= 0 and no work.
+"""Frictionless contact as a linear complementarity problem between pushes p and gaps W p + g.
 
 The linear complementarity problem 0 <= p, W p + g >= 0, p . (W p + g) = 0 is solved exactly by
 principal pivoting: nodes are released by the sign of their force and added by their true gap, all
@@ -27,11 +27,11 @@ _PATIENCE = 5
 """Block pivots that may fail to improve before pivots are made one at a time."""
 
 _ROUNDING = 1e-12
-"""Part of the largest distance among the gaps below which a gap counts as closed."""
+"""Fraction of the largest gap below which a gap counts as closed."""
 
 _GIVE = 1e-12
-"""Part of its own compliance that is added to each node's. Rows that are combinations of others
-then have a solution; the gaps change by no larger part."""
+"""Fraction by which each node's own compliance is raised, so that rows that are combinations of
+others have a solution; the gaps change by no larger fraction."""
 
 _SINGLE_PIVOTS = 20  # for each unknown, before relaxation takes over
 _SWEEPS = 2000
@@ -48,10 +48,10 @@ def unilateral(
     Args:
         delassus: (k, k) m/N, symmetric positive semidefinite, how pushes open gaps.
         gap: (k,) m, finite, without any push.
-        start: (k,) guess of who is pushed, such as the last frame's.
+        start: (k,) guess of which nodes are pushed, such as the last frame's.
 
     Returns:
-        (k,) N, push, at least zero, and (k,) who is pushed.
+        (k,) N, push, at least zero, and (k,) which nodes are pushed.
     """
     push = np.zeros(len(gap))
     active = np.array(start, dtype=np.bool_)
@@ -92,7 +92,7 @@ def solve_active(delassus, rhs, index, count, factor, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pivot(delassus, gap, push, active):
-    """What `unilateral` does: fills push (k,) and active (k,), which comes in as the guess."""
+    """The pivoting of `unilateral`: fills push (k,), and active (k,), which holds the guess."""
     k = len(gap)
     factor = np.empty((k, k))
     solution = np.empty(k)

@@ -36,26 +36,27 @@ CLOSED = 1e-9
 """A gap up to this is closed, and so is one of a node this deep in the probe, m."""
 
 _MIXED, _ROUNDS = 30, 250
-"""Rounds that mix earlier ones, and rounds in all: the rest are plain and shorter, which is
-surer."""
+"""Rounds that mix earlier ones, and rounds in all: the later ones take plain, shorter steps, which
+converge more surely."""
 
 _SHORT = 0.7  # length of a shorter step
 
 _NEAR = 0.4
-"""Part of the spacing: nodes with wider gaps are left out until the probe enters them."""
+"""Gap, over the spacing, beyond which nodes are left out until the probe enters them."""
 
 _AHEAD = 0.25
-"""Part of the spacing: open gaps wider than this wait for the next round."""
+"""Gap, over the spacing, beyond which open nodes are not solved for before the next round."""
 
 _MEMORY = 4  # how many earlier rounds are mixed
 
 _SLIDING = 1e-7
-"""Force along the surface over the contact force below which the normals are at rest."""
+"""The normals have converged when the force along the surface over the contact force is below
+this."""
 
 SKIRT = 0.25
-"""Part of the spacing by which a pushed node must be beside the probe to be let go; it grows each
-time that the node comes back. Pressed down, a node at the rim moves sideways, would come up, and
-would be under the probe again without end."""
+"""Fraction of the spacing by which a pushed node must be beside the probe to be let go; it grows
+each time that the node comes back. A node at the rim that is pressed down moves sideways; let go at
+once, it would come up, get under the probe again, and so on without end."""
 
 
 class CompliantContact:
@@ -82,8 +83,8 @@ class CompliantContact:
         self._compliance = compliance
         self.forces = np.zeros((len(rest), 3))  # (S, 3), N, of the probe on the tissue
         self.displacement = np.zeros((len(rest), 3))  # (S, 3), m; exact at `near` nodes
-        self.near = np.zeros(len(rest), dtype=bool)  # (S,), which the last press looked at
-        self.sliding_force = 0.0  # N, norm of what is left along the surface at pushed nodes
+        self.near = np.zeros(len(rest), dtype=bool)  # (S,), nodes that the last press considered
+        self.sliding_force = 0.0  # N, norm of the forces along the surface at pushed nodes
 
     def clear(self) -> None:
         """Touch nothing."""
@@ -95,7 +96,7 @@ class CompliantContact:
     def press(self, pose: Pose) -> bool:
         """Find the forces of the probe at a pose, starting from the last ones.
 
-        Only nodes near the probe are looked at; `overlooked` tells whether that was enough.
+        Only nodes near the probe are considered; `overlooked` tells whether that was enough.
 
         Returns:
             Whether all gaps are closed or open as they should be, to a nanometre.
@@ -105,7 +106,7 @@ class CompliantContact:
         return self._solve(pose)
 
     def overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
-        """Whether nodes that the last press did not look at are in the probe.
+        """Whether nodes that the last press did not consider are in the probe.
 
         Args:
             pose: of the probe.
@@ -117,7 +118,7 @@ class CompliantContact:
         return bool(entered.any())
 
     def press_again(self, pose: Pose) -> bool:
-        """As `press`, with what `overlooked` found."""
+        """As `press`, with the nodes that `overlooked` found."""
         return self._solve(pose)
 
     def _gaps(self, pose: Pose) -> NDArray[np.float64]:
@@ -289,7 +290,7 @@ def _push(block, point, gap, normal, limit, first, active, forces):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def yielded(block, active, forces, displacement):
-    """Fills displacement (k, 3) with what forces (k, 3) at active nodes do."""
+    """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
     pushed = np.flatnonzero(active)
     for i in range(len(block)):
         row = block[i]
@@ -303,7 +304,7 @@ def yielded(block, active, forces, displacement):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _check(gap, normal, active, forces):
-    """Whether gaps and normals are as they should be, and the norm of forces along the surface."""
+    """Whether gaps and normals have converged, and the norm of the forces along the surface."""
     fits = True
     load, sliding = 0.0, 0.0
     for m in range(len(gap)):
@@ -322,7 +323,7 @@ def _check(gap, normal, active, forces):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mix(active, step, points, steps, count, point):
-    """Moves point (k, 3) by its step, less what the last rounds' changes explain of it."""
+    """Anderson's mixing: moves point (k, 3) by its step less the part the last changes explain."""
     gram = np.zeros((count, count))
     weight = np.zeros(count)
     for m in range(len(active)):
@@ -333,12 +334,12 @@ def _mix(active, step, points, steps, count, point):
                     for b in range(count):
                         gram[a, b] += steps[a, m, axis] * steps[b, m, axis]
     everyone = np.arange(count)
-    share = np.zeros(count)
+    coefficient = np.zeros(count)
     if count > 0:
-        solve_active(gram, weight, everyone, count, np.empty((count, count)), share)
+        solve_active(gram, weight, everyone, count, np.empty((count, count)), coefficient)
     for m in range(len(active)):
         for axis in range(3):
             value = step[m, axis]
             for a in range(count):
-                value -= share[a] * (points[a, m, axis] + steps[a, m, axis])
+                value -= coefficient[a] * (points[a, m, axis] + steps[a, m, axis])
             point[m, axis] += value

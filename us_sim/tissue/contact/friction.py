@@ -44,10 +44,10 @@ _STILL = 2e-11
 """Sweeps go on until no node moves by more, m."""
 
 _LOCAL = 10
-"""Steps towards a node's own force, in its turn."""
+"""Steps towards a node's force when its turn comes."""
 
 _TURN = 1e-8
-"""A normal that turns by less has come to rest."""
+"""A normal that turns by less (rad) has converged."""
 
 
 class FrictionalContact(CompliantContact):
@@ -232,7 +232,7 @@ def _sweep(block, inverse, offset, normal, goal, anchored, friction, forces, sli
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _parts(vector, normal, along):
-    """The part along the normal, and the length of the rest, which fills along (3,)."""
+    """The component along the normal, and the length of the tangent part, put into along (3,)."""
     part = vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
     for axis in range(3):
         along[axis] = vector[axis] - part * normal[axis]

@@ -34,8 +34,8 @@ GAP_TOLERANCE = 1e-5
 """A node this close to the probe's surface lies on it, m."""
 
 _GRIP = 0.1
-"""Length by which a collider goes on behind, m, where a hand holds the probe. Nodes cannot slip
-past it there, and a sudden jump by more than its thickness still finds them before it."""
+"""Length by which a collider continues behind the face, m, as where a hand holds the probe. Nodes
+cannot slip past it there, and are found in it even after a jump beyond the collider's thickness."""
 
 
 def only_forward(collider: Collider, spacing: float) -> bool:
@@ -69,8 +69,8 @@ def push_out(
         pose: of the probe in the points' frame.
         points: (N, 3) m.
         spacing: m, between neighbouring points.
-        skirt: (N,) m, how far beside the probe each point still counts as under its rim, where it
-            pushes along +z only; none by default.
+        skirt: (N,) m, how far beside the probe each point still counts as under its rim, for a
+            probe that pushes along +z only; zero by default.
 
     Returns:
         (N,) m, negative inside, infinite where the probe cannot push, and (N, 3) unit directions in

@@ -36,12 +36,12 @@ def predict_forces(
         compliance: (3C, 3C) m/N of the nodes that the probe can touch.
         gap: (C,) m, to the probe where it is now; infinite where it cannot push.
         normal: (C, 3), in which it pushes.
-        held: (C, 3) N, forces that hold the touched nodes, all of which are replaced.
-        touched: (C,), before.
-        reach: m, nodes further off stay untouched.
+        held: (C, 3) N, forces that hold the touched nodes; all of them are replaced.
+        touched: (C,), which nodes were touched before.
+        reach: m, nodes with wider gaps stay untouched.
 
     Returns:
-        (C, 3) N, the change of the forces, and (C,) who is touched.
+        (C, 3) N, the change of the forces, and (C,) which nodes are touched.
     """
     near = np.flatnonzero((touched | (gap < reach)) & np.isfinite(gap))
     load = np.where(touched[:, None], held, 0.0)

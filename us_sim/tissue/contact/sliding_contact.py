@@ -24,16 +24,17 @@ from us_sim.tissue.contact.penetration import GAP_TOLERANCE, only_forward, push_
 __all__ = ["SlidingContact"]
 
 _SKIRT = 0.25
-"""Part of the spacing by which a node touched beside a small rounding must be away to be let go.
-Pressed down it moves sideways, would come up, and would be under the probe again without end."""
+"""Fraction of the spacing by which a touched node must be beside a probe of small rounding to be
+let go. Pressed down it moves sideways; let go at once, it would come up and get under the probe
+again."""
 
 _EXACT, _PROJECTIONS = 1e-9, 4
-"""Distance from the surface, m, and projections that reach it at most: where the push direction is
-not the surface's normal, one does not."""
+"""Distance from the surface, m, that projections must reach, and how many there may be: one is not
+enough where the push direction is not the surface's normal."""
 
 
 class SlidingContact:
-    """The active set of a large-deformation solver: who touches the probe, where, how hard.
+    """The active set of a large-deformation solver: which nodes touch the probe, where, how hard.
 
     Args:
         collider: the probe's shape.
@@ -68,7 +69,7 @@ class SlidingContact:
 
         Args:
             pose: of the probe.
-            retreat: m, by which all gaps are taken to be wider than they are.
+            retreat: m, added to all gaps.
             positions: m, frame ``patient``.
         """
         if self._height is not None:
@@ -82,9 +83,9 @@ class SlidingContact:
     def aim(self, pose: Pose, retreat: float, positions: NDArray[np.float64]) -> None:
         """As `look`, and fix how far the probe pushes if it does so along one direction.
 
-        At its rounding the surface that a node meets changes as the node slides, though the push is
-        not along the surface's normal: it has no energy. Fixed where nodes are now, it has one, and
-        can neither grow nor take on others, until the next aim, while that is made least.
+        At the rounding of such a probe the height of the surface changes as a node slides, though
+        the push is not along the surface's normal: such a force has no energy. With the heights
+        fixed where the nodes are now it has one, which can be minimised until the next aim.
         """
         self._height = None
         self.look(pose, retreat, positions)
@@ -103,15 +104,15 @@ class SlidingContact:
             self.look(pose, retreat, positions)
 
     def weigh(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the probe does not balance of the forces (C, 3) N that hold the nodes: (C, 3) N.
+        """(C, 3) N, the part that the probe does not balance of the holding forces (C, 3) N.
 
-        Along the normal a touched node is pushed, not pulled.
+        The probe balances pushes along the normals of touched nodes, and no pulls.
         """
         self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
         return force - np.maximum(self.push, 0.0)[:, None] * self.normal
 
     def release(self) -> None:
-        """Let go whom the probe would have to pull."""
+        """Let go the nodes that the probe would have to pull."""
         self.touched &= self.push >= 0.0
         self.push[~self.touched] = 0.0
 

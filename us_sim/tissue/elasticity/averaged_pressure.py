@@ -1,9 +1,10 @@
 """Linear tetrahedra that do not lock when nearly incompressible: pressures averaged around nodes.
 
-The equations are the neo-Hookean's of the same shares (see `us_sim.tissue.elasticity.bulk_shares`),
-linearised at rest: K u + B' p = f and B u = C p, with one pressure at each node whose surroundings
-are nearly incompressible. Kept as unknowns, the pressures couple neighbours only; eliminated, they
-leave the stiffness K + B' C^-1 B, which couples neighbours of neighbours.
+The equations are those of the neo-Hookean material with the same split of the bulk stiffness (see
+`us_sim.tissue.elasticity.volumetric_split`), linearised at rest: K u + B' p = f and B u = C p, with
+one pressure at each node whose surroundings are nearly incompressible. Kept as unknowns, the
+pressures couple neighbours only; eliminated, they leave the stiffness K + B' C^-1 B, which couples
+neighbours of neighbours.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
@@ -27,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, dia_array
 
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness, shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["AveragedPressure", "averaged_pressure"]
@@ -60,11 +61,11 @@ class AveragedPressure:
 
 def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:
     """Assemble the equations of a mesh."""
-    shares = bulk_shares(materials)
-    element = lame_stiffness(mesh, shares.element - shares.shear, shares.shear)
-    weight = shares.nodal * mesh.volumes / 4
-    # Of whatever rounding leaves of a share that ought to be zero, nothing is averaged.
-    weight[shares.nodal <= 1e-9 * shares.element] = 0.0
+    split = volumetric_split(materials)
+    element = lame_stiffness(mesh, split.element - split.shear, split.shear)
+    weight = split.nodal * mesh.volumes / 4
+    # A nodal part this small is the rounding of zero: it gets no pressure.
+    weight[split.nodal <= 1e-9 * split.element] = 0.0
     capacity: NDArray[np.float64] = np.bincount(
         mesh.tetrahedra.ravel(), np.repeat(weight, 4), len(mesh.nodes)
     ).astype(np.float64)

@@ -1,11 +1,11 @@
 """A field at the corners of sixty-four cells of a box mesh, and its gradients in their tetrahedra.
 
-The cells of a box mesh are numbered by their first node, so that what sixty-four cells need lies in
-eight runs of sixty-four nodes: it is copied, not gathered. (Numbers that have no cell, at the far
-faces, have no width and no stiffness; a tenth or so of them.) Corner 4 x + 2 y + z of a cell is
-that many nodes along x, y and z from its first. Cells are mirrored in turn along x, which here is a
-negative width. In a cell, the tetrahedra p, q, r and s at its corners 0, 6, 5 and 3 have three of
-its edges each, and t between them has half sums of the faces' diagonals.
+The cells of a box mesh are numbered by their first node, so that the corners of sixty-four cells
+are eight runs of sixty-four nodes: they are copied, not gathered. (About a tenth of the numbers, at
+the upper faces, have no cell: there width and stiffness are zero.) Corner 4 x + 2 y + z of a cell
+is that many nodes along x, y and z from its first. Cells are mirrored in turn along x, which here
+is a negative width. In a cell, the tetrahedra p, q, r and s at its corners 0, 6, 5 and 3 have three
+of its edges each, and t between them has half sums of the faces' diagonals.
 
 Buffers are rows of `LANES` numbers, one number a cell. ``grid`` (4,) holds the number of nodes from
 a cell to the next along x, y and z, and the first number beyond the last cell.
@@ -51,19 +51,19 @@ PER_WIDTH = 0
 """Row of the constants: one over the width along x (negative where mirrored), then y and z."""
 
 FIELD = 0
-"""Row of a buffer: the field, 3 corner + axis."""
+"""First row of a buffer's field, row 3 corner + axis of it."""
 
 SUMS = FIELD + 24
-"""Row of a buffer: the nodes' sums, one a corner."""
+"""First row of a buffer's nodal sums, one a corner."""
 
 PRESSURES = SUMS + 8
-"""Row of a buffer: what the nodes' sums make in the five tetrahedra."""
+"""First row of a buffer's pressures in the five tetrahedra, which the nodal sums make."""
 
 OUT = PRESSURES + 5
-"""Row of a buffer from which on is what comes out: 3 corner + axis, or 6 a corner, or less."""
+"""First row of a buffer's result: a field of 3 corner + axis, 6 rows a corner, or fewer."""
 
 ROWS = OUT + 48
-"""Rows of a buffer."""
+"""Number of rows of a buffer."""
 
 
 @njit(**INLINED)
@@ -237,7 +237,7 @@ def put_forces(p, q, r, s, t, rows, w, lanes):
 
 @njit(**INLINED)
 def put_volumes(p, q, r, s, t, w, lanes):
-    """Rows corner from OUT on: the sums of what the five tetrahedra give to each corner."""
+    """Rows corner from OUT on: the five tetrahedra's contributions to each corner, summed."""
     at_one, at_two, at_four = (p + t) + (r + s), (p + t) + (q + s), (p + t) + (q + r)
     _put_eight((p, at_one, at_two, s, at_four, r, q, t + (q + r + s)), lanes, OUT, 1, w)
 

@@ -25,9 +25,9 @@ __all__ = ["ElasticBalance"]
 class ElasticBalance:
     """Residual of each frame of a run.
 
-    It is the norm of the unbalanced elastic forces over the norm of the contact forces: without any
-    over the largest there were since rest. Inertia and damping do not count, so that it says how
-    far the tissue is from where it would come to rest, and follows from the nodes alone.
+    It is the norm of the unbalanced elastic forces over the norm of the contact forces, or, without
+    contact, over the largest such norm since rest. Inertia and damping do not count: it follows
+    from the nodes alone and says how far the tissue is from where it would come to rest.
 
     Args:
         rounding: N, norm of the forces at rest that arise when coordinates are rounded.
@@ -41,7 +41,7 @@ class ElasticBalance:
     def of(
         cls, springs: SpringNetwork, volume: VolumeTerm, nodes: NDArray[np.float64]
     ) -> ElasticBalance:
-        """For springs and volumes that are undeformed at nodes (N, 3) m."""
+        """The balance of springs and volumes that are undeformed at nodes (N, 3) m."""
         stiffness = float(np.linalg.norm(springs.stiffness))
         if len(volume.tetrahedra):
             # A tetrahedron resists as a spring of its modulus and size.
@@ -55,7 +55,7 @@ class ElasticBalance:
         return self._heaviest
 
     def forget(self) -> None:
-        """The tissue is at rest, or somewhere else: loads before count no more."""
+        """Begin anew, since the tissue was put elsewhere: earlier loads no longer count."""
         self._heaviest = 0.0
 
     def residual(
@@ -64,7 +64,7 @@ class ElasticBalance:
         touched: NDArray[np.integer],
         normal: NDArray[np.float64],
     ) -> float:
-        """Of one frame.
+        """The residual of one frame.
 
         Args:
             holding: (N, 3) N that would hold the nodes where they are, nothing at fixed ones.

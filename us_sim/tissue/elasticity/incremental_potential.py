@@ -1,4 +1,4 @@
-"""The function of which an implicit Euler step of damped springs and volumes is the minimum.
+"""The function that an implicit Euler step of damped springs and volumes minimises.
 
 A step of h from x0 with velocity v minimises, over positions x,
 
@@ -70,7 +70,7 @@ class IncrementalPotential:
 
     @property
     def viscous_part(self) -> float:
-        """Of the elastic energy that a step starts with, what `evaluate` leaves out there."""
+        """Fraction of the elastic energy at a step's start that `evaluate` does not count there."""
         return 1.0 - 1.0 / self._stiffening
 
     def begin(self, positions: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
@@ -106,7 +106,7 @@ class IncrementalPotential:
         return value, force
 
     def curvature(self, positions: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-        """J, second derivative along direction (N, 3) m, without what could make it negative."""
+        """J, second derivative along direction (N, 3) m, without terms that could be negative."""
         elastic = _spring_curvature(*self._springs, self._lengths, positions, direction)
         elastic += _volume_curvature(self._volume, positions, direction)
         inertia = float(self._inertia @ np.einsum("ij,ij->i", direction, direction))
@@ -115,8 +115,8 @@ class IncrementalPotential:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _aim(edges, rest_length, tetrahedra, rest_volume, x, stiffening, length, volume):
-    """Fills length (E,) and volume (M,) that a step from x (N, 3) draws springs and volumes to."""
-    viscous = 1.0 - 1.0 / stiffening  # rounds to nothing where nothing is viscous
+    """Fills length (E,) and volume (M,) to which a step from x (N, 3) draws springs and volumes."""
+    viscous = 1.0 - 1.0 / stiffening  # exactly zero without viscosity
     for e in range(len(edges)):
         u = x[edges[e, 1], 0] - x[edges[e, 0], 0]
         v = x[edges[e, 1], 1] - x[edges[e, 0], 1]
@@ -169,9 +169,9 @@ def _add_volume_forces(volumes, aimed_volume, x, force):
     mean[:] = 0.0
     for t in range(len(tetrahedra) if len(mean) > 0 else 0):
         volume = area_vectors(x, tetrahedra, t)[0]
-        share = 0.25 * nodal[t] * (volume - aimed_volume[t])
+        quarter = 0.25 * nodal[t] * (volume - aimed_volume[t])
         for corner in range(4):
-            mean[tetrahedra[t, corner]] += share
+            mean[tetrahedra[t, corner]] += quarter
     for i in range(len(mean)):
         energy += 0.5 * mean[i] * mean[i] * inverse_weight[i]
         mean[i] *= inverse_weight[i]
@@ -225,11 +225,11 @@ def _volume_curvature(volumes, x, direction):
         rate /= 6.0
         total += element[t] * rate * rate / rest_volume[t]
         if len(mean) > 0:
-            share = 0.25 * nodal[t] * rate
-            mean[a] += share
-            mean[b] += share
-            mean[c] += share
-            mean[d] += share
+            quarter = 0.25 * nodal[t] * rate
+            mean[a] += quarter
+            mean[b] += quarter
+            mean[c] += quarter
+            mean[d] += quarter
     for i in range(len(mean)):
         total += mean[i] * mean[i] * inverse_weight[i]
     return total

@@ -1,7 +1,7 @@
 """Rows of sixty-four numbers, one a cell or a tetrahedron, which neo-Hookean loops run along.
 
-Row r of a buffer begins at r * `LANES`. These functions are compiled into the loops that call
-them, with the row known by then.
+Row r of a buffer begins at r * `LANES`. These functions are inlined into the loops that call them,
+so that the row is a constant there.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.lanes import LANES, in_lanes, three

@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 _SAMPLES = 1024
-"""Samples of each tetrahedron, which tell a fraction of its volume to about one percent."""
+"""Samples of each tetrahedron: enough to measure a volume fraction to about one percent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def label_fractions(
     labels: NDArray[np.uint8],
     index_from_patient: NDArray[np.float64],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """How much of each tetrahedron each label fills.
+    """The volume fraction of each label in each tetrahedron.
 
     The same 1024 low-discrepancy points (Kronecker sequence of the generalised golden ratio, mapped
     to the simplex by sorting) are looked up in every tetrahedron, so that a tetrahedron smaller

@@ -1,13 +1,13 @@
 """Nearly incompressible stable neo-Hookean tissue without a matrix: energy, forces, their slope.
 
-Linear tetrahedra with the energy of `neo_hookean_point`. What `bulk_shares` gives to the nodes
-resists the average change of volume around each of them:
+Linear tetrahedra have the energy of `neo_hookean_point`. The nodal part of `volumetric_split`
+resists the average change of volume around each node:
 
     sum over tetrahedra e of V (mu/2 (|F|^2 - 3) - mu (J - 1) + element/2 (J - 1)^2)
     + 1/2 sum over nodes a of C q^2,   C = sum of c over a's e,   q = sum of c (J - 1) / C,
 
-with c = V nodal / 4, and what `neo_hookean_point` adds against being crushed. Linearised at rest it
-is the linear elasticity of the same shares.
+with c = V nodal / 4, plus the term of `neo_hookean_point` against being crushed. Linearised at rest
+it is linear elasticity with the same split.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.material import Material
@@ -30,12 +30,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["NeoHookean"]
@@ -44,9 +44,9 @@ __all__ = ["NeoHookean"]
 class NeoHookean:
     """Energy, forces and tangent of a mesh whose fields are (3, N) arrays of one dtype.
 
-    Every node has its row, fixed ones too. Arrays given must be C-contiguous and of ``dtype``.
-    In single precision forces are right to about 1e-6 of the stresses that a displacement of its
-    own rounding makes, so a residual at Poisson's ratios above 0.499 wants double precision.
+    Every node has its column, fixed ones too. Arguments must be C-contiguous and of ``dtype``.
+    In single precision the error of the forces is that of a displacement rounded to about 1e-6, so
+    a residual at Poisson's ratios above 0.499 needs double precision.
 
     Args:
         mesh: in frame ``patient``.
@@ -66,7 +66,7 @@ class NeoHookean:
         self._count = len(mesh.nodes)
         kind = TetrahedraSums if mesh.planes is None else CellSums
         self._sums: NodalSums = kind(mesh, materials, self.dtype)
-        weight = bulk_shares(materials).nodal * mesh.volumes / 4
+        weight = volumetric_split(materials).nodal * mesh.volumes / 4
         total = np.zeros(self._count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())
@@ -98,9 +98,9 @@ class NeoHookean:
     def linearise(self, displacement: NDArray, positive: bool = False) -> None:
         """Let `tangent_product` and `diagonal_blocks` be those at this displacement.
 
-        With ``positive`` the tangent has no negative eigenvalue (where no Poisson's ratio is
-        negative), as descent needs: it is the exact one wherever that has none by itself in a
-        tetrahedron, and elsewhere the stress there has less part in it.
+        With ``positive`` the tangent has no negative eigenvalue, as descent needs (unless a
+        Poisson's ratio is negative). A tetrahedron whose exact tangent has none keeps it; in the
+        others the stress counts for less.
         """
         self._require(displacement)
         loosest = np.float32(0.0 if positive else np.inf)
@@ -120,7 +120,7 @@ class NeoHookean:
     def diagonal_blocks(self) -> NDArray:
         """(6, N) N/m, the entries xx, xy, xz, yy, yz, zz of each node's block of the tangent.
 
-        The nodes' share of the bulk stiffness is counted as it is at rest.
+        The nodal part of the bulk stiffness is counted as it is at rest.
         """
         blocks = np.empty((6, self._count), dtype=self.dtype)
         self._sums.diagonal_blocks(blocks)
@@ -128,7 +128,7 @@ class NeoHookean:
         return blocks
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:
-        """The smallest J, a tetrahedron's volume over its volume at rest; NaN if one is."""
+        """The smallest J, a tetrahedron's volume over its volume at rest; NaN if any J is NaN."""
         self._require(displacement)
         return self._sums.volume_ratios(displacement)[0]
 
@@ -158,7 +158,7 @@ class NeoHookean:
 def _nodal_blocks(
     mesh: TetrahedralMesh, weight: NDArray[np.float64], total: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(6, N) N/m, the diagonal blocks at rest of the nodes' share of the bulk stiffness.
+    """(6, N) N/m, the diagonal blocks at rest of the nodal part of the bulk stiffness.
 
     Node n meets the average of each neighbour a, and its own, through s(a, n), the sum of c g over
     the tetrahedra of both, g being n's shape gradient there; its block is the sum over a of

@@ -1,7 +1,7 @@
 """Sums of a stable neo-Hookean material over the cells of a box mesh, sixty-four at a time.
 
-The copying, and what makes a cell of five tetrahedra, is in `cell_lanes`; a loop without branches
-runs over the lanes, which LLVM turns into vector instructions. The same input gives the same bytes.
+`cell_lanes` copies the nodes and divides a cell into five tetrahedra; a loop without branches runs
+over the lanes, which LLVM turns into vector instructions. The same input gives the same bytes.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.material import Material
@@ -23,7 +23,6 @@ from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from us_sim.errors import MeshError
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.cell_lanes import (
     FIELD,
     OUT,
@@ -59,16 +58,18 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     volume_slope,
 )
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["CellSums"]
 
 _SHEAR, _ELEMENT, _NODAL, _CONSTANTS = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13, PER_WIDTH + 18
-"""Rows of the constants behind the widths: of each of five tetrahedra V mu, V element and V nodal
-/ 4; and how many."""
+"""First rows of the constants behind the widths: V mu, V element and V nodal / 4 of each of the
+five tetrahedra; and the number of rows."""
 
 _K, _TANGENT = FIELD + 24, FIELD + 29
-"""Rows of what the tangent needs behind the displacement: V (p - mu); and how many."""
+"""First row of V (p - mu), which the tangent needs, behind the displacement; and the number of
+rows."""
 
 
 class CellSums(NodalSums):
@@ -89,12 +90,12 @@ class CellSums(NodalSums):
         for axis in range(3):
             rows[number, PER_WIDTH + axis] = 1 / widths[axis][cells[axis]]
         rows[number, PER_WIDTH] *= 1 - 2 * (cells.sum(axis=0) % 2)
-        shares = bulk_shares(materials)
-        rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * shares.shear).reshape(-1, 5)
-        rows[number, _ELEMENT:_NODAL] = (mesh.volumes * shares.element).reshape(-1, 5)
-        rows[number, _NODAL:] = (mesh.volumes * shares.nodal / 4).reshape(-1, 5)
+        split = volumetric_split(materials)
+        rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * split.shear).reshape(-1, 5)
+        rows[number, _ELEMENT:_NODAL] = (mesh.volumes * split.element).reshape(-1, 5)
+        rows[number, _NODAL:] = (mesh.volumes * split.nodal / 4).reshape(-1, 5)
         self._constants = in_lanes(rows).astype(dtype)
-        # Nodes from one corner of a cell to the next along x, y and z, and the last cell's number.
+        # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
         self._grid = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
         self._tangent = np.zeros((len(self._constants), _TANGENT * LANES), dtype=dtype)
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
@@ -149,7 +150,7 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
 
 @njit(**INLINED)
 def _pressure(h, shear, element, nodal):
-    """V times the slope of all energy but the shear's by J; nodal is what the nodes make of it."""
+    """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
     change = volume_change(h)
     return element * change + nodal + shear * crowding(change)[1]
 
@@ -190,7 +191,7 @@ def _energy(displacement, grid, constants, lanes):
 
 @njit(**INLINED)
 def _count(ratio, least, count):
-    """The least ratio so far, NaN if one is, and how many were not above zero."""
+    """The least ratio so far, NaN if any was, and how many were not above zero."""
     least = ratio if ratio < least or np.isnan(ratio) else least
     return least, count if ratio > 0 else count + ONE
 

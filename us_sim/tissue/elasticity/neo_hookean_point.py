@@ -7,12 +7,13 @@ logarithmic barrier):
     mu/2 (|F|^2 - 3) - mu (J - 1) + bulk/2 (J - 1)^2,    bulk = lambda + mu.
 
 It is a polynomial, so it holds for inverted tissue too, and linearised at rest it is Hooke's law.
-But it lets a tetrahedron be pressed to nothing by a finite force, as where a vein closes. So below
-a quarter of its volume (J0) a term is added that grows beyond bounds, twice continuously from zero,
+But a finite force can press a tetrahedron to nothing, as where a vein closes. So below a quarter of
+its volume (J0) a term is added that begins with two continuous derivatives and grows without bound,
 
     mu (J0 - J)^3 / (3 J0 J),
 
-and below a sixty-fourth goes on as its Taylor polynomial of second order, to hold everywhere.
+and that goes on below a sixty-fourth as its Taylor polynomial of second order, so that it is
+defined everywhere.
 
 Everything is written in h, not F, so that small strains keep all their digits in single precision.
 
@@ -62,7 +63,8 @@ LOOP: dict[str, Any] = {
 }
 """How loops are compiled: with fused multiply-adds, but NaN stays NaN."""
 
-INLINED: dict[str, Any] = {**LOOP, "forceinline": True}  # and what they call
+INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
+"""How the functions that these loops call are compiled."""
 
 ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
@@ -173,7 +175,7 @@ def energy_density(h, shear, bulk):
 
 @njit(**INLINED)
 def stress(h, shear, pressure):
-    """First Piola-Kirchhoff stress mu F + (p - mu) cof F, p being the slope of all else by J."""
+    """First Piola-Kirchhoff stress mu F + (p - mu) cof F; p is the other energy's slope by J."""
     c = cofactor_change(h)
     k = pressure - shear
     return (
@@ -217,13 +219,13 @@ def volume_slope(h, d):
 
 @njit(**INLINED)
 def bulk_slope(h, shear, element):
-    """How fast the pressure rises with J: element, and what keeps from being crushed."""
+    """How fast the pressure rises with J: element, and the term against being crushed."""
     return element + shear * crowding(volume_change(h))[2]
 
 
 @njit(**INLINED)
 def stress_rise(h, d, shear, element, k, nodal):
-    """The change of the stress for a small change d of h, and nodal one of the average pressure.
+    """The change of the stress for a small change d of h and a change nodal of the mean pressure.
 
     k is p - mu.
     """
@@ -237,7 +239,7 @@ def block(g, c, shear, bulk):
     """(xx, xy, xz, yy, yz, zz) of mu g.g I + bulk (cof F g)(cof F g)', c being cof F - I.
 
     This is how a node with the shape gradient g resists its own displacement; the rest of the
-    stress has no part in it.
+    stress does not contribute.
     """
     x = (c[0] * g[0] + c[1] * g[1] + c[2] * g[2]) + g[0]
     y = (c[3] * g[0] + c[4] * g[1] + c[5] * g[2]) + g[1]

@@ -1,6 +1,6 @@
 """Sums of a stable neo-Hookean material over the tetrahedra of any mesh, sixty-four at a time.
 
-The gathering is in `tetrahedron_lanes`; a loop without branches runs over the lanes, which LLVM
+`tetrahedron_lanes` gathers the nodes; a loop without branches runs over the lanes, which LLVM
 turns into vector instructions. The same input gives the same bytes.
 
 >>> import numpy as np
@@ -22,7 +22,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
@@ -54,15 +53,17 @@ from us_sim.tissue.elasticity.tetrahedron_lanes import (
     scatter,
     scatter_scalar,
 )
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TetrahedraSums"]
 
 _SHEAR, _ELEMENT, _NODAL, _CONSTANTS = SHAPE + 9, SHAPE + 10, SHAPE + 11, SHAPE + 12
-"""Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and how many."""
+"""Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
+number."""
 
 _GRADIENT, _K, _TANGENT = 0, 9, 10
-"""Rows of what the tangent needs: the displacement's gradient, V (p - mu); and how many."""
+"""Rows that the tangent needs: the displacement's gradient, V (p - mu); and their number."""
 
 
 class TetrahedraSums(NodalSums):
@@ -70,14 +71,14 @@ class TetrahedraSums(NodalSums):
 
     def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
         count = len(mesh.tetrahedra)
-        shares = bulk_shares(materials)
+        split = volumetric_split(materials)
         rows = np.empty((count, _CONSTANTS))
         rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
-        rows[:, _SHEAR] = mesh.volumes * shares.shear
-        rows[:, _ELEMENT] = mesh.volumes * shares.element
-        rows[:, _NODAL] = mesh.volumes * shares.nodal / 4
+        rows[:, _SHEAR] = mesh.volumes * split.shear
+        rows[:, _ELEMENT] = mesh.volumes * split.element
+        rows[:, _NODAL] = mesh.volumes * split.nodal / 4
         self._constants = in_lanes(rows).astype(dtype)
-        # Places beyond the last tetrahedron name node 0 and have no stiffness.
+        # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
         self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
         self._tangent = np.zeros((len(self._nodes), _TANGENT * LANES), dtype=dtype)
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
@@ -121,7 +122,7 @@ def _nodal_pressure(lanes, constants, w):
 
 @njit(**INLINED)
 def _pressure(h, shear, lanes, rows, w):
-    """V times the slope of all energy but the shear's by J."""
+    """V times the slope by J of all energy but the shear's."""
     change = volume_change(h)
     own = rows[_ELEMENT * LANES + w] * change + shear * crowding(change)[1]
     return own + _nodal_pressure(lanes, rows, w)

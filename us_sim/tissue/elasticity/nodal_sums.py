@@ -1,7 +1,7 @@
-"""What a neo-Hookean tissue needs of a mesh: sums over its tetrahedra, at its nodes.
+"""The interface of sums over tetrahedra, at their nodes, that a neo-Hookean tissue needs.
 
-`NeoHookean` adds what the nodes' averages make; which class does the sums follows from the mesh,
-cells of a box or any tetrahedra.
+`NeoHookean` adds the nodal averages. One class does the sums for the cells of a box mesh, another
+for any tetrahedra.
 
 >>> from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 >>> from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
@@ -24,12 +24,12 @@ __all__ = ["NodalSums"]
 class NodalSums(Protocol):
     """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
 
-    Displacements and their changes are (3, N) m. ``nodal`` is (N,), of the part of the bulk
-    stiffness that resists averages around nodes, or empty where there is none.
+    Displacements and their changes are (3, N) m. ``nodal`` is (N,) and belongs to the nodal part
+    of the bulk stiffness; it is empty where there is none.
     """
 
     def energy(self, displacement: NDArray) -> float:
-        """J, of what resists in each tetrahedron by itself."""
+        """J, of each tetrahedron by itself, without the nodal part."""
         ...
 
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
@@ -45,7 +45,7 @@ class NodalSums(Protocol):
         ...
 
     def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        """Keep what the slopes at this displacement need.
+        """Store what the slopes at this displacement need.
 
         Args:
             displacement: (3, N) m.

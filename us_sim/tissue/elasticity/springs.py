@@ -48,12 +48,12 @@ class SpringNetwork:
     stiffness: NDArray[np.float64]  # (E,), N/m
     damping: NDArray[np.float64]  # (E,), N s/m
     rest_length: NDArray[np.float64]  # (E,), m
-    # (M,), Pa, lambda and mu that those of each tetrahedron amount to; empty when of no mesh
+    # (M,), Pa, both lambda and mu of the springs of each tetrahedron; empty without a mesh
     lame_constant: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def arrays(self) -> SpringArrays:
-        """What kernels take."""
+        """The arrays that kernels take."""
         return SpringArrays(self.edges, self.stiffness, self.damping, self.rest_length)
 
     def forces(
@@ -67,7 +67,7 @@ class SpringNetwork:
         return force
 
     def without(self, fixed: NDArray[np.bool_]) -> SpringNetwork:
-        """The network without springs between two fixed nodes, which never do anything."""
+        """The network without the springs between two fixed nodes, which have no effect."""
         kept = ~fixed[self.edges].all(axis=1)
         return SpringNetwork(
             self.edges[kept],
@@ -126,8 +126,8 @@ def fitted_springs(
     Args:
         mesh, materials: of the tissue.
         damping_factor: s, damping constant over spring constant.
-        with_volume: a volume term will add what lambda lacks, so that mu is to be met. Without
-            it, and below Poisson's ratio 1/4, Young's modulus is met, with the springs' own 1/4.
+        with_volume: match mu, since a volume term will add what lambda lacks. Otherwise, and below
+            Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
     """
     ratio = np.maximum(materials.poisson_ratio, 0.25) if with_volume else 0.25
     shear = materials.young_modulus / (2 * (1 + ratio))
@@ -174,7 +174,8 @@ def _lengths(edges, nodes, length):
 def spring_forces(springs, positions, velocity, force):
     """Fills force (N, 3) with the paper's eq. (1), along each spring, on both its nodes.
 
-    Edges in the order of their first nodes are quick: that node's numbers then stay in registers.
+    It is fastest with edges in the order of their first nodes, whose numbers then stay in
+    registers.
     """
     edges, stiffness, damping, rest_length = springs
     force[:] = 0.0

@@ -1,4 +1,4 @@
-"""How long a step symplectic Euler can take, and what makes a longer one stable.
+"""The longest stable step of symplectic Euler, and what makes a longer one stable.
 
 A mode of circular frequency w, damped by b times its stiffness, is multiplied in a step of dt by a
 root of z**2 - (2 - b w**2 dt - w**2 dt**2) z + 1 - b w**2 dt. Both roots are inside the unit circle
@@ -32,7 +32,7 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["highest_frequency", "node_stiffness", "stabilised", "step_limit"]
 
 _MARGIN = 1.05
-"""Factor by which masses and sub-steps stay away from the bound on stability."""
+"""Safety factor of masses and sub-steps on Gershgorin's bound of stability."""
 
 _TOLERANCE = 1e-4  # relative, of the square of the highest frequency
 
@@ -76,8 +76,8 @@ def highest_frequency(
 def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
     """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
 
-    Of springs alone it is the sum of a node's spring constants, and holds however they turn and
-    stretch; it is about 2.7 times what the undeformed network needs, with a volume term too.
+    For springs alone it is the sum of a node's spring constants, which holds however they turn and
+    stretch. With or without a volume term it is about 2.7 times what the undeformed tissue needs.
 
     Args:
         factors: as in `highest_frequency`.
@@ -102,13 +102,13 @@ def stabilised(
 ) -> tuple[NDArray[np.float64], int, str]:
     """Masses (N,) kg and number of sub-steps that make a step stable, and what was done, in words.
 
-    Whether a step is stable, and what it needs, is judged by `node_stiffness`, so that it stays
-    stable as the tissue deforms. The limit in the words is the one of small oscillations.
+    They follow from the bound of `node_stiffness`, so that the step stays stable as the tissue
+    deforms. The limit in the words is the one of small oscillations.
 
     Args:
         model: whose lumped masses are simulated where possible.
         factors: as in `highest_frequency`.
-        time_step: s, asked for.
+        time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
         stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only says what it is.
         maximum_substeps: of one step.

@@ -1,8 +1,8 @@
-"""Tetrahedra turned inside out, which springs do not mind.
+"""Tetrahedra turned inside out, which springs do not resist.
 
 Springs know lengths and not volumes: pressed beyond the mesh's spacing, a node can pass through a
-face and then rests on the wrong side. Under the probe that is only said; once it is gone, the
-undeformed tissue is known to be the state of rest.
+face and then rests on the wrong side. Under the probe this is only reported; without a probe the
+tissue is put back to its undeformed state, which is then the state of rest.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.tangling import count_inverted
@@ -24,7 +24,7 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["Tangling", "count_inverted"]
 
 _PATIENCE = 10
-"""Frames that a released tissue is given to untangle by itself."""
+"""Frames in which a released tissue may untangle by itself."""
 
 
 class Tangling:
@@ -40,7 +40,7 @@ class Tangling:
         self._frames_free = 0
 
     def forget(self) -> None:
-        """The tissue was put somewhere else."""
+        """Begin anew, since the tissue was put elsewhere."""
         self._frames_free = 0
 
     def judge(self, positions: NDArray[np.float64], touched: bool) -> tuple[str, bool]:

@@ -1,7 +1,7 @@
 """A field at the nodes of sixty-four tetrahedra, and its gradients in them.
 
-Buffers and constants are rows of `LANES` numbers, one number a tetrahedron, and the rows have names
-here.
+Buffers and constants are rows of `LANES` numbers, one number a tetrahedron; the rows' names are
+defined here.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.lanes import LANES, in_lanes
@@ -34,19 +34,19 @@ __all__ = [
 ]
 
 SHAPE = 0
-"""Row of the constants: the gradients of the shape functions of nodes 1, 2 and 3."""
+"""First row of the constants' gradients of the shape functions of nodes 1, 2 and 3."""
 
 FIELD = 0
-"""Row of a buffer: the field, 3 b + axis at the b-th node."""
+"""First row of a buffer's field, row 3 b + axis of it at the b-th node."""
 
 SUMS = FIELD + 12
-"""Row of a buffer: the nodes' sums, one a node."""
+"""First row of a buffer's nodal sums, one a node."""
 
 OUT = SUMS + 4
-"""Row of a buffer from which on is what comes out: 3 b + axis, or 6 a node, or less."""
+"""First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer."""
 
 ROWS = OUT + 24
-"""Rows of a buffer."""
+"""Number of rows of a buffer."""
 
 
 @njit(**INLINED)

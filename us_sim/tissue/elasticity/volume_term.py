@@ -1,11 +1,11 @@
-"""What a spring network lacks: resistance of each tetrahedron to a change of its volume.
+"""The resistance of tetrahedra to a change of volume, which a spring network lacks.
 
 Springs of any arrangement that pull along the lines between their ends obey Cauchy's relations:
 as a material they have lambda = mu, which is Poisson's ratio 1/4 (M. Born and K. Huang, Dynamical
 Theory of Crystal Lattices, 1954, section 11). The missing part of lambda is added as an energy of
 volume, as M. Teschner et al., A Versatile and Robust Model for Geometrically Complex Deformable
-Solids, CGI 2004, do, here with the coefficients of elasticity and shared between tetrahedra and
-nodes as `us_sim.tissue.elasticity.bulk_shares` says.
+Solids, CGI 2004, do, here with the coefficients of elasticity and divided between tetrahedra and
+nodes by `us_sim.tissue.elasticity.volumetric_split`.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.material import Material
@@ -34,16 +34,16 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from us_sim.tissue.elasticity.bulk_shares import bulk_shares
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import SpringNetwork
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 _YIELD = 1.5
-"""Sum of a tetrahedron's squared faces over that at rest, from which on it yields."""
+"""A tetrahedron yields when the sum of its squared face areas over that at rest exceeds this."""
 
 _ROUNDING = 1e-9
-"""Part of the shear modulus below which what is left for the nodes is rounding."""
+"""Fraction of the shear modulus below which a nodal part is rounding."""
 
 __all__ = [
     "VolumeArrays",
@@ -83,19 +83,19 @@ class VolumeTerm:
     nodal: NDArray[np.float64]  # (M,), Pa, n
     node_weight: NDArray[np.float64]  # (N,), N m, C
     damping_time: float  # s, viscosity over stiffness
-    # (M,) m4, at which sum of squared derivatives of 6 times the volume a tetrahedron yields, see
-    # `volume_term`; infinite where it never does
+    # (M,) m4, the sum of squared derivatives of 6 times the volume at which a tetrahedron yields,
+    # see `volume_term`; infinite where it never does
     yield_area: NDArray[np.float64]
 
     @classmethod
     def nothing(cls, count: int) -> VolumeTerm:
-        """Of no tetrahedron, for ``count`` nodes."""
+        """The term without a tetrahedron, for ``count`` nodes."""
         none = np.zeros(0)
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
 
     @cached_property
     def arrays(self) -> VolumeArrays:
-        """What kernels take."""
+        """The arrays that kernels take."""
         inverse = np.zeros_like(self.node_weight)
         np.divide(1.0, self.node_weight, out=inverse, where=self.node_weight > 0)
         return VolumeArrays(
@@ -147,7 +147,7 @@ def volume_term(
     *,
     yielding: bool = False,
 ) -> VolumeTerm:
-    """What the network's lambda lacks to the material's.
+    """The difference between the material's lambda and the spring network's, as a volume term.
 
     Where the springs alone resist a change of volume more than the material would, that is below
     Poisson's ratio 1/4 or with springs too stiff, nothing is taken off: a negative resistance could
@@ -161,11 +161,11 @@ def volume_term(
             it does there. Its stiffness grows with the square of its faces, and so, without this,
             a mesh stretched far out of shape would need ever shorter explicit steps.
     """
-    shares = bulk_shares(materials)
-    lacking = shares.element - shares.shear - springs.lame_constant
+    split = volumetric_split(materials)
+    lacking = split.element - split.shear - springs.lame_constant
     element = np.maximum(lacking, 0.0)
-    nodal = shares.nodal + np.minimum(lacking, 0.0)
-    nodal[nodal < _ROUNDING * shares.shear] = 0.0
+    nodal = split.nodal + np.minimum(lacking, 0.0)
+    nodal[nodal < _ROUNDING * split.shear] = 0.0
     weight = np.zeros(len(mesh.nodes))
     rest_volume = np.empty(len(mesh.tetrahedra))
     _measure(mesh.tetrahedra, mesh.nodes, rest_volume)
@@ -227,7 +227,7 @@ def push_corners(tetrahedra, t, push, px, py, pz, qx, qy, qz, rx, ry, rz, force)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _yielded(yield_area, px, py, pz, qx, qy, qz, rx, ry, rz):
-    """What is left of a tetrahedron's strain, and of its stress."""
+    """The factor by which yielding reduces a tetrahedron's strain, and its stress."""
     sx, sy, sz = px + qx + rx, py + qy + ry, pz + qz + rz
     area = px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz
     area += rx * rx + ry * ry + rz * rz + sx * sx + sy * sy + sz * sz
@@ -262,11 +262,11 @@ def add_volume_forces(volumes, positions, velocity, force):
             change[t] += damping_time * rate / 6.0
         change[t] *= _yielded(yield_area[t], px, py, pz, qx, qy, qz, rx, ry, rz)
         if len(mean) > 0:
-            share = 0.25 * nodal[t] * change[t]
-            mean[a] += share
-            mean[b] += share
-            mean[c] += share
-            mean[d] += share
+            quarter = 0.25 * nodal[t] * change[t]
+            mean[a] += quarter
+            mean[b] += quarter
+            mean[c] += quarter
+            mean[d] += quarter
     for i in range(len(mean)):
         mean[i] *= inverse_weight[i]
     for t in range(len(tetrahedra)):

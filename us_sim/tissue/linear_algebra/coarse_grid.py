@@ -1,4 +1,4 @@
-"""A coarse grid over a mesh: what is smooth in a correction, solved directly.
+"""A coarse grid over a mesh, on which the smooth part of a correction is solved directly.
 
 Conjugate gradients with a local preconditioner carry a force one layer of nodes an iteration. So
 what varies slowly is solved for on a few hundred nodes of a regular grid around the mesh, between
@@ -36,18 +36,17 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 __all__ = ["CoarseGrid"]
 
 _MOST_NODES = 400
-"""Nodes at most of a grid around the bounding box: a dense product of 1,200 unknowns takes 0.2
-ms."""
+"""Most nodes of a grid around the bounding box: a dense product of 1,200 unknowns takes 0.2 ms."""
 
 _SPARSEST = 8
-"""Nodes of the mesh for each of the grid: with fewer there is nothing to gain."""
+"""Fewest nodes of the mesh for each node of the grid: with fewer there is nothing to gain."""
 
 _INDEPENDENT = 1e-7
-"""Combinations of grid functions this much softer than the grid's stiffest are not independent."""
+"""Combinations of grid functions softer than this fraction of the stiffest count as dependent."""
 
 _YIELD = 3.0
-"""How stiffly, against a touched node's own stiffness, the grid keeps off the probe: what the grid
-leaves to the local preconditioner need not be exact."""
+"""Stiffness of the grid's constraint at a touched node, over the node's own. The constraint need
+not be exact, as the local preconditioner does the rest."""
 
 
 class CoarseGrid:

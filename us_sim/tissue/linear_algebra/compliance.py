@@ -1,4 +1,4 @@
-"""How the surface that a probe can touch, and the whole tissue below it, yields to forces.
+"""The compliance of the surface that a probe can touch, and the field of each force in the tissue.
 
 >>> import numpy as np
 >>> from us_sim.tissue.linear_algebra.compliance import surface_compliance
@@ -34,22 +34,23 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["SurfaceCompliance", "surface_compliance"]
 
 _VERSION = 3
-"""Counts as part of the cache's key: raise it when the bytes change."""
+"""Part of the cache's key: raise it when the bytes change."""
 
 _DOUBLE = 4_000_000
-"""Numbers in the fields. With fewer, single precision would save no time worth its rounding."""
+"""Numbers in the fields below which they are in double precision, as single would save little
+time."""
 
 _KEPT = 12_000_000
-"""Numbers in the fields from which on making them takes a second, and keeping them pays."""
+"""Numbers in the fields from which on they are cached, as making them takes a second."""
 
 _INTEGER = 400_000_000
-"""Numbers in the fields from which on they are kept as 16-bit integers, a scale for each block of
-nodes: what is read in a frame, and not the arithmetic, takes the time then."""
+"""Numbers in the fields from which on they are 16-bit integers with a scale for each block of
+nodes, as reading them, and not the arithmetic, then takes the time."""
 
 _BLOCK = 1024  # nodes
 
 _SAMPLES = 24
-"""Forces by which the rounding of the fields is measured."""
+"""Number of forces by which the rounding error of the fields is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class SurfaceCompliance:
     fields: NDArray  # (3S, 3, F), m/N, what each force does to all free nodes; integers if scaled
     scales: NDArray[np.float32]  # (3S, 3, blocks of F), m/N, of integers; else (0, 3, 0)
     count: int  # N, nodes of the mesh
-    rounding: float  # unbalanced force that rounding leaves in a field, over the force
+    rounding: float  # unbalanced force in a field due to rounding, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; rows without force are not read."""
@@ -88,12 +89,12 @@ def surface_compliance(
 ) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
-    What takes long is kept in the user's cache folder, under a hash of mesh, materials, fixed and
-    contact nodes.
+    A result that takes long is kept in the user's cache folder, under a hash of mesh, materials,
+    fixed and contact nodes.
 
     Args:
         model: the tissue.
-        progress: told the fraction done and what is being done, where it takes a second or more.
+        progress: told the fraction done and what is being done, if it takes a second or more.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -229,7 +230,7 @@ _FORM = Form("compliance.json", _pack, _unpack)
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _add_rows(fields, rows, weights, free, displacement):
     """Adds the weighted rows of fields (R, 3, F) to displacement (N, 3) of free (F,) nodes."""
-    width = 1024  # of a piece that stays in the fastest cache
+    width = 1024  # nodes of a piece that stays in the fastest cache
     four = len(rows) // 4 * 4
     whole = np.empty((3, width))
     for begin in range(0, len(free), width):

@@ -1,9 +1,9 @@
 """Static condensation: the compliance of a few nodes, and how all others follow them.
 
 A multifrontal elimination (J. W. H. Liu, The multifrontal method for sparse matrix solution, SIAM
-Review 34, 1992) in which the kept nodes come last. What is left for them is a dense stiffness; on
-the way every part of the mesh says how it follows the nodes around it, so that the displacement of
-all nodes comes from that of the kept ones by dense products, for all loads at once.
+Review 34, 1992) in which the kept nodes come last, with a dense stiffness. Each part of the mesh,
+when eliminated, stores how it follows the nodes around it, so that the displacement of all nodes
+comes from that of the kept ones by dense products, for all loads at once.
 
 The pressures of nearly incompressible tissue are unknowns of their own. The matrix is then
 quasi-definite, and can be factored in any order without pivoting (R. J. Vanderbei, Symmetric
@@ -63,7 +63,7 @@ class _Follower:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """The compliance of K kept nodes, and what follows them."""
+    """The compliance of K kept nodes, and the parts of the mesh that follow them."""
 
     kept: NDArray[np.int32]  # (K,)
     compliance: NDArray[np.float64]  # (3K, 3K), m/N, displacement 3 k + axis of force 3 l + axis
@@ -98,9 +98,9 @@ def condense(
     Args:
         mesh: of the system.
         system: its equations.
-        fixed: (N,), nodes that stay; at least so many that the stiffness is positive definite.
+        fixed: (N,), nodes that stay; enough to make the stiffness positive definite.
         kept: (K,) nodes that are not fixed.
-        precision: of the numbers by which parts follow.
+        precision: of the numbers that say how parts follow.
         report: told the fraction of the arithmetic done.
 
     Raises:
@@ -147,7 +147,7 @@ def _follow(parts: list[_Follower], above: NDArray[np.floating]) -> Iterator[Fie
 
 
 class _Elimination:
-    """The numbers of the unknowns, and the fronts."""
+    """One elimination: the numbering of the unknowns, and the fronts."""
 
     def __init__(
         self,
@@ -235,7 +235,7 @@ class _Elimination:
         unknowns: NDArray[np.int64],
         updates: list[_Update],
     ) -> NDArray[np.float64]:
-        """The matrix of a part's own unknowns and those around, with what came from below."""
+        """The matrix of a part's own unknowns and those around, with the updates from below."""
         front = np.zeros((len(unknowns), len(unknowns)))
         position = self._position
         position[unknowns] = np.arange(len(unknowns))
@@ -251,7 +251,7 @@ class _Elimination:
 def _condense_front(
     front: NDArray[np.float64], moves: int, presses: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How the first unknowns follow the others, and what is left for those."""
+    """How the first unknowns follow the others, and the Schur complement of the others."""
     own = moves + presses
     left = front[moves:, moves:]
     half = np.empty((0, len(front) - moves))

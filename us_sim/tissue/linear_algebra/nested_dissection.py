@@ -43,8 +43,8 @@ def nested_dissection(
     Args:
         points: (N, 3) m, by whose coordinates nodes are halved.
         edges: (E, 2), which nodes couple.
-        kept: (N,), nodes that are left to the end.
-        largest: so many nodes are not halved any more.
+        kept: (N,), nodes that come last.
+        largest: number of nodes up to which a part is not halved.
     """
     count = len(points)
     both = np.concatenate([edges, edges[:, ::-1]])

@@ -36,7 +36,7 @@ Product = Callable[[NDArray[np.floating], NDArray[np.floating]], None]
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """What may not move."""
+    """The constraints of fixed and of touched nodes."""
 
     fixed: NDArray[np.integer]  # (F,), nodes that do not move at all
     touched: NDArray[np.integer]  # (K,), nodes that move along the probe's surface only
@@ -91,12 +91,12 @@ def projected_conjugate_gradients(
         constraints: what may not move.
         residual: (3, N), within the constraints; overwritten with what is left.
         solution: (3, N), overwritten.
-        iterations: at most so many products.
-        tolerance: ends when the preconditioned residual's norm has fallen to this part.
+        iterations: the most products.
+        tolerance: ends when the preconditioned residual's norm has fallen to this fraction.
 
     Returns:
         How many products were used, and whether a direction of negative curvature was met: then the
-        solution is what was found before it, or, met at once, that direction.
+        solution is the one before it, or, if it was the first direction, that direction.
     """
     search, image, conditioned = (np.zeros_like(residual) for _ in range(3))
     solution[:] = 0.0
@@ -199,8 +199,8 @@ def _dot(a, b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _renew(conditioned, share, search):
-    s = search.dtype.type(share)
+def _renew(conditioned, beta, search):
+    s = search.dtype.type(beta)
     for d in range(3):
         z = conditioned[d]
         p = search[d]

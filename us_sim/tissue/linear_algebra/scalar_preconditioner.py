@@ -1,9 +1,9 @@
-"""A constant matrix of one number per pair of nodes that stands in for a mass-spring tissue's.
+"""A constant matrix, one number per pair of nodes, that approximates a mass-spring tissue's.
 
 As in projective dynamics (T. Liu et al., Fast Simulation of Mass-Spring Systems, ACM Trans. Graph.
 32, 2013; T. Liu, S. Bouaziz and L. Kavan, Quasi-Newton Methods for Real-Time Simulation of
 Hyperelastic Materials, ACM Trans. Graph. 36, 2017), every spring and every tetrahedron counts as if
-it resisted in all three directions alike: one factor serves all of them, and for good. Nodes that
+it resisted in all three directions alike: one factor, computed once, serves all of them. Nodes that
 are confined to planes are corrected for by the compliance of the surface.
 
 >>> import numpy as np
@@ -43,7 +43,7 @@ class ScalarPreconditioner:
         diagonal: (N,) N/m.
         free: (N,), the others do not move.
         surface: (C,) free nodes that can be confined.
-        progress: told the fraction of the surface's solutions done, and what they are.
+        progress: told the fraction done of the solutions for the surface, and what they are.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class ScalarPreconditioner:
             options={"SymmetricMode": True},
         )
         self._surface = surface
-        # (C, N) m/N, what a push at each surface node moves; rounding is put right where used.
+        # (C, N) m/N, the answer to a push at each surface node; its rounding is corrected at use.
         self._response = np.zeros((len(surface), count), dtype=np.float32)
         number = np.cumsum(free) - 1
         for start in range(0, len(surface), _BLOCK):
@@ -92,7 +92,7 @@ class ScalarPreconditioner:
             self._schur = cho_factor(delassus + 1e-6 * np.diag(np.diag(delassus)))
 
     def solve(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) m that force (N, 3) N moves the nodes, keeping to the planes."""
+        """(N, 3) m, the displacement by force (N, 3) N, confined nodes staying in their planes."""
         displacement = np.zeros_like(force)
         displacement[self._free] = self._factor.solve(force[self._free])
         if len(self._touched):
@@ -104,7 +104,7 @@ class ScalarPreconditioner:
         return displacement
 
     def move(self, displacement: NDArray[np.float64], distance: NDArray[np.float64]) -> None:
-        """Add to displacement (N, 3) m what moves the confined nodes by distance (K,) m, nearly."""
+        """Add to displacement (N, 3) m one that moves confined nodes by about distance (K,) m."""
         if len(self._touched):
             push = cho_solve(self._schur, distance)[:, None] * self._normal
             displacement += self._columns @ push.astype(np.float32)

@@ -1,4 +1,4 @@
-"""What makes a tetrahedral mesh unfit to carry a deformation, said in one sentence each.
+"""Checks of tetrahedral meshes: each fault that no solver could work with, in one sentence.
 
 >>> import numpy as np
 >>> from us_sim.errors import MeshError
@@ -27,7 +27,7 @@ __all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # the six edges of a tetrahedron
 
 _FARTHEST = 1e6
-"""Coordinate beyond which no body is, m; volumes would overflow."""
+"""Largest coordinate of a body, m; beyond it volumes would overflow."""
 
 _SMALLEST_VOLUME = 1e-9
 """Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise."""
@@ -189,7 +189,7 @@ def _turn(tetrahedra: NDArray[np.integer], numbers: NDArray[np.intp]) -> NDArray
 def _check_hinges(
     tetrahedra: NDArray[np.integer], one: NDArray[np.intp], other: NDArray[np.intp]
 ) -> None:
-    """Whether what hangs together does so by faces; tetrahedra (P,) and (P,) share one each."""
+    """Whether what is connected is so by faces; the pairs (P,) and (P,) have one in common."""
     count = len(tetrahedra)
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(count, count))
     bodies, body = connected_components(graph, directed=False)

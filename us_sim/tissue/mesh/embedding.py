@@ -27,11 +27,11 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 __all__ = ["EmbeddedSurface"]
 
 _REACH = 0.5
-"""Distance that a vertex may lie outside the mesh, in longest edges of the nearest tetrahedron,
-whose deformation carries it."""
+"""Distance that a vertex may lie outside the mesh, over the longest edge of the nearest
+tetrahedron, whose deformation carries it."""
 
 _ROUNDING = 1e-6
-"""Distance from the mesh up to which a vertex is in it, m."""
+"""Distance from the mesh up to which a vertex counts as within it, m."""
 
 
 class EmbeddedSurface:

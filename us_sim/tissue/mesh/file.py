@@ -34,7 +34,7 @@ _SIZES = (1e-3, 10.0)
 """Sizes of bodies, m: a smaller or larger one is in the wrong unit."""
 
 _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
-"""What a volume mesh may hold beside tetrahedra: their corners, edges and faces."""
+"""Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces."""
 
 
 def read_mesh(

@@ -1,4 +1,4 @@
-"""Which nodes of a mesh can be held or touched: by face, by where they look, and by label.
+"""Selections of a mesh's nodes to be fixed or touched: by face, by normal, and by label.
 
 >>> from us_sim.tissue.mesh.node_selection import face_nodes
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
@@ -32,8 +32,8 @@ that the skin is the face of smallest z."""
 
 
 _MARGIN = 0.05
-"""Distance from the bounding box, over its size, up to which nodes of other meshes are on its
-face."""
+"""Distance from a bounding box's face, over the box's size, up to which nodes count as on the face;
+for meshes that are no box."""
 
 _GRAZING = 0.1
 """The cosine to -z below which a probe that comes along +z would only graze the surface."""
@@ -47,8 +47,8 @@ def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) ->
 
     Args:
         face: a name from `FACES`; ``top`` is the skin, ``sides`` are the four that stand on it.
-        margin: m, how near, for a mesh that is no box; a twentieth of its size along that axis
-            where it is not given.
+        margin: m, how near, for a mesh that is no box; by default a twentieth of its size along
+            that axis.
 
     Raises:
         MeshError: there is no such face.

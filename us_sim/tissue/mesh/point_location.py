@@ -1,4 +1,4 @@
-"""Where points lie in a tetrahedral mesh, or how far outside it.
+"""Where points lie in a tetrahedral mesh, or how far outside it they are.
 
 >>> import numpy as np
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
@@ -32,7 +32,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Points within tetrahedra; those outside the mesh are given in the nearest one."""
+    """Points in barycentric coordinates of their tetrahedron, or, outside, of the nearest."""
 
     tetrahedra: NDArray[np.int32]  # (P,)
     weights: NDArray[np.float64]  # (P, 4), barycentric, sum 1; some negative outside the mesh

@@ -1,4 +1,4 @@
-"""Mending what is wrong with a mesh where only one answer can be meant, and saying what was done.
+"""Repair of meshes, where only one answer can be meant, with a sentence on what was done.
 
 >>> import numpy as np
 >>> from us_sim.tissue.mesh.repair import repair

@@ -1,4 +1,4 @@
-"""What a scene says of the mesh of its tissue."""
+"""The settings of the tissue's mesh in a scene."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The exact linear finite element method: every frame is solved to rounding, not iterated towards.
 
-The stiffness is constant. So what a force on each node that the probe can reach does to the whole
-tissue is computed once (`us_sim.tissue.linear_algebra.compliance`); in a frame the forces are found
-there, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and the field
-is their sum.
+The stiffness is constant. So the displacement field of a unit force on each node that the probe can
+reach is computed once (`us_sim.tissue.linear_algebra.compliance`). A frame finds the forces on
+these nodes, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and
+adds up their fields.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem import Fem
@@ -39,10 +39,10 @@ from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 __all__ = ["CONTACTS", "Fem", "FemSettings"]
 
-CONTACTS = ("frictionless", "coulomb", "sticking")  # what holds between the probe and the surface
+CONTACTS = ("frictionless", "coulomb", "sticking")  # laws of friction between probe and surface
 
 _ROUNDING = 1e-5
-"""Rounding, over the force, from which on what it leaves is computed in every frame."""
+"""Rounding error of the fields, over the force, above which it is measured anew in every frame."""
 
 _EXTENSIONS = 10
 """How often nodes that were overlooked, because they were far from the probe, are added."""
@@ -70,10 +70,10 @@ class FemSettings(SolverSettings):
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
-    The residual is what rounding leaves in the stored fields and the forces along the surface where
-    the probe is curved (without friction), or by which the forces had not settled (with it). What
-    rounding leaves is as measured when the fields were made, unless that is much, as with moduli
-    far apart: then it is computed in every frame.
+    The residual is the rounding error of the stored fields, together with the forces along the
+    surface of a curved probe (without friction) or the last change of the forces (with friction).
+    The rounding error is the one measured when the fields were made, unless that is large, as with
+    moduli far apart: then it is computed in every frame.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -84,7 +84,7 @@ class Fem(TissueSolver):
     """
 
     name: ClassVar[str] = "fem"
-    farthest: ClassVar[float] = 3.0  # held as it is
+    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemSettings
 

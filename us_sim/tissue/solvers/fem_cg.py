@@ -43,7 +43,8 @@ from us_sim.tissue.solvers.solver import (
 __all__ = ["FemCg", "FemCgSettings"]
 
 _REFINEMENT = 1e-2
-"""How far the residual must fall before touched nodes that slid a little are corrected again."""
+"""Fraction to which the residual must fall before touched nodes that slid a little are
+corrected."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class FemCg(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_cg"
-    farthest: ClassVar[float] = 3.0  # held as it is
+    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemCgSettings
 
@@ -190,7 +191,9 @@ class FemCg(TissueSolver):
         unbalanced[self._touchable] -= push
         imbalance = float(np.linalg.norm(unbalanced))
         load = float(np.linalg.norm(push))
-        self._heaviest = max(self._heaviest, load) or imbalance  # taken over and not touched
+        self._heaviest = (
+            max(self._heaviest, load) or imbalance
+        )  # a state taken over without contact
         self._reference = load or self._heaviest
         residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance

@@ -1,12 +1,12 @@
 """Large deformation of nearly incompressible tissue, in real time.
 
 Quasi-static: every frame the elastic energy of `neo_hookean` is made least among the displacements
-that keep out of the probe. A frame predicts by the exact linear answer to the probe's motion (on
-the surface compliance, its contact a complementarity problem) and by what the last frame added to
-that; then Newton steps of a few conjugate-gradient iterations, held on the probe's surface, correct
-it. Motion too large for one prediction is cut into sub-steps, which may go on in later frames; no
-step is taken that turns a tetrahedron inside out, or that lowers neither the unbalanced forces nor
-the energy.
+that keep out of the probe. A frame predicts the displacement by the exact linear answer to the
+probe's motion (contact is a complementarity problem on the surface compliance) and by the last
+frame's correction to such an answer; then Newton steps of a few conjugate-gradient iterations, held
+on the probe's surface, correct it. Motion too large for one prediction is cut into sub-steps, which
+may go on in later frames; no step is taken that turns a tetrahedron inside out, or that lowers
+neither the unbalanced forces nor the energy.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
@@ -52,24 +52,25 @@ from us_sim.tissue.solvers.sub_steps import between, motion
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
 _STRIDE = 0.05
-"""Part of its smallest extent by which one prediction carries the tissue: 5 mm of 0.1 m."""
+"""Longest motion of one prediction, over the tissue's smallest extent: 5 mm for 0.1 m."""
 
 _PREDICTION = 3
-"""Iterations that take the time of a prediction."""
+"""Conjugate-gradient iterations that take as long as one prediction."""
 
 _BUDGET, _LEAST_BUDGET = 30, 12
-"""Conjugate-gradient iterations of a frame of 33 ms at 10,000 nodes, and at least of any frame."""
+"""Conjugate-gradient iterations that fit a frame of 33 ms at 10,000 nodes, and the least of any
+frame."""
 
 _NEWTON = 6
 """Iterations of one Newton step: solved further, a step after a large change overshoots."""
 
 _PASSING, _PASSABLE = 4, 0.1
-"""Iterations of a sub-step that others follow, and the residual with which they may."""
+"""Iterations of a sub-step that is not the last, and the residual at which the next may begin."""
 
 _HALVINGS = 4
 """Times that a sub-step is halved, in later frames too, before it is tried in full again."""
 
-_SHARES = (0.5, 0.0)
+_FRACTIONS = (0.5, 0.0)
 """Fractions of the prediction to try when all of it would invert tetrahedra."""
 
 _NEAR = 1e-4
@@ -124,7 +125,7 @@ class FemNonlinear(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_nonlinear"
-    farthest: ClassVar[float] = 3.0  # held as it is
+    farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemNonlinearSettings
 
@@ -162,7 +163,7 @@ class FemNonlinear(TissueSolver):
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """As if the tissue yielded to a little more force as it does at rest."""
+        """Approximate: computed with the tissue's compliance at rest."""
         contact = self._newton.contact
         pushed = np.flatnonzero(contact.push > 0.0)
         if self._pose is None or len(pushed) == 0:
@@ -186,9 +187,9 @@ class FemNonlinear(TissueSolver):
 
     def _forget(self) -> None:
         self._followed: Pose | None = None  # the pose that the tissue is at
-        self._retreat = 0.0  # m, by which it is still kept off the probe there
+        self._retreat = 0.0  # m, penetration of the probe there that the tissue has still to follow
         self._taken_over = False
-        self._halvings = 0  # of the next step, as longer ones came out inside out
+        self._halvings = 0  # of the next step, since longer ones inverted tetrahedra
         self._correction.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
@@ -246,12 +247,12 @@ class FemNonlinear(TissueSolver):
         newton.settle_on(pose, self._retreat)
 
     def _steps_to(self, pose: Pose) -> int:
-        """Into how many steps the rest of the way is cut."""
+        """The number of steps into which the rest of the motion is cut."""
         assert self._followed is not None
         if same_pose(self._followed, pose) and self._retreat == 0.0:
             return 0
-        way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
-        return max(1, math.ceil(max(way, self._retreat) / self._stride - 1e-6))
+        distance = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+        return max(1, math.ceil(max(distance, self._retreat) / self._stride - 1e-6))
 
     def _follow(self, pose: Pose) -> int:
         """Step towards the pose as far as the frame's iterations go; returns the steps taken."""
@@ -264,11 +265,12 @@ class FemNonlinear(TissueSolver):
             self._correction.forget()
         while (steps := self._steps_to(pose)) and budget > 0:
             assert self._followed is not None
-            share = 0.5**self._halvings / steps
-            target, retreat = between(self._followed, pose, share), self._retreat * (1 - share)
+            fraction = 0.5**self._halvings / steps
+            target = between(self._followed, pose, fraction)
+            retreat = self._retreat * (1 - fraction)
             good = newton.snapshot()
             effort = _Effort(_PASSING, budget - _PREDICTION, _PASSABLE)
-            if share == 1.0:
+            if fraction == 1.0:
                 effort = replace(effort, least=self._iterations, goal=self._frame_tolerance)
             used = self._attempt(target, retreat, effort, ordinary)
             budget -= _PREDICTION + abs(used)
@@ -285,7 +287,7 @@ class FemNonlinear(TissueSolver):
         return taken
 
     def _attempt(self, pose: Pose, retreat: float, effort: _Effort, ordinary: bool) -> int:
-        """One step; how many iterations it took, less than none when it came out inside out."""
+        """One step; returns its iterations, as a negative number when it inverted tetrahedra."""
         newton = self._newton
         assert self._followed is not None
         start, touched = newton.displacement.copy(), newton.contact.touched.copy()
@@ -313,19 +315,19 @@ class FemNonlinear(TissueSolver):
         start: NDArray[np.float64],
         touched: NDArray[np.bool_],
     ) -> None:
-        """Start from what is left of a prediction that turns tetrahedra inside out, or from none.
+        """Start from a fraction of a prediction that inverts tetrahedra: that of the least energy.
 
         Args:
             pose, retreat: of the step.
             start: (3, N) m, before the prediction.
-            touched: (S,), then.
+            touched: (S,), which nodes were touched then.
         """
         newton = self._newton
         least, best = newton.tissue.energy(newton.displacement), newton.snapshot()
         change = newton.displacement - start
-        for share in _SHARES:
-            newton.displacement = start + share * change
-            newton.contact.touched = touched | (newton.contact.touched & (share > 0.0))
+        for fraction in _FRACTIONS:
+            newton.displacement = start + fraction * change
+            newton.contact.touched = touched | (newton.contact.touched & (fraction > 0.0))
             newton.settle_on(pose, retreat)
             energy = newton.tissue.energy(newton.displacement)
             if energy < least:
@@ -339,7 +341,7 @@ class FemNonlinear(TissueSolver):
         self._correction.guess(np.eye(6)[0], np.eye(3)[2])
 
     def _improve(self, pose: Pose, retreat: float, effort: _Effort) -> int:
-        """Newton steps until the effort is spent; how many iterations were used."""
+        """Take Newton steps until the effort is spent; returns the iterations used."""
         newton, used = self._newton, 0
         while newton.imbalance > 0.0:
             left = effort.least - used
@@ -354,7 +356,7 @@ class FemNonlinear(TissueSolver):
         return used
 
     def _predict(self, pose: Pose, retreat: float) -> None:
-        """Fill the field with the linear answer to the probe's new pose, and say who touches it."""
+        """Fill the field with the linear answer to a new pose, and set the touched nodes."""
         newton, contact = self._newton, self._newton.contact
         before = contact.touched.copy()
         contact.aim(pose, retreat, newton.surface)
@@ -376,8 +378,8 @@ class FemNonlinear(TissueSolver):
         kept = newton.snapshot()
         if behind:
             newton.weigh_on(pose)
-            way = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
-            actions.append(f"the tissue is {1e3 * max(way, self._retreat):.2g} mm behind")
+            lag = float(np.linalg.norm(motion(self._followed, pose, self._lever)))
+            actions.append(f"the tissue is {1e3 * max(lag, self._retreat):.2g} mm behind")
         contact = newton.contact
         if newton.imbalance == 0.0 and newton.load == 0.0:
             self._heaviest = 0.0  # still at rest

@@ -34,10 +34,10 @@ from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMoti
 __all__ = ["Msds", "MsdsSettings"]
 
 _REST_TIME = 0.2
-"""Time for which motion is watched at least before the tissue counts as settled, s."""
+"""Shortest time for which motion is watched before the tissue counts as settled, s."""
 
 _NEARLY_RESTING = 1e-4
-"""Distance from its rest state at which a released, settled tissue is put there, m."""
+"""Distance from its rest state up to which a released, settled tissue is put to rest, m."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Msds(TissueSolver):
     """Point masses joined by Voigt elements (the paper's eqs. 1 to 5).
 
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
-    so either each mass is raised to what the asked step needs or each step is divided. Both follow
+    so either each mass is raised to what the step set needs or each step is divided. Both follow
     the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
     turn and stretch (`us_sim.tissue.elasticity.step_limit`).
 
@@ -181,18 +181,18 @@ class Msds(TissueSolver):
         if pose is None:
             return np.empty((0, 3, 3)), np.empty((0, 3))
         before = self._pose or self._lifted(pose)
-        way = np.arange(1, self._steps + 1)[:, None] / self._steps
-        origins = before.position + way * (pose.position - before.position)
+        fraction = np.arange(1, self._steps + 1)[:, None] / self._steps
+        origins = before.position + fraction * (pose.position - before.position)
         if np.array_equal(before.orientation, pose.orientation):
             rotations = np.repeat(pose.rotation[None], self._steps, axis=0)
         else:
             towards = pose.orientation * (1 if pose.orientation @ before.orientation >= 0 else -1)
-            turns = (1 - way) * before.orientation + way * towards
+            turns = (1 - fraction) * before.orientation + fraction * towards
             rotations = np.array([Pose(orientation=turn).rotation for turn in turns])
         return rotations, origins
 
     def _lifted(self, pose: Pose) -> Pose:
-        """Where a probe that was not there before has come from: straight up, until it is clear."""
+        """The start of a probe that was not there before: lifted straight up until it is clear."""
         gap, _ = self._gap(pose)
         depth = max(0.0, -float(gap.min(initial=0.0)))
         return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
@@ -233,7 +233,7 @@ class Msds(TissueSolver):
         return Deformation(self._positions.copy(), touched, force, torque, residual, action)
 
     def _put_back_if_tangled(self) -> str:
-        """What was done about tetrahedra turned inside out, after what was done for stability."""
+        """The action of stabilisation, followed by what was done about inverted tetrahedra."""
         words, hopeless = self._tangling.judge(self._positions, bool(self._contact.touched.any()))
         if hopeless:
             self._positions[:] = self.model.mesh.nodes

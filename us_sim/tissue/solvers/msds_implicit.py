@@ -55,14 +55,14 @@ from us_sim.tissue.solvers.spring_tissue import (
 __all__ = ["MsdsImplicit", "MsdsImplicitSettings"]
 
 _REST_TIME = 0.2
-"""Time for which motion is watched at least before the tissue counts as settled, s."""
+"""Shortest time for which motion is watched before the tissue counts as settled, s."""
 
 _NEARLY_RESTING = 1e-4
-"""Distance from its rest state at which a released, settled tissue is put there, m."""
+"""Distance from its rest state up to which a released, settled tissue is put to rest, m."""
 
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
-"""How the preconditioner weighs springs and volumes, which resist in all directions alike there:
-between what they resist to shear and to compression (found by trial)."""
+"""Weights of springs and volumes in the preconditioner, where they resist in all directions alike:
+between their resistance to shear and to compression (found by trial)."""
 
 _LEAST_INERTIA = 1e-9
 """Least inertia of a node in the preconditioner, over its own stiffness."""
@@ -208,13 +208,13 @@ class MsdsImplicit(TissueSolver):
         self._potential.begin(before, self._velocity)
         if moved and self._goes_on(pose):
             self._positions += self._time_step * self._velocity
-        given = -np.inf  # J, the most that the function was before it was lowered
+        initial = -np.inf  # J, the function's largest value before it was lowered
         for number, iterations in enumerate(self._rounds):
             self._revise(pose, moved and number == 0)
-            given = max(given, self._minimise(iterations))
+            initial = max(initial, self._minimise(iterations))
         kinetic = self._kinetic()
         self._velocity = (self._positions - before) / self._time_step
-        return self._outcome(pose, kinetic, given)
+        return self._outcome(pose, kinetic, initial)
 
     def _goes_on(self, pose: Pose | None) -> bool:
         """Whether the touched nodes, moving on as they do, come nearer to the probe's surface."""
@@ -293,7 +293,7 @@ class MsdsImplicit(TissueSolver):
         self._reference = load or self._balance.heaviest
         return start
 
-    def _outcome(self, pose: Pose | None, kinetic: float, given: float) -> Deformation:
+    def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
         words, hopeless = self._tangling.judge(self._positions, bool(contact.touched.any()))
         if hopeless:
@@ -301,9 +301,9 @@ class MsdsImplicit(TissueSolver):
             self._velocity[:] = 0.0
             self._balance.forget()
         energy, elastic = self._potential.elastic(self._positions)
-        self._limit_speed(kinetic, given, energy)
+        self._limit_speed(kinetic, initial, energy)
         elastic[self.model.fixed] = 0.0
-        # As they slid, and were moved onto planes, the probe pushes them another way now.
+        # Nodes that slid, or were moved onto planes, are now pushed in another direction.
         normal = contact.normal_at(pose, self._surface())
         loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
         pushed = contact.touched & (loaded | (contact.push > 0))
@@ -330,24 +330,24 @@ class MsdsImplicit(TissueSolver):
         )
 
     def _kinetic(self) -> float:
-        """J."""
+        """J, of the nodes' motion."""
         return 0.5 * float(self.mass @ np.einsum("ij,ij->i", self._velocity, self._velocity))
 
-    def _limit_speed(self, kinetic: float, given: float, energy: float) -> None:
+    def _limit_speed(self, kinetic: float, initial: float, energy: float) -> None:
         """Take away what an unfinished minimisation or a jump of the probe brings in as speed.
 
-        What inertia, springs and volumes had at the start, with touched nodes where the probe has
-        put them, is the value of the function there; more than that cannot be left. And a jump
-        puts nodes elsewhere but does not throw them: kinetic energy grows by no more than the
-        springs' and volumes' energy has changed.
+        The energy of inertia, springs and volumes at the start, with touched nodes where the probe
+        has put them, is the value of the function there; no more can be left at the end. And a jump
+        displaces nodes but does not throw them: kinetic energy grows by no more than the springs'
+        and volumes' energy has changed.
 
         Args:
             kinetic: J, before the frame.
-            given: J, the most that the function was before it was lowered.
+            initial: J, the function's largest value before it was lowered.
             energy: J, of springs and volumes now.
         """
-        given += self._energy * self._potential.viscous_part
-        allowed = min(given - energy, kinetic + abs(energy - self._energy))
+        initial += self._energy * self._potential.viscous_part
+        allowed = min(initial - energy, kinetic + abs(energy - self._energy))
         moving = self._kinetic()
         if moving > max(allowed, 0.0):
             self._velocity *= np.sqrt(max(allowed, 0.0) / moving)

@@ -1,4 +1,4 @@
-"""Newton's method for tissue held on the probe: one step at a time, none for the worse.
+"""Newton's method for tissue held on the probe: no step is taken that makes matters worse.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import RoundedBox
@@ -43,23 +43,23 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["Newton"]
 
 _SINGLE_CONTRAST = 1e4
-"""Young's moduli further apart than this leave nothing of the softer forces in single precision."""
+"""Ratio of Young's moduli beyond which rounding to single precision hides the softer forces."""
 
 _SINGLE_BULK = 1e3
-"""Bulk over shear modulus above which single precision leaves nothing of the shear's forces."""
+"""Bulk over shear modulus beyond which rounding to single precision hides the shear's forces."""
 
 _BACKTRACKS = 6
-"""Times that a step is halved before it is given up."""
+"""Step lengths that are tried, each half the last."""
 
 _CROWDED = 0.2
-"""With a tetrahedron pressed to this part of its volume, steps along the exact tangent overshoot;
-with none, those along one without negative eigenvalues fall short."""
+"""Volume ratio of the most compressed tetrahedron below which steps use a tangent without negative
+eigenvalues, since those of the exact tangent overshoot; above it those of the former fall short."""
 
 _FORCING = 1e-2
-"""Part to which the preconditioned residual falls in a step: the next one has the true slope
-again."""
+"""Fraction to which a step lowers the preconditioned residual. Lower is no use: the next step has a
+new tangent."""
 
-_LOCAL_SHARE = 4.0
+_LOCAL_WEIGHT = 4.0
 """Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
 stiffness at rest; 1 to 6 were tried."""
 
@@ -77,7 +77,7 @@ class _Snapshot:
 
 
 class Newton:
-    """Tissue somewhere, the forces in it, and the way to a better balance.
+    """A state of the tissue, the forces in it, and steps towards their balance.
 
     Args:
         model: with at least one movable contact node.
@@ -97,7 +97,7 @@ class Newton:
         self._grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
         # As they are at rest: the deformed ones, computed anew at each step, save no iterations.
         self._blocks: NDArray[np.floating] = self.tissue.diagonal_blocks().astype(self._dtype)
-        self._share = self._local_share()
+        self._local_scale = self._local_weight()
         shape = (3, len(mesh.nodes))
         self._solution = np.empty(shape, self._dtype)
         self._balance = np.empty(shape)
@@ -107,7 +107,7 @@ class Newton:
         self.rest()
 
     def rest(self) -> None:
-        """Undeformed, and touched nowhere."""
+        """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
         self.force = np.zeros_like(self.force)
         self.contact.clear(len(self._surface))
@@ -115,7 +115,7 @@ class Newton:
         self.load = 0.0  # N, norm of the contact forces
 
     def snapshot(self) -> _Snapshot:
-        """What `restore` needs."""
+        """A copy of the state for `restore`."""
         return _Snapshot(
             self.displacement.copy(),
             self.force.copy(),
@@ -125,7 +125,7 @@ class Newton:
         )
 
     def restore(self, snapshot: _Snapshot) -> None:
-        """Go back."""
+        """Go back to a snapshot."""
         self.displacement = snapshot.displacement.copy()
         self.force = snapshot.force.copy()
         self.contact = snapshot.contact.copy()
@@ -151,12 +151,12 @@ class Newton:
         """One Newton step with a line search.
 
         Args:
-            pose: of the probe, on which `settle_on` was called, or another step.
-            retreat: m, by which gaps are taken to be wider.
-            iterations: at most so many of the conjugate gradients.
+            pose: of the probe, the one of the last `settle_on` or step.
+            retreat: m, added to the gaps.
+            iterations: the most of the conjugate gradients.
 
         Returns:
-            How many were used, and whether the step was taken; else nothing has changed.
+            The iterations used, and whether the step was taken; if not, nothing has changed.
         """
         contact = self.contact
         contact.release()
@@ -176,7 +176,7 @@ class Newton:
             image[:, touched] -= np.einsum("kij,jk->ik", turn, change[:, touched])
 
         self._grid.touch(touched, normal, _along(blocks[:, touched], normal))
-        inverse = inverse_blocks(blocks, self._share, constraints)
+        inverse = inverse_blocks(blocks, self._local_scale, constraints)
         used, _ = projected_conjugate_gradients(
             product,
             inverse,
@@ -189,13 +189,13 @@ class Newton:
         )
         if self._search(pose, retreat, self._solution * np.float64(self.imbalance)):
             return used, True
-        # Where a released node is driven back by its neighbours' move, its own way still leads on.
+        # Where its neighbours' move drives a released node back, its own force still leads on.
         own = -self.force
         project(own, constraints)
         return used, self._search(pose, retreat, apply_blocks(inverse, own))
 
     def _search(self, pose: Pose, retreat: float, change: NDArray[np.float64]) -> bool:
-        """Move by as much of the change as lowers the imbalance or the energy."""
+        """Move by the largest fraction of the change that lowers imbalance or energy."""
         before = self.snapshot()
         inverted = energy = None
         length = 1.0
@@ -235,8 +235,8 @@ class Newton:
         self.imbalance = float(np.linalg.norm(self._balance))
         self.load = float(np.linalg.norm(np.maximum(self.contact.push, 0.0)))
 
-    def _local_share(self) -> float:
-        """What the local preconditioner weighs beside the coarse one, which needs no weight."""
+    def _local_weight(self) -> float:
+        """Weight of the local preconditioner; the coarse one beside it has weight 1."""
         none = np.zeros(0, np.int64)
         constraints = Constraints(self._fixed, none, np.zeros((0, 3)))
         inverse = inverse_blocks(self.tissue.diagonal_blocks(), 1.0, constraints)
@@ -249,7 +249,7 @@ class Newton:
             if largest == 0.0:
                 return 1.0
             vector = apply_blocks(inverse, self.tissue.tangent_product(vector / largest))
-        return _LOCAL_SHARE / largest
+        return _LOCAL_WEIGHT / largest
 
 
 def _along(blocks: NDArray[np.floating], normal: NDArray[np.float64]) -> NDArray[np.float64]:

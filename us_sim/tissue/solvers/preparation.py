@@ -48,7 +48,7 @@ class Preparation:
             return f"preparing for {time.monotonic() - self._began:.0f} s{self._progress}"
 
     def want(self, plan: Plan) -> None:
-        """Begin to make what a plan needs; what is being made for another is given up after."""
+        """Begin to make what a plan needs; what is still being made for another is then dropped."""
         with self._lock:
             self._wanted = plan
             self._outcome = None
@@ -58,7 +58,7 @@ class Preparation:
                 self._thread.start()
 
     def take(self) -> Prepared | Failed | None:
-        """What has come of the newest plan, once; None as long as nothing has."""
+        """The outcome of the newest plan, once; None until there is one."""
         with self._lock:
             outcome, self._outcome = self._outcome, None
             return outcome
@@ -79,7 +79,7 @@ class Preparation:
                 outcome = self._tissue.make(plan, self._show)
             except UsSimError as error:
                 outcome = Failed(plan, str(error))
-            except Exception as error:  # lest the thread end without a word
+            except Exception as error:  # so that the thread does not end silently
                 _logger.exception("preparing %s", plan.solver)
                 outcome = Failed(plan, f"{type(error).__name__}: {error}")
             with self._lock:

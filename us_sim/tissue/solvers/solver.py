@@ -36,10 +36,10 @@ __all__ = ["COUNT", "TOLERANCE", "SolverSettings", "TissueSolver", "create_solve
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
 TOLERANCE = Quantity("number", 1e-15, 1.0)
-"""A residual that is small enough."""
+"""The residual at which a solver stops."""
 
 _PATIENCE = 5
-"""Frames in a row that may come to nothing before the tissue is put to rest."""
+"""Frames in a row that may fail before the tissue is put to rest."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,15 @@ class SolverSettings(Settings):
 class TissueSolver(ABC):
     """Deforms one tissue, frame by frame.
 
-    A solver never returns a number that is not finite, nor nodes that flew off: should a frame come
-    out so, the last good state stays and the deformation's ``action`` says it. Should that happen
-    again and again, the tissue is put back to rest.
+    A solver never returns a number that is not finite, nor nodes that flew off: when a frame fails
+    so, the last good state stays and the deformation's ``action`` says it. After several such
+    frames in a row the tissue is put back to rest.
     """
 
     name: ClassVar[str]
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
-    """What can be set of this method. A solver is made with the model, one of these, and a callback
-    that is told the fraction of the making that is done and what that is, or None."""
+    """The class of this method's settings. A solver is made with the model, its settings, and a
+    callback that is told the fraction done and what is being made, or None."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
 
@@ -79,7 +79,7 @@ class TissueSolver(ABC):
         self.settings = settings if settings is not None else self.Settings()
         self._pose: Pose | None = None
         self._settled = True
-        self._failures = 0  # frames in a row that came to nothing
+        self._failures = 0  # frames in a row that failed
         self._reach = self.farthest * float(np.ptp(model.mesh.nodes, axis=0).max())
         self._last = self._resting()
 
@@ -104,7 +104,7 @@ class TissueSolver(ABC):
         return deformation
 
     def _recovered(self, good: TissueState) -> Deformation:
-        """What stands for a frame that came to nothing; the next one tries again."""
+        """The result in place of a frame that failed; the next one tries again."""
         action = "the frame came out not finite or far away, so the last good state was kept"
         self._failures += 1
         if self._failures < _PATIENCE:
@@ -226,8 +226,8 @@ def create_solver(
         name: one of `SOLVERS`.
         model: the tissue.
         settings: of the solver's own class.
-        progress: told the fraction of what takes long in making it that is done, and what that is.
-        values: or some of those settings by name.
+        progress: told the fraction done of what takes long in making it, and what is being made.
+        values: settings by name, instead of ``settings``.
 
     Raises:
         SolverError: no such solver or setting, a setting out of range, or a model it cannot solve.

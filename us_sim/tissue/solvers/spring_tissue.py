@@ -1,4 +1,4 @@
-"""The springs and the resistance to changes of volume that mass-spring solvers have in common."""
+"""Settings and forces that the mass-spring solvers have in common."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def spring_volume(default: bool) -> Any:
 
 @dataclass(frozen=True)
 class SpringSettings(SolverSettings):
-    """What can be set of every mass-spring solver.
+    """The settings of every mass-spring solver.
 
     Raises:
         SolverError: a value is out of range, with its name and the range.
@@ -63,7 +63,7 @@ class SpringSettings(SolverSettings):
 def spring_tissue(
     model: TissueModel, settings: SpringSettings, *, yielding: bool = False
 ) -> tuple[SpringNetwork, VolumeTerm]:
-    """The springs, without those between fixed nodes, and the volume term that settings ask for.
+    """The springs, without those between fixed nodes, and the volume term, as the settings say.
 
     Args:
         model: the tissue.

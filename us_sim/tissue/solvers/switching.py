@@ -49,9 +49,11 @@ class Plan:
     """How a tissue is to be deformed."""
 
     solver: str  # name of the method
-    compared: str = ""  # of one that runs beside it, '' for none
+    compared: str = ""  # name of a second method that runs beside it, '' for none
     settings: Mapping[str, SolverSettings] = field(default_factory=dict)  # of methods by name
-    model: Callable[[], TissueModel] | None = None  # makes one in place of that there is
+    model: Callable[[], TissueModel] | None = (
+        None  # makes a new model; None to go on with the present one
+    )
     reason: str = ""  # what was changed, for a person
 
 
@@ -72,7 +74,7 @@ class SwitchableTissue:
     Args:
         model: shared by all solvers.
         name: of the solver in use.
-        settings: of solvers by their names; of those that are not there, the defaults.
+        settings: of solvers by their names; those missing have their defaults.
 
     Raises:
         SolverError: as `create_solver`.
@@ -100,7 +102,7 @@ class SwitchableTissue:
 
     @property
     def name(self) -> str:
-        """Of the solver in use."""
+        """Name of the solver in use."""
         return self._solver.name
 
     @property
@@ -113,7 +115,7 @@ class SwitchableTissue:
         return self._solver.contact_stiffness()
 
     def make(self, plan: Plan, progress: Callable[[float, str], None] | None = None) -> Prepared:
-        """Make and compile what a plan needs and is not there yet; nothing changes by that.
+        """Make and compile the solvers of a plan that are not there yet; nothing else changes.
 
         It may be called in a thread of its own while another deforms the tissue.
 
@@ -138,7 +140,7 @@ class SwitchableTissue:
         return Prepared(plan, model, solvers)
 
     def adopt(self, prepared: Prepared) -> None:
-        """Go on with what was made, from where the tissue is."""
+        """Go on with the solvers made, from where the tissue is."""
         plan, state = prepared.plan, self._solver.state
         if prepared.model is not self._model:
             self._model, self._solvers = prepared.model, {}

@@ -1,7 +1,7 @@
 """The paper's time integration (eqs. 3 to 5) of a spring network that a moving probe enters.
 
 Forces change velocities, and the new velocities move the nodes: here a kilogram of free springs
-drifts on at the speed it was given.
+drifts on at its initial speed.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
@@ -64,7 +64,7 @@ class Contact(NamedTuple):
 
     @classmethod
     def at(cls, reachable: NDArray[np.int32]) -> Contact:
-        """Nothing is touched."""
+        """A contact in which nothing is touched."""
         count = len(reachable)
         return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
@@ -78,7 +78,7 @@ def advance_frame(springs, volumes, particles, probe, contact, time_step, subste
         volumes: their `VolumeArrays`.
         particles: `Particles`, moved here.
         probe: `ProbeMotion` of S = ``steps`` steps, or of none.
-        contact: `Contact`, filled in here as it is in the last sub-step; to its wrench is added.
+        contact: `Contact`, filled in here as of the last sub-step; its wrench is added to.
     """
     inverse_mass, positions, velocity, force = particles
     duration = time_step * steps * substeps
@@ -90,7 +90,7 @@ def advance_frame(springs, volumes, particles, probe, contact, time_step, subste
             for i in range(len(positions)):
                 for axis in range(3):
                     v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]
-                    # What runs ahead of a press decays to denormal numbers, ten times as slow.
+                    # Ahead of a press motion decays to denormal numbers, ten times as slow.
                     velocity[i, axis] = v if abs(v) > 1e-30 else 0.0
             for i in range(len(positions)):
                 for axis in range(3):

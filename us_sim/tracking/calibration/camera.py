@@ -1,4 +1,4 @@
-"""Camera calibration from photos of a board (Zhang 2000), with what the photos cannot tell.
+"""Camera calibration from photos of a board (Zhang 2000), with what the photos leave open.
 
 >>> import numpy as np
 >>> from scipy.spatial.transform import Rotation
@@ -35,8 +35,8 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 _FEWEST_VIEWS = 3
 _SMALLEST_TILT = math.radians(2.0)  # between two of the boards
-_SMALL_TILT = math.radians(10.0)  # that is to blame for what stays open
-_SMALLEST_REACH = 0.3  # of the way from the middle to the image's corners
+_SMALL_TILT = math.radians(10.0)  # below which the tilt is to blame for what stays open
+_SMALLEST_REACH = 0.3  # fraction of the distance from the middle to the image's corners
 _GOOD_REACH = 0.7
 _LARGEST_DEVIATION = 0.05  # of the focal lengths
 _GOOD_DEVIATION = 0.01
@@ -54,7 +54,7 @@ class CameraCalibration:
     camera: CameraModel
     rms: float  # pixels, root mean square distance of all corners from where they should be
     residuals: NDArray[np.float64]  # (K,) pixels, the same of each view that was used
-    used: NDArray[np.bool_]  # (N,) which of the given views; the others fit far worse
+    used: NDArray[np.bool_]  # (N,) which of the views; the others fit far worse
     deviations: NDArray[np.float64]  # (9,) standard deviations of INTRINSICS
     tilt: float  # rad, the largest angle between two boards
     reach: float  # how far the corners go from the middle (0) to the image's corners (1)
@@ -135,7 +135,7 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """What OpenCV finds."""
+    """OpenCV's solution."""
 
     rms: float
     matrix: NDArray[np.float64]  # (3, 3)

@@ -80,14 +80,14 @@ def calibrate_photos(asked: CameraSettings, progress: Progress | None = None) ->
     )
 
 
-def find_photos(given: Sequence[str]) -> list[Path]:
+def find_photos(patterns: Sequence[str]) -> list[Path]:
     """The files that are named, lie in named folders or match patterns, in natural order.
 
     Raises:
         CalibrationError: a name stands for no photo.
     """
     photos: dict[Path, None] = {}
-    for text in given:
+    for text in patterns:
         path = Path(text).expanduser()
         if path.is_file():
             photos[path] = None
@@ -104,7 +104,7 @@ def find_photos(given: Sequence[str]) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[bool, int, str]]:
-    """2.jpg before 10.jpg."""
+    """A sort key that puts 2.jpg before 10.jpg."""
     parts = re.findall(r"\d+|\D+", str(path))
     return [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
 
@@ -153,7 +153,7 @@ def _notes(
     names: Sequence[str],
     views: Sequence[BoardView],
 ) -> dict[str, object]:
-    """What the file says besides the camera; ROS' readers pass it over."""
+    """What the file says in addition to the camera; ROS' readers ignore it."""
     return {
         "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
         "residuals": {
@@ -163,6 +163,6 @@ def _notes(
         },
         "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
         "largest_tilt": found.tilt,  # rad, between two boards
-        "reach": found.reach,  # of the way from the image's middle to its corners
+        "reach": found.reach,  # fraction of the distance from the image's middle to its corners
         "note": found.note,
     }

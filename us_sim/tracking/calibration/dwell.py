@@ -1,4 +1,4 @@
-"""Where a stylus' tip stayed while the stylus was tilted: the landmarks somebody touched.
+"""Landmarks that somebody touched: places where a stylus' tip stayed while it was tilted.
 
 As Plus' landmark detection has it: whoever touches a landmark pivots about it for a second, which
 tells it from a stylus that lies on the table.

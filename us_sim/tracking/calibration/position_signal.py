@@ -119,6 +119,6 @@ def _line_through_most(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 def _ascending(
     times: NDArray[np.float64], values: NDArray[np.float64], left_out: int
 ) -> PositionSignal:
-    """Sorted by time; of samples with the same time the first."""
+    """A signal sorted by time, with the first of samples at the same time."""
     times, first = np.unique(times, return_index=True)
     return PositionSignal(times, values[first], left_out)

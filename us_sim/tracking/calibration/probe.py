@@ -152,7 +152,7 @@ class _Image:
         return matrix
 
     def moved(self, step: NDArray[np.float64], free: bool) -> _Image:
-        """Turned by step[:3] about the body's axes, moved by [3:6], pixels grown where free."""
+        """The image turned by step[:3] about the body's axes, moved by [3:6], and scaled if free."""
         first = 8 if free else 6
         return _Image(
             Rotation.from_rotvec(step[:3]).as_matrix() @ self.rotation,
@@ -211,7 +211,7 @@ class _Sightings:
         )
 
     def only(self, which: NDArray[np.bool_]) -> _Sightings:
-        """Some of them."""
+        """The sightings that a mask selects."""
         return _Sightings(
             self.pixels[which],
             self.rotations[which],

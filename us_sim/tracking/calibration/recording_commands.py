@@ -71,8 +71,8 @@ def calibrate_tip(asked: PivotSettings, _: Progress | None = None) -> str:
 def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
-    Landmarks on a probe's face, measured in the frame of its marker, give the probe's calibration
-    in the same way when inverted.
+    Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
+    calibration when inverted.
 
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.

@@ -41,7 +41,7 @@ _GAP = 5.0  # times the usual interval, between samples that nothing is interpol
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """What to add to the moving signal's stamps so that it agrees with the fixed one."""
+    """The offset to add to the moving signal's stamps so that it agrees with the fixed one."""
 
     offset: float  # s
     deviation: float  # s, its standard deviation
@@ -109,7 +109,7 @@ class _Match:
     values: NDArray[np.float64]
 
     def correlation(self, shift: float) -> float:
-        """Of the samples with the curve so much later; 0 where gaps leave too few."""
+        """Correlation of the samples with the curve moved later by a shift; 0 if too few."""
         times, values = self.times + shift, self.values
         if len(self.gaps):
             known = ~((times > self.gaps[:, :1]) & (times < self.gaps[:, 1:])).any(axis=0)
@@ -129,7 +129,7 @@ class _Match:
         return float(found.x)
 
     def without(self, block: NDArray[np.intp]) -> _Match:
-        """Less some of the samples."""
+        """The match without a block of the samples."""
         times, values = (np.delete(array, block) for array in (self.times, self.values))
         return _Match(self.curve, self.gaps, times, values)
 

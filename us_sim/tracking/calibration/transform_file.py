@@ -1,6 +1,6 @@
-"""A rigid transform in a YAML file, with what is known of how well it was found.
+"""A rigid transform in a YAML file, with the quality of its calibration.
 
-What `us-sim calibrate` writes and what a scene takes as `registration:` or `calibration:`. The
+`us-sim calibrate` writes it and a scene takes it as `registration:` or `calibration:`. The
 pose is that of the frame `from` in the frame `to`, so it turns points of `from` into points of
 `to`: a registration is from the device's frame to `patient`, a calibration from `probe` to the
 tracked body.
@@ -187,7 +187,7 @@ def _document(path: Path) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """What YAML's safe subset can hold, of arrays and NumPy's numbers."""
+    """Arrays and NumPy's numbers as types that YAML's safe subset can hold."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):

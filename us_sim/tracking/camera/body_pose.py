@@ -49,7 +49,7 @@ class BodyPose:
     covariance: NDArray[np.float64]  # (6, 6), as Measurement has it
     error: float  # pixels, root mean square over points of their distance
     deviation: float  # pixels, of a coordinate, by what is left over; at least what was assumed
-    residuals: NDArray[np.float64]  # (N, 2) pixels, of the points as they were given
+    residuals: NDArray[np.float64]  # (N, 2) pixels, of the points in their order
     misfit: float  # twice the negative log likelihood of Huber's distribution, and a constant
 
 
@@ -64,7 +64,7 @@ def body_poses(
 ) -> list[BodyPose]:
     """The pose of a body of which points are seen, and the other one that a plane may have.
 
-    A square seen from afar looks nearly the same when it is tilted the other way about its line
+    A square seen from afar looks nearly the same when it is tilted the opposite way about its line
     of sight. So both solutions of every marker (Collins and Bartoli 2014, IPPE) and the guess are
     held against all points, the best are refined, and what differs is returned.
 
@@ -159,7 +159,7 @@ def _refined(
     deviation: float,
 ) -> BodyPose | None:
     """The pose of least misfit near a first one; None where that leads behind the camera, or
-    the points leave a way to move open."""
+    the points do not determine a pose."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, position
     normal = np.empty((6, 6))

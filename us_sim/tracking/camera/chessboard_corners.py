@@ -60,7 +60,7 @@ def refined_crossing(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refine(image, corner, directions, side, gap):
-    """Gauss-Newton over the place, the mean, the contrast and the blur; whether it went."""
+    """Gauss-Newton over the place, the mean, the contrast and the blur; returns its success."""
     rows, columns = image.shape
     arm = max(2.5, _ARM * side)
     near = max(1.0, _NEAR * gap)
@@ -127,9 +127,9 @@ def _refine(image, corner, directions, side, gap):
         if not solve_definite(normal, right):
             return False
         length = math.sqrt(right[0] * right[0] + right[1] * right[1])
-        share = min(1.0, 1.0 / max(length, 1e-9))
-        corner[0] += share * right[0]
-        corner[1] += share * right[1]
+        scale = min(1.0, 1.0 / max(length, 1e-9))
+        corner[0] += scale * right[0]
+        corner[1] += scale * right[1]
         mean += right[2]
         contrast += right[3]
         width = min(3.0, max(0.3, width + max(-0.3, min(0.3, right[4]))))

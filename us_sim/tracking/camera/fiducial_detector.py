@@ -114,9 +114,9 @@ class FiducialDetector:
                 markers; the corners are still those of the whole image.
         """
         left, top, right, bottom = window or (0, 0, image.shape[1], image.shape[0])
-        # Of the part that is looked at: without this, specks of noise in a small one are tried.
-        share = max(image.shape) / max(1, right - left, bottom - top)
-        self._parameters.minMarkerPerimeterRate = _SMALLEST * share
+        # OpenCV's rate is relative to the part: in a small one it would try specks of noise.
+        ratio = max(image.shape) / max(1, right - left, bottom - top)
+        self._parameters.minMarkerPerimeterRate = _SMALLEST * ratio
         self._detector.setDetectorParameters(self._parameters)
         part = image[top:bottom, left:right]
         if reduction > 1:

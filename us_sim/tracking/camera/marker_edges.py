@@ -73,17 +73,17 @@ def _mended(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
     """The quadrilateral with one corner put where it may be.
 
     A polygon that is fitted to the outline of a slanted square may cut off a sharp tip, or follow
-    the shadow beyond it. So each corner in turn is put where it makes a parallelogram, or, lest
-    perspective mislead, beside that on the line to a neighbour.
+    the shadow beyond it. So each corner in turn is put where it makes a parallelogram, or, as
+    perspective may mislead, at the place nearest to that on the line to a neighbour.
     """
     for k in range(4):
         before, after = corners[k - 1], corners[(k + 1) % 4]
         wanted = before + after - corners[(k + 2) % 4]
         for neighbour in (before, after):
             line = corners[k] - neighbour
-            share = float((wanted - neighbour) @ line / (line @ line))
+            fraction = float((wanted - neighbour) @ line / (line @ line))
             mended = corners.copy()
-            mended[k] = neighbour + share * line
+            mended[k] = neighbour + fraction * line
             yield mended
         mended = corners.copy()
         mended[k] = wanted
@@ -92,7 +92,7 @@ def _mended(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refine(image, corners, cells, refined):
-    """Fit four edges and intersect neighbours, in rounds from wide to narrow; whether it went."""
+    """Fit four edges and intersect neighbours, from wide to narrow; returns success."""
     refined[:] = corners
     edges = np.empty((4, 3))
     widths = np.full(4, 1.0)
@@ -126,8 +126,8 @@ def _meet(ends, edges, k):
         px, py, dx, dy = _tangent(ends[before], ends[k], edges[before], x, y)
         qx, qy, ex, ey = _tangent(ends[k], ends[(k + 1) % 4], edges[k], x, y)
         cross = dx * ey - dy * ex
-        way = ((qx - px) * ey - (qy - py) * ex) / cross
-        x, y = px + way * dx, py + way * dy
+        length = ((qx - px) * ey - (qy - py) * ex) / cross
+        x, y = px + length * dx, py + length * dy
     return x, y
 
 
@@ -165,7 +165,7 @@ def _fit_edge(image, start, end, border, edge, widths, k):
     if not length > 6.0:
         return False
     tx, ty = tx / length, ty / length
-    # Corners go clockwise with y down: outwards is to the left of the way along.
+    # Corners go clockwise with y down: outwards is to the left of the edge's direction.
     nx, ny = ty, -tx
     mx, my = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
     half = 0.5 * length
@@ -221,8 +221,8 @@ def _fit_profile(place, length, reach, edge, widths, k):
     black, white = low / lows, high / highs
     edge[:] = 0.0
     width = widths[k]
-    # The bow is held to what a lens may do, and the width to what a focused one does, as if some
-    # pixels of noise said so.
+    # A weak prior, of some pixels' weight, holds the bow to what a lens may do, and the width to
+    # that of a focused one.
     noise = 0.02 * (white - black)
     bow_weight = (noise / (0.002 * length + 0.01)) ** 2
     width_weight = (noise / 1.0) ** 2

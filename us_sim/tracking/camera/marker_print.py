@@ -88,7 +88,7 @@ class PrintSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """What is black on one sheet of paper; mm from its upper left corner, x right, y down."""
+    """The print on one sheet of paper; mm from its upper left corner, x right, y down."""
 
     body: RigidBody
     paper: str
@@ -236,7 +236,7 @@ def _cell(body: RigidBody, corners: NDArray[np.float64]) -> float:
 
 
 def _cells(name: str, number: int, corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Runs of black cells of a marker whose corners (4, 2) are given, row by row."""
+    """Runs of black cells, row by row, of a marker with corners (4, 2)."""
     bits = dictionary(name).markerSize + 2
     code = np.asarray(cv2.aruco.generateImageMarker(dictionary(name), number, bits)) == 0
     runs = []

@@ -1,4 +1,4 @@
-"""What a camera sees where: the pinhole and its lens, as ROS's camera_info says them.
+"""The camera model: a pinhole and its lens, as ROS's camera_info has them.
 
 >>> import numpy as np
 >>> from us_sim.tracking.camera.model import CameraModel

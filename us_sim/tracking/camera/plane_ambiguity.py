@@ -1,4 +1,4 @@
-"""Which of a plane's two poses it is, by what all images so far say.
+"""The choice between a plane's two poses, by the evidence of all images so far.
 
 >>> import numpy as np
 >>> from us_sim.tracking.camera.body_pose import body_poses
@@ -28,7 +28,7 @@ from us_sim.tracking.camera.body_pose import BodyPose, rotation_angle
 
 __all__ = ["PlaneAmbiguity"]
 
-_FORGETTING = 0.9  # of what earlier images say, from one to the next
+_FORGETTING = 0.9  # factor of the evidence of earlier images, from one to the next
 _SURE = 12.0  # log likelihood ratio beyond which more does not count: so that it can be unlearned
 
 
@@ -39,7 +39,7 @@ class PlaneAmbiguity:
     image of a small marker may fit the wrong one better by chance.
 
     Args:
-        deviation: pixels, that poses were made with.
+        deviation: pixels, with which the poses were estimated.
     """
 
     def __init__(self, deviation: float) -> None:
@@ -63,8 +63,8 @@ class PlaneAmbiguity:
         """Learn from an image of which a pose was chosen.
 
         Returns:
-            (6, 6) its covariance, wider by how likely it is the other one: that of the mixture of
-            both about the chosen one.
+            (6, 6) its covariance, that of the mixture of both poses about the chosen one: the
+            likelier the other is, the wider.
         """
         self._evidence *= _FORGETTING
         if len(found) == 1:
@@ -74,13 +74,13 @@ class PlaneAmbiguity:
             self._evidence = -self._evidence
         evidence = self._evidence + self._ratio(pose, other)
         self._evidence = float(np.clip(evidence, -_SURE, _SURE))
-        share = 1.0 / (1.0 + np.exp(self._evidence))
+        probability = 1.0 / (1.0 + np.exp(self._evidence))
         turn = rotation_between(pose.pose.orientation, other.pose.orientation)
         apart = np.concatenate([other.pose.position - pose.pose.position, turn])
-        return np.asarray(pose.covariance + share * np.outer(apart, apart))
+        return np.asarray(pose.covariance + probability * np.outer(apart, apart))
 
     def _ratio(self, one: BodyPose, other: BodyPose) -> float:
-        """Log likelihood ratio, with the noise that the better of both leaves."""
+        """Log likelihood ratio, with the noise estimated from the better of both."""
         better = one if one.misfit <= other.misfit else other
         return 0.5 * (other.misfit - one.misfit) * (self._deviation / better.deviation) ** 2
 

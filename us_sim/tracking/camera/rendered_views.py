@@ -1,4 +1,4 @@
-"""What a camera would see of a body of markers at a known pose, pixel by pixel.
+"""Rendered images of a body of markers at a known pose, pixel by pixel.
 
 >>> import cv2, numpy as np
 >>> from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
@@ -54,17 +54,19 @@ _STEP = 0.5  # pixels that a body moves between the moments of which an exposure
 
 @dataclass(frozen=True)
 class Conditions:
-    """What comes between a body and its image."""
+    """What degrades the image of a body."""
 
     defocus: float = 0.6  # pixels, standard deviation of the lens's blur
     read_noise: float = 1.0  # grey, standard deviation of what every pixel adds
     shot_noise: float = 0.01  # grey, variance that comes with each level of light
-    gradient: float = 0.0  # share of the light that is lost from one side of the image to the other
-    occlusion: float = 0.0  # share of the body's extent in the image that a hand covers
+    gradient: float = (
+        0.0  # fraction of the light that is lost from one side of the image to the other
+    )
+    occlusion: float = 0.0  # fraction of the body's extent in the image that a hand covers
 
 
 SHARP = Conditions(defocus=0.0, read_noise=0.0, shot_noise=0.0)
-"""Only pixels and their grey levels."""
+"""An image that is only sampled to pixels and grey levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +150,11 @@ class RenderedView:
         """Poses during the exposure, so close that their sum is smooth."""
         if motion is None:
             return [pose]
-        ends = [_moved(pose, share * motion) for share in (-0.5, 0.5)]
+        ends = [_moved(pose, fraction * motion) for fraction in (-0.5, 0.5)]
         corners = self.body.corners.reshape(-1, 3)
         first, last = (self.camera.project(end.apply(corners)) for end in ends)
-        way = np.linalg.norm(last - first, axis=1)
-        longest = float(way.max()) if np.isfinite(way).all() else 0.0
+        shift = np.linalg.norm(last - first, axis=1)
+        longest = float(shift.max()) if np.isfinite(shift).all() else 0.0
         count = max(1, math.ceil(longest / _STEP))
         return [_moved(pose, ((i + 0.5) / count - 0.5) * motion) for i in range(count)]
 
@@ -192,18 +194,18 @@ class RenderedView:
         self,
         image: NDArray[np.float32],
         pose: Pose,
-        share: float,
+        fraction: float,
         random: np.random.Generator,
     ) -> None:
-        """Fingers that come from one side and reach over so much of the body's extent."""
+        """Draw fingers that come from one side and cover a fraction of the body's extent."""
         corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
         if not np.isfinite(corners).all():
             return
         angle = random.uniform(0, 2 * np.pi)
         reach = np.array([np.cos(angle), np.sin(angle)])
         across = np.array([-reach[1], reach[0]])
-        ways, widths = corners @ reach, corners @ across
-        tip = ways.min() + share * np.ptp(ways)
+        heights, widths = corners @ reach, corners @ across
+        tip = heights.min() + fraction * np.ptp(heights)
         finger = max(4.0, float(np.ptp(widths)) / 3.2)
         start = float(widths.min()) + random.uniform(-0.3, 0.3) * finger
         far = float(np.hypot(*image.shape))
@@ -225,7 +227,7 @@ class RenderedView:
                 )
 
     def _gradient(self, loss: float, random: np.random.Generator) -> NDArray[np.float32]:
-        """(rows, columns) share of the light, 1 at one side of the image."""
+        """(rows, columns) fraction of the light, 1 at one side of the image."""
         angle = random.uniform(0, 2 * np.pi)
         width, height = self.camera.width, self.camera.height
         x = (np.arange(width, dtype=np.float32) / width - 0.5) * np.float32(np.cos(angle))
@@ -344,7 +346,7 @@ def _print(image, rays, inverse, cells, black, white):
             total, inside = 0.0, 0
             for k in range(_SAMPLES):
                 for m in range(_SAMPLES):
-                    # No two samples share a line or a column, so that no slant is favoured.
+                    # No two samples lie on a line or a column, so that no slant is favoured.
                     s = (k + (m + 0.5) / _SAMPLES) / _SAMPLES
                     t = (m + (k + 0.5) / _SAMPLES) / _SAMPLES
                     across = (1 - t) * ((1 - s) * xa + s * xb) + t * ((1 - s) * xc + s * xd)
@@ -352,8 +354,8 @@ def _print(image, rays, inverse, cells, black, white):
                     if 0 <= across < columns and 0 <= along < rows:
                         inside += 1
                         total += white if cells[int(along), int(across)] else black
-            share = 1.0 / (_SAMPLES * _SAMPLES)
-            image[i, j] = share * total + (1 - share * inside) * image[i, j]
+            weight = 1.0 / (_SAMPLES * _SAMPLES)
+            image[i, j] = weight * total + (1 - weight * inside) * image[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -181,7 +181,7 @@ def _board(board: Any, dictionary: str) -> RigidBody:
 
 
 def _placed(marker: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    """Corners of a marker of which the size and the pose are given."""
+    """Corners of a marker that is described by its size and pose."""
     size = _length(marker["size"], MARKER_SIZE, f"{where}.size")
     position = marker.get("position", [0.0, 0.0, 0.0])
     if not isinstance(position, list) or len(position) != 3:

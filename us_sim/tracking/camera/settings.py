@@ -1,4 +1,4 @@
-"""What a scene says of the camera source: the body to look for, and when to believe it.
+"""The settings of the camera source in a scene: the body to look for, and when to believe it.
 
 >>> import math
 >>> from us_sim.tracking.camera.settings import CameraSettings

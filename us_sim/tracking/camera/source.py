@@ -1,4 +1,4 @@
-"""Where a body of markers is, by a camera: one image in, one measurement out.
+"""The pose of a body of markers by a camera: one image in, one measurement out.
 
 >>> import cv2, numpy as np
 >>> from us_sim.tracking.camera.model import CameraModel
@@ -142,8 +142,10 @@ class CameraSource:
         right, bottom = np.clip(np.ceil(high + margin), 0, size).astype(int).tolist()
         if right - left < _LEAST_MARGIN or bottom - top < _LEAST_MARGIN:
             return None
-        ways = corners.reshape(-1, 4, 2)
-        edge = float(np.linalg.norm(ways[:, [0, 1]] - ways[:, [1, 2]], axis=2).max(axis=1).min())
+        squares = corners.reshape(-1, 4, 2)
+        edge = float(
+            np.linalg.norm(squares[:, [0, 1]] - squares[:, [1, 2]], axis=2).max(axis=1).min()
+        )
         return (left, top, right, bottom), max(1, min(4, int(edge / _SHORTEST)))
 
     def _pose(

@@ -1,4 +1,4 @@
-"""What is in an image in place of the markers that were looked for."""
+"""A sentence on the other markers in an image that lacks the ones looked for."""
 
 from __future__ import annotations
 

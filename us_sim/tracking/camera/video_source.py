@@ -30,7 +30,7 @@ _OLDEST_S = 1.0  # a camera's own time stamp is believed up to this age
 
 
 class VideoSource:
-    """Opened and closed any number of times; one image after the other.
+    """A source of images, one after the other, that can be opened and closed any number of times.
 
     Args:
         source: a camera's number ("0"), its device ("/dev/video0"), the address of a stream, or

@@ -34,7 +34,7 @@ from us_sim.tracking.measurement import Measurement
 
 __all__ = ["ConstantVelocityKalman"]
 
-# What is not known of the first pose: how fast it moves, one standard deviation.
+# The speed of the first pose is not known: one standard deviation of it.
 _INITIAL_SPEED = 0.5  # m/s
 _INITIAL_ANGULAR_SPEED = 5.0  # rad/s
 

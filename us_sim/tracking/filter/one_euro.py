@@ -32,14 +32,14 @@ class OneEuro(PoseFilter):
     """A low-pass filter whose cutoff rises with speed (Casiez, Roussel, Vogel, CHI 2012).
 
     Position and rotation have a cutoff each, fc = minimum + coefficient · speed, with the speed
-    itself low-passed. All coordinates share it, so that a motion is filtered alike in whatever
+    itself low-passed. It is one for all coordinates, so that a motion is filtered alike in whatever
     direction it goes. The rotation is filtered on the manifold: the step towards the measured one
     is taken along the shortest turn. Speeds are differences of measured poses, as in the authors'
     first implementations: the paper's differences to the filtered pose hold the lag as well, which
     makes slow motions look fast.
 
-    Steps may vary. Of noise that grows less the covariance says nothing, since the filter does not
-    know how far it is behind: it stays the measurement's.
+    Steps may vary. The covariance stays the measurement's, though there is less noise, since the
+    filter does not know how far it is behind.
     """
 
     Settings = OneEuroSettings
@@ -63,11 +63,11 @@ class OneEuro(PoseFilter):
             self._pose = pose
         else:
             self._step = step = 1e-9 * (measurement.stamp - before.stamp)
-            share = _share(self._settings.derivative_cutoff, step)
+            alpha = _alpha(self._settings.derivative_cutoff, step)
             velocity = (pose.position - before.pose.position) / step
-            self._velocity = self._velocity + share * (velocity - self._velocity)
+            self._velocity = self._velocity + alpha * (velocity - self._velocity)
             turn = rotation_between(before.pose.orientation, pose.orientation) / step
-            self._angular_velocity = self._angular_velocity + share * (
+            self._angular_velocity = self._angular_velocity + alpha * (
                 turn - self._angular_velocity
             )
             self._pose = self._towards(pose)
@@ -77,12 +77,12 @@ class OneEuro(PoseFilter):
     def _towards(self, pose: Pose) -> Pose:
         """The filtered pose after a step towards a measured one."""
         position, orientation = self._pose.position, self._pose.orientation
-        share = _share(self._cutoff, self._step)
-        turn = _share(self._rotation_cutoff, self._step) * rotation_between(
+        alpha = _alpha(self._cutoff, self._step)
+        turn = _alpha(self._rotation_cutoff, self._step) * rotation_between(
             orientation, pose.orientation
         )
         return Pose(
-            position + share * (pose.position - position),
+            position + alpha * (pose.position - position),
             product(rotation_exp(turn), orientation),
         )
 
@@ -103,8 +103,8 @@ class OneEuro(PoseFilter):
     def lag(self) -> float:
         """s, behind a uniform motion: the filter's time constant 1 / (2 pi fc), exactly.
 
-        Exponential smoothing with share a of step T is T (1 - a) / a behind a ramp, and the
-        share that Casiez et al. (eq. 5) take makes that the time constant whatever the step is.
+        Exponential smoothing with the factor a and the step T is T (1 - a) / a behind a ramp; with
+        the factor of Casiez et al. (eq. 5) that is the time constant, whatever the step is.
         """
         return 1.0 / (2.0 * pi * self._cutoff)
 
@@ -118,12 +118,12 @@ class OneEuro(PoseFilter):
         angular = 2.0 * pi * frequency
         if not self._step:
             return atan(angular * self.lag) / angular
-        angle, kept = angular * self._step, 1.0 - _share(self._cutoff, self._step)
-        return atan2(kept * sin(angle), 1.0 - kept * cos(angle)) / angular
+        angle, memory = angular * self._step, 1.0 - _alpha(self._cutoff, self._step)
+        return atan2(memory * sin(angle), 1.0 - memory * cos(angle)) / angular
 
 
-def _share(cutoff: float, step: float) -> float:
-    """How much of the way to a new value is taken in a step (s): Casiez et al. (2012), eq. 5."""
+def _alpha(cutoff: float, step: float) -> float:
+    """The smoothing factor for a cutoff (Hz) and a step (s): Casiez et al. (2012), eq. 5."""
     return 1.0 / (1.0 + 1.0 / (2.0 * pi * cutoff * step))
 
 

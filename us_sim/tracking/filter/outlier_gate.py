@@ -1,4 +1,4 @@
-"""Which poses are not believed: those that no probe could have come to, or to so soon.
+"""The gate that refuses poses to which no probe could have come, or not so soon.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.filter.settings import GateSettings
@@ -39,9 +39,9 @@ class Verdict(Enum):
 class OutlierGate:
     """Compares each measurement with the newest believed one.
 
-    Where both have a covariance by Mahalanobis' distance (chi-square with six degrees of freedom);
-    a probe that is as fast and turns as fast as it may is just at the limit, were there no noise.
-    Else by the limits on speed, to which the settings' jumps are added: they are for the noise.
+    Where both have a covariance it compares by Mahalanobis' distance (chi-square with six degrees
+    of freedom); without noise, the fastest probe allowed would be just at the limit. Otherwise it
+    compares by the limits on speed, plus the settings' jumps for the noise.
     No filter is asked what it expects: a hand that starts to move is quicker than its filter, and
     a fit's covariance is often too small to be all that a gate allows.
 
@@ -50,7 +50,7 @@ class OutlierGate:
     as fewer were believed, one more than these is enough, since the first of all may be wrong.
 
     While measurements come and are refused, the time in which the probe may have moved is at most
-    that of so many of them: else a stream of nonsense were believed now and then.
+    that of so many of them: else a stream of nonsense would be believed now and then.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -126,11 +126,11 @@ class OutlierGate:
     def _too_fast(self, before: Measurement, measurement: Measurement, step: float) -> str:
         """Why a probe cannot have come from one pose to another in a time (s), or nothing."""
         settings, elapsed = self._settings, 1e-6 * (measurement.stamp - before.stamp)
-        way = _norm(measurement.pose.position - before.pose.position)
+        distance = _norm(measurement.pose.position - before.pose.position)
         limit = settings.jump + settings.maximum_speed * step
-        if way > limit:
+        if distance > limit:
             return (
-                f"the pose is {1e3 * way:.1f} mm from the one {elapsed:.1f} ms before, where "
+                f"the pose is {1e3 * distance:.1f} mm from the one {elapsed:.1f} ms before, where "
                 f"{1e3 * limit:.1f} mm are believed"
             )
         turn = _norm(rotation_between(before.pose.orientation, measurement.pose.orientation))
@@ -148,10 +148,10 @@ def _norm(vector: NDArray[np.float64]) -> float:
 
 
 def _chi_square_limit(confidence: float) -> float:
-    """Below it is that share of chi-square with six degrees of freedom.
+    """The quantile of chi-square with six degrees of freedom at a confidence.
 
-    The share above x is exp(-y) (1 + y + y² / 2), y = x / 2 (Abramowitz and Stegun, 26.4.21). SciPy
-    knows it too, but takes half a second to import.
+    The probability above x is exp(-y) (1 + y + y² / 2), y = x / 2 (Abramowitz and Stegun, 26.4.21).
+    SciPy has the quantile too, but takes half a second to import.
     """
     low, high = 0.0, 100.0
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Filters of poses: what each of them does.
+"""The interface of filters of poses.
 
 >>> from us_sim.tracking.filter.pose_filter import Unfiltered
 >>> Unfiltered().lag
@@ -62,7 +62,7 @@ class Unfiltered(PoseFilter):
         """Nothing is kept."""
 
     def lag_at(self, frequency: float) -> float:  # noqa: ARG002
-        """None."""
+        """s, no lag."""
         return 0.0
 
 

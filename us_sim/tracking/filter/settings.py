@@ -92,7 +92,7 @@ class KalmanSettings(Settings):
 
 @dataclass(frozen=True)
 class GateSettings(Settings):
-    """Which poses are not believed; each setting is a key of ``tracker.gate``.
+    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``.
 
     Raises:
         TrackingError: a value is out of range, with its name and the range.

@@ -32,16 +32,16 @@ _HEAVIEST, _STIFFEST = 1e5, 1e9
 """N and N/m beyond which a model is not believed."""
 
 _FADING = 0.5
-"""Part of the push at the model's pose below which all but the push along it fades."""
+"""Fraction of the push at the model's pose below which the rest of the energy fades."""
 
 _FARTHEST = 0.03
-"""m: with less stiffness than makes the push end on this way, it ends there all the same."""
+"""m: distance after which the push ends at the latest, however soft the tissue is."""
 
 _STIFFEST_SECANT = 3e3
-"""N/m: a solver that swings may seem to be stiffer than tissue can be."""
+"""N/m: beyond it the stiffness is an oscillation of the solver, not tissue."""
 
 _NEAR = 5e-4
-"""m along the push: two poses nearer tell nothing of the stiffness between them."""
+"""m along the push: poses nearer than this do not determine the stiffness between them."""
 
 
 def wrench_in_patient(
@@ -57,8 +57,8 @@ class ContactModel:
 
     With d the displacement of the probe's origin and its rotation vector about the axes of
     ``patient``, the energy is ``-wrench · d + d · stiffness d / 2``. The part of it along the push
-    is that of a spring, which ends where it would pull. The rest is bounded by what the spring
-    stored, and fades with the push, so that nothing is left without it. The wrench is the slope of
+    is that of a spring, which ends where it would pull. The rest is bounded by the energy of that
+    spring, and fades with the push, so that it is zero without one. The wrench is the slope of
     this one energy: over a closed path no work is done.
 
     Raises:
@@ -122,7 +122,7 @@ class ContactModel:
         return np.concatenate([pose.position - self.pose.position, turn])
 
     def energy_at(self, pose: Pose) -> float:
-        """J, what the tissue gives back until the probe is let go, as far as the model tells."""
+        """J, energy that the tissue returns until the probe is let go, by this model."""
         return self.answer(self.displacement(pose))[0]
 
     def wrench_at(self, pose: Pose) -> NDArray[np.float64]:
@@ -147,20 +147,20 @@ class ContactModel:
         push = force - float(slope @ d)
         if push <= 0.0:
             return 0.0, np.zeros(6)
-        share, share_slope = _share(push / force)
+        fade, fade_slope = _fade(push / force)
         pulled = wrench - stiffness @ d
-        # Never more than the spring along the push stored, or light contact would end with a kick.
+        # At most what the spring along the push stored, or light contact would end with a kick.
         most = 0.5 * force * force / spring
         part = math.tanh(-0.5 * float((wrench + pulled) @ d) / most)
         rest = most * part
-        energy = 0.5 * push * push / spring + share * rest
-        answer = (push / spring + share_slope / force * rest) * slope
-        answer += share * (1.0 - part * part) * pulled
+        energy = 0.5 * push * push / spring + fade * rest
+        answer = (push / spring + fade_slope / force * rest) * slope
+        answer += fade * (1.0 - part * part) * pulled
         return energy, answer
 
 
-def _share(push: float) -> tuple[float, float]:
-    """How much is left of the rest at a part of the push, and the slope of that."""
+def _fade(push: float) -> tuple[float, float]:
+    """The factor of the rest of the energy at a fraction of the push, and its slope."""
     x = push / _FADING
     if x >= 1.0:
         return 1.0, 0.0
@@ -168,10 +168,10 @@ def _share(push: float) -> tuple[float, float]:
 
 
 class SecantStiffness:
-    """The stiffness along the push, from how that changed between poses that came by.
+    """The stiffness along the push, by the secant between two poses.
 
-    For solvers that know none of their own. What stiffness there is across the push, or against
-    turns, cannot be told from a few poses: so none is claimed.
+    It is for solvers that know no stiffness of their own. A few poses do not determine the
+    stiffness across the push or against turns: so that is zero.
     """
 
     def __init__(self) -> None:
@@ -199,9 +199,9 @@ class SecantStiffness:
         if self._last is None:
             self._last = pose.position, force
         else:
-            way = float((pose.position - self._last[0]) @ push)
-            if abs(way) >= _NEAR:
-                spring = -float((force - self._last[1]) @ push) / way
+            distance = float((pose.position - self._last[0]) @ push)
+            if abs(distance) >= _NEAR:
+                spring = -float((force - self._last[1]) @ push) / distance
                 spring = min(max(spring, 0.0), _STIFFEST_SECANT)
                 self._spring = 0.5 * (self._spring or spring) + 0.5 * spring
                 self._last = pose.position, force

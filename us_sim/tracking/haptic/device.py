@@ -29,10 +29,10 @@ __all__ = ["HapticDevice"]
 
 
 class HapticDevice:
-    """Between a haptic arm's handle and the probe.
+    """The coupling of a haptic arm's handle and the probe.
 
-    The handle's way is scaled, its rotation is not. While the clutch is held the probe stays; then
-    it goes on from there, with the handle wherever it is.
+    The handle's translation is scaled, its rotation is not. While the clutch is held the probe
+    stays; then it goes on from there, with the handle wherever it is.
 
     Args:
         settings: the scales.
@@ -47,8 +47,8 @@ class HapticDevice:
         calibration: Pose | None = None,
     ) -> None:
         self._scale, self._force_scale = settings.scale, settings.force_scale
-        #: The handle's work over the probe's.
-        self.share = settings.force_scale / settings.scale
+        #: Work on the handle over work on the probe.
+        self.work_ratio = settings.force_scale / settings.scale
         registration, calibration = registration or Pose(), calibration or Pose()
         self._turn = registration.rotation
         #: (3,) m, from the handle's origin to the probe's, along the probe's axes.
@@ -56,7 +56,7 @@ class HapticDevice:
         self.reset()
 
     def reset(self) -> None:
-        """Forget where the clutch has moved the handle's frame to."""
+        """Forget the displacement of the handle's frame by the clutch."""
         self._offset = np.zeros(3)  # m, added to the scaled position
         self._regrip = Pose().orientation  # turns the handle in its own frame
         self._held: Pose | None = None  # where the body is kept
@@ -101,7 +101,7 @@ class HapticDevice:
             before, now: of the handle in the arm's frame.
 
         Returns:
-            (6,) m, rad: the way of its origin, and its rotation vector, axes of ``patient``.
+            (6,) m, rad: displacement of its origin, and its rotation vector, axes of ``patient``.
         """
         moved = np.empty(6)
         moved[:3] = self._turn @ (self._scale * (now.position - before.position))
@@ -116,7 +116,7 @@ class HapticDevice:
     ) -> NDArray[np.float64]:
         """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
 
-        It does the work of the wrench on the probe, times `share`: so what takes no energy there
+        Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
         takes none here.
 
         Args:
@@ -130,7 +130,7 @@ class HapticDevice:
             torque = torque + se3.cross_matrix(arm) @ force
         felt = np.empty(6)
         felt[:3] = self._force_scale * (force @ self._turn)
-        felt[3:] = self.share * (torque @ self._turn)
+        felt[3:] = self.work_ratio * (torque @ self._turn)
         return felt
 
     def direction_on_handle(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:

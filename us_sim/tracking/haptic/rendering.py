@@ -42,38 +42,38 @@ _REMEMBERED = 4096
 """Poses of the handle kept for the models that carry their stamps."""
 
 _BETWEEN = 20_000_000
-"""ns: two poses nearer in time tell where the handle was between them."""
+"""ns: between two poses nearer in time than this the handle's pose is interpolated."""
 
 _RESTART = 1_000_000_000
 """ns: a stamp that jumps back by more is a restarted device, not a late pose."""
 
 _LEVER = 0.05
-"""m: a turn of the handle by an angle counts as a way of this much times it."""
+"""m: a turn of the handle by an angle counts as a displacement of this lever times the angle."""
 
 _SMOOTHED = 5
-"""Ticks over which the handle's way is averaged to tell the next one's."""
+"""Ticks over which the handle's displacement is averaged to predict the next tick's."""
 
 _RESERVE = 10
-"""Ticks at the present speed for which there is energy left, below which less is given back."""
+"""Ticks for which the energy left must last: one tick returns at most an equal part of it."""
 
 _STORED = 2.0
-"""How much more energy than its model's the tissue may have stored: nothing beyond is given back,
-so that what was lost on the way does not come back as a kick."""
+"""Energy returned to the handle at most, over what the model says the tissue has stored, so that
+energy that was lost meanwhile does not come back as a kick."""
 
 _DAMPING = 10.0
-"""N s/m, the most with which energy given away by mistake is taken back."""
+"""N s/m, the strongest damping by which energy returned in excess is taken back."""
 
 
 class HapticRendering:
-    """Evaluates the newest model of the contact at the newest pose, and gives no energy away.
+    """Evaluates the newest model of the contact at the newest pose, and adds no energy.
 
-    Each model is tied to the pose of the handle from which it was made, by its stamp, so it does
-    not matter what the tracker did in between. From one model to the next what is felt goes on
-    without a step. The work done by the wrench on the handle is added up (the passivity observer of
-    B. Hannaford and J.-H. Ryu, Time-domain passivity control of haptic interfaces, IEEE Trans.
-    Robotics and Automation 18, 2002); as soon as the handle would get more than it has given since
-    contact began, the force along its way is taken off (their controller, for the next tick as in
-    J.-H. Ryu, C. Preusche, B. Hannaford and G. Hirzinger, Time domain passivity control with
+    Each model is tied by its stamp to the pose of the handle from which it was made, so it does not
+    matter what the tracker did in between. From one model to the next the wrench goes on without a
+    step. The work done by the wrench on the handle is added up (the passivity observer of B.
+    Hannaford and J.-H. Ryu, Time-domain passivity control of haptic interfaces, IEEE Trans.
+    Robotics and Automation 18, 2002); as soon as the handle would get more than it has put in since
+    contact began, the force along its motion is taken off (their controller, for the next tick as
+    in J.-H. Ryu, C. Preusche, B. Hannaford and G. Hirzinger, Time domain passivity control with
     reference energy following, IEEE Trans. Control Systems Technology 13, 2005).
 
     After any doubt the wrench is zero, until a model comes that is newer, and then grows slowly.
@@ -101,14 +101,17 @@ class HapticRendering:
         self._pose_time: int | None = None
         self._model: ContactModel | None = None
         self._model_time = 0
-        self._not_before: int | None = None  # ns, that the next model's stamp must be after
+        self._not_before: int | None = None  # ns, the next model's stamp must be later
         self._anchor = Pose()  # of the handle, when the model was made
         self._begun: int | None = None  # ns, when the ramp began
-        self._left_over, self._since = np.zeros(6), 0  # of the models before, and from when on, ns
+        self._left_over, self._since = (
+            np.zeros(6),
+            0,
+        )  # wrench of earlier models, and since when, ns
         self._felt = np.zeros(6)
-        self._way = np.zeros(6)  # of the handle since the last tick
-        self._ways: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
-        #: J, taken from the handle since contact began, less what it was given.
+        self._motion = np.zeros(6)  # m, rad, of the handle since the last tick
+        self._motions: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
+        #: J, work done by the handle since contact began, less work done on it.
         self.energy = 0.0
         #: Why nothing is felt; '' while something may be.
         self.doubt = "no pose of the handle yet"
@@ -130,11 +133,11 @@ class HapticRendering:
         self._arrived_model.append((model, now))
 
     def clutch(self, held: bool) -> None:
-        """While the clutch is held nothing is felt."""
+        """Take the state of the clutch: while it is held nothing is felt."""
         self._is_clutched = held
 
     def distrust(self, why: str) -> None:
-        """What came in cannot be used."""
+        """Stop, for a reason, because input cannot be used."""
         self._distrusted.append(why)
 
     def render(self, now: int) -> NDArray[np.float64]:
@@ -144,10 +147,10 @@ class HapticRendering:
             now: ns, of the clock of `pose` and `model`.
         """
         doubt = self._take_poses(now)
-        self.energy -= float(self._felt @ self._way)
-        self._ways.append(self._way)
+        self.energy -= float(self._felt @ self._motion)
+        self._motions.append(self._motion)
         if doubt:
-            # Only what is found from here on is believed.
+            # Only models of poses from here on are believed.
             self._not_before = self._stamps[-1] if self._stamps else None
             return self._doubted(doubt)
         doubt = self._take_model(now)
@@ -167,15 +170,15 @@ class HapticRendering:
         felt = self._limited(self._unilateral(felt))
         felt *= min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
         if self.energy > 0.0:
-            most = max(_STORED * self._device.share * stored, 0.0) if wrench.any() else 0.0
+            most = max(_STORED * self._device.work_ratio * stored, 0.0) if wrench.any() else 0.0
             self.energy = min(self.energy, most)
         self._felt = self._passive(felt)
         return self._felt.copy()
 
     def _take_poses(self, now: int) -> str:
-        """Take what arrived; a doubt about the handle, if any."""
+        """Take the poses that arrived; returns a doubt about the handle, or an empty text."""
         doubt = self._distrusted.popleft() if self._distrusted else ""
-        self._way = np.zeros(6)
+        self._motion = np.zeros(6)
         while self._arrived:
             stamp, pose, time = self._arrived.popleft()
             step = stamp - self._stamps[-1] if self._stamps else 1
@@ -186,14 +189,14 @@ class HapticRendering:
             elif step <= 0:
                 continue  # repeated or late: the handle is where the newest says
             if self._poses:
-                way = _way(self._poses[-1], pose)
-                far, turn = _lengths(way)
-                if far > self._settings.jump:
-                    doubt = f"the handle has jumped by {1e3 * far:.1f} mm"
+                motion = _motion(self._poses[-1], pose)
+                distance, turn = _lengths(motion)
+                if distance > self._settings.jump:
+                    doubt = f"the handle has jumped by {1e3 * distance:.1f} mm"
                 elif turn > self._settings.rotation_jump:
                     doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
                 else:
-                    self._way = self._way + way
+                    self._motion = self._motion + motion
             self._stamps.append(stamp)
             self._poses.append(pose)
             self._pose_time = time
@@ -208,7 +211,7 @@ class HapticRendering:
         return "the clutch is held" if self._is_clutched else ""
 
     def _take_model(self, now: int) -> str:
-        """Take the newest model, if it belongs to a pose; a doubt about what there is, if any."""
+        """Take the newest model if it belongs to a pose; returns a doubt, or an empty text."""
         if self._arrived_model:
             self._adopt(*self._arrived_model.popleft())
         if self._model is None:
@@ -218,7 +221,7 @@ class HapticRendering:
         return ""
 
     def _adopt(self, model: ContactModel, time: int) -> None:
-        """Go over to a newer model, if it is known where the handle was."""
+        """Change to a newer model, if it is known where the handle was."""
         stamp = model.stamp - self._time_offset
         if self._not_before is not None and stamp <= self._not_before:
             return
@@ -227,7 +230,7 @@ class HapticRendering:
             return
         before = self._model
         if before is not None and not self.doubt:
-            # What is felt now goes over into the new model's.
+            # The wrench felt now fades into the new model's.
             handle = self._poses[-1]
             _, old = before.answer(self._device.probe_moved(before.pose, self._anchor, handle))
             _, new = model.answer(self._device.probe_moved(model.pose, anchor, handle))
@@ -246,20 +249,20 @@ class HapticRendering:
         if place == 0 or self._stamps[place] - self._stamps[place - 1] > _BETWEEN:
             return None
         first, second = self._stamps[place - 1], self._stamps[place]
-        share = (stamp - first) / (second - first)
-        return se3.interpolate(self._poses[place - 1], self._poses[place], share)
+        fraction = (stamp - first) / (second - first)
+        return se3.interpolate(self._poses[place - 1], self._poses[place], fraction)
 
     def _far(self, moved: NDArray[np.float64]) -> str:
-        """A doubt about a model made elsewhere, so far away (6,) m, rad."""
-        far, turn = _lengths(moved)
-        if far > self._settings.model_reach:
-            return f"the probe is {1e3 * far:.1f} mm from where the contact is known"
+        """A doubt about a model made at a displacement (6,) m, rad, or an empty text."""
+        distance, turn = _lengths(moved)
+        if distance > self._settings.model_reach:
+            return f"the probe is {1e3 * distance:.1f} mm from where the contact is known"
         if turn > self._settings.model_rotation_reach:
             return f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
         return ""
 
     def _doubted(self, doubt: str) -> NDArray[np.float64]:
-        """Zero, and begin anew with the next model."""
+        """Return a wrench of zero, and begin anew with the next model."""
         if not self.doubt:
             self.stopped = doubt
             self.stops += 1
@@ -268,14 +271,14 @@ class HapticRendering:
         self._model = None
         self._left_over, self._since = np.zeros(6), 0
         self._felt = np.zeros(6)
-        self._ways.clear()
-        self.energy = min(self.energy, 0.0)  # what was given away is still owed
+        self._motions.clear()
+        self.energy = min(self.energy, 0.0)  # energy returned in excess is still owed
         return np.zeros(6)
 
     def _left(self, now: int) -> NDArray[np.float64]:
-        """(6,), what is still felt of the models before."""
-        share = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
-        return self._left_over * min(max(share, 0.0), 1.0)
+        """(6,) N, N m, what is still felt of earlier models."""
+        fraction = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
+        return self._left_over * min(max(fraction, 0.0), 1.0)
 
     def _unilateral(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
         """The wrench, less a force that would pull the handle against the tissue's push."""
@@ -287,7 +290,7 @@ class HapticRendering:
         return felt
 
     def _limited(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
-        """At most what the arm may give."""
+        """The wrench within the limits of the arm."""
         force, torque = _lengths(felt)
         if force > self._settings.force_limit:
             felt[:3] *= self._settings.force_limit / force
@@ -296,30 +299,30 @@ class HapticRendering:
         return felt
 
     def _passive(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The wrench, less what along the handle's way would give more than there is."""
-        way = sum(self._ways) / len(self._ways)
-        given = float(felt @ way)
+        """The wrench, less the part along the motion that would return too much energy."""
+        motion = sum(self._motions) / len(self._motions)
+        work = float(felt @ motion)
         left = self.energy
         allowed = left / _RESERVE if left > 0.0 else left
-        if given <= allowed:
+        if work <= allowed:
             return felt
-        direction = way * self._metric
+        direction = motion * self._metric
         square = float(direction @ direction)
         if square == 0.0:
             return felt
-        # Along the way no more is taken off than is there, and than damping gives back.
-        most = max(given, 0.0) + _DAMPING * self._settings.rate * square
-        off = min(given - allowed, most) / square
+        # No more is taken off along the motion than there is, and than the damping allows.
+        most = max(work, 0.0) + _DAMPING * self._settings.rate * square
+        off = min(work - allowed, most) / square
         return self._limited(self._unilateral(felt - off * self._metric * direction))
 
 
-def _way(first: Pose, second: Pose) -> NDArray[np.float64]:
+def _motion(first: Pose, second: Pose) -> NDArray[np.float64]:
     """(6,) m, rad, from one pose of the handle to another, along the axes of the arm."""
     turn = se3.rotation_between(first.orientation, second.orientation)
     return np.concatenate([second.position - first.position, turn])
 
 
 def _lengths(pair: NDArray[np.float64]) -> tuple[float, float]:
-    """Of the first and of the last three numbers."""
+    """The norms of the first and of the last three numbers."""
     a, b, c, d, e, f = pair.tolist()
     return math.sqrt(a * a + b * b + c * c), math.sqrt(d * d + e * e + f * f)

@@ -1,4 +1,4 @@
-"""What a scene says of a haptic arm: how it moves the probe, and what it may give back.
+"""The settings of a haptic arm in a scene: how it moves the probe, and the limits of its wrench.
 
 >>> from us_sim.tracking.haptic.settings import HapticSettings
 >>> HapticSettings(scale=2, ramp="500 ms").ramp

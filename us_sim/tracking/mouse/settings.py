@@ -1,4 +1,4 @@
-"""What a scene says of a 6-DOF mouse: how its cap's deflection moves the probe.
+"""The settings of a 6-DOF mouse in a scene: how its cap's deflection moves the probe.
 
 >>> from us_sim.tracking.mouse.settings import SixDofMouseSettings
 >>> settings = SixDofMouseSettings(mode="position", reach=["30 mm", "-30 mm", "-30 mm"])

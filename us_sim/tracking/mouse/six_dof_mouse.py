@@ -95,7 +95,7 @@ class SixDofMouse:
         self._point, self._from = self.pose, self._twist.copy()
 
     def _deflection(self, axes: Sequence[float]) -> NDArray[np.float64] | None:
-        """(6,) of the axes used, those in the dead band at 0 and the rest from there on."""
+        """(6,) deflections of the axes used, counted from the edge of the dead band."""
         last = max(self._used)
         if len(axes) <= last:
             self.last_problem = (
@@ -131,13 +131,13 @@ class SixDofMouse:
         return self._held.get(button, False)
 
     def _moved(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
-        """With a velocity (6,) m, rad that stays the same in the frame that the motion is in."""
+        """The pose after a motion (6,) m, rad that is uniform in the frame of motion."""
         if self._settings.frame == "probe":
             return pose @ se3.exp(twist)
         return self._displaced(pose, twist)
 
     def _displaced(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
-        """Moved by (3,) m and turned about the probe's face by (3,) rad."""
+        """The pose moved by (3,) m and turned about the probe's face by (3,) rad."""
         turn = se3.rotation_exp(twist[3:])
         if self._settings.frame == "probe":
             return pose @ Pose(twist[:3], turn)

@@ -46,7 +46,7 @@ class SpaceMouseReports:
         self.buttons = [0, 0]
 
     def take(self, report: bytes) -> bool:
-        """Whether the report says something of axes or buttons.
+        """Take a report; returns whether it is about axes or buttons.
 
         Older devices send translation and rotation one after the other, newer ones together.
         """
@@ -100,7 +100,7 @@ class SpaceMouse:
 
     @property
     def axes(self) -> list[float]:
-        """Six, ±1: forward, left, up, and turns about these."""
+        """Six deflections in ±1: forward, left, up, and turns about these."""
         return list(self._reports.axes)
 
     @property

@@ -28,7 +28,7 @@ from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 __all__ = ["OpenIGTLinkClient"]
 
 LPS_FROM_RAS = Pose(orientation=np.array([0.0, 0.0, 1.0, 0.0]))
-"""x and y turned round."""
+"""Half a turn about z: x and y change sign."""
 
 _RETRY_S = 1.0
 _CONNECT_S = 2.0
@@ -41,7 +41,7 @@ class OpenIGTLinkClient:
     """A thread that stays connected and hands on each pose of one body.
 
     Args:
-        settings: where the server is, and what its poses are in.
+        settings: the server's address, and the frame of its poses.
         body: name of the device, or of the body in a TDATA; None for the only one.
         take: called in the client's thread with each measurement, whose stamp is the message's
             (0 where it has none).
@@ -141,7 +141,7 @@ class OpenIGTLinkClient:
             self._take(Measurement(header.stamp, pose))
 
     def _is_wanted(self, name: str) -> bool:
-        """Whether it is the body's name; now and then said when only others come."""
+        """Whether a name is the body's; reports now and then when only others come."""
         self._names[name] = None
         if self._body is None:
             if len(self._names) == 1:
@@ -175,7 +175,7 @@ def _keep_alive(connection: socket.socket) -> None:
 
 
 def _read(connection: socket.socket, size: int) -> bytes:
-    """That many bytes.
+    """Read that many bytes.
 
     Raises:
         TrackingError: the server has closed the connection.

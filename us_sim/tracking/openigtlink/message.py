@@ -64,7 +64,7 @@ _WORLDS = {"ras": 1, "lps": 2}
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before a message's body."""
+    """The header of a message."""
 
     version: int
     kind: str

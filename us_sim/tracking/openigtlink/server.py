@@ -1,4 +1,4 @@
-"""Serves the newest of each message to whoever connects, as 3D Slicer does, without ever waiting.
+"""An OpenIGTLink server that sends each client the newest messages and never waits for one.
 
 >>> from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
 >>> server = OpenIGTLinkServer("localhost", 0)
@@ -26,7 +26,7 @@ _READ_AT_ONCE = 1 << 16
 
 @dataclass(eq=False)
 class _Client:
-    """A connection, the message that is on its way, and the newest of each that wait."""
+    """A connection, the message being sent, and the newest of each name that wait."""
 
     connection: socket.socket
     underway: memoryview = field(default_factory=lambda: memoryview(b""))
@@ -34,7 +34,7 @@ class _Client:
 
 
 class OpenIGTLinkServer:
-    """A thread that sends to every client what `send` was last given under each name.
+    """A thread that sends the newest message of each name to every client.
 
     A client that is too slow for all messages gets the newest ones; what a client sends is not
     listened to.

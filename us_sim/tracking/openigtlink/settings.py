@@ -1,4 +1,4 @@
-"""What a scene says of an OpenIGTLink server: where it is, and what its poses are in.
+"""The settings of an OpenIGTLink server in a scene: its address, and the frame of its poses.
 
 >>> from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 >>> OpenIGTLinkSettings(host="tracker.local", world="ras").port
