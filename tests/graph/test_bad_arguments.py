@@ -1,9 +1,22 @@
 """Nodes given what they cannot use: one sentence, status 1, no traceback."""
 
+import importlib
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
+
+
+@pytest.fixture
+def _own_signals() -> Iterator[None]:
+    """What a node does at its end about signals is undone."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    kept = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, kept, strict=True):
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(
@@ -28,13 +41,26 @@ import pytest
         ("path_player", ["-p", "rate:=1.0"], "parameter `path` is missing; name a bag to play"),
         ("session_recorder", ["-p", "file:=/proc/nowhere/x.mcap"], "/proc/nowhere"),
         ("session_recorder", ["-p", "compression:=rar"], "rar"),
-        ("probe_tracker", ["-r", "no remapping"], "no remapping"),
     ],
 )
-def test_a_node_refuses_in_one_sentence(node, arguments, words, tmp_path):
+@pytest.mark.usefixtures("_own_signals")
+def test_a_node_refuses_in_one_sentence(node, arguments, words, tmp_path, capfd):
     volume = tmp_path / "broken.mha"
     volume.write_bytes(b"ObjectType = Image\nNDims = 3\n")
     arguments = [argument.replace("BROKEN", str(volume)) for argument in arguments]
+    module = importlib.import_module(f"us_sim.nodes.{node}")
+    assert module.main([node, "--ros-args", *arguments]) == 1
+    assert_one_sentence(capfd.readouterr().err, words)
+
+
+@pytest.mark.parametrize(
+    ("node", "arguments", "words"),
+    [
+        ("probe_tracker", ["-r", "no remapping"], "no remapping"),
+        ("tissue_deformer", ["-p", "compare_with:=magic"], "magic"),
+    ],
+)
+def test_so_does_its_process(node, arguments, words):
     result = subprocess.run(
         [sys.executable, "-m", f"us_sim.nodes.{node}", "--ros-args", *arguments],
         capture_output=True,
@@ -43,7 +69,12 @@ def test_a_node_refuses_in_one_sentence(node, arguments, words, tmp_path):
         check=False,
     )
     assert result.returncode == 1, result.stderr
-    said = [line for line in result.stderr.splitlines() if line.startswith("us_sim: ")]
-    assert len(said) == 1, result.stderr
+    assert_one_sentence(result.stderr, words)
+
+
+def assert_one_sentence(stderr, words):
+    """No traceback, and those words in the one sentence that there is."""
+    said = [line for line in stderr.splitlines() if line.startswith("us_sim: ")]
+    assert len(said) == 1, stderr
     assert words in said[0]
-    assert "Traceback" not in result.stderr
+    assert "Traceback" not in stderr

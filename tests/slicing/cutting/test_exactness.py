@@ -8,7 +8,7 @@ from slicing_cases import KINDS, between_voxels, random_case, sampled, tetrahedr
 
 from us_sim.slicing.cutting.slicer import create_slicer
 
-CASES = {"scan_conversion": 130, "row_subdivision": 25}
+CASES = {"scan_conversion": 80, "row_subdivision": 20}
 """How many of each kind; the same ones always, since a pixel may lie within rounding of an edge."""
 
 _CLOSE = 0.1

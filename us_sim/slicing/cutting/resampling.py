@@ -100,6 +100,7 @@ def full_runs(plane: SlicePlane) -> NDArray[np.int32]:
     """(rows, 2, 2) as `SlicePlane.spans`, for an image that fills its grid."""
     runs = np.zeros((plane.rows, 2, 2), dtype=np.int32)
     runs[:, 0, 1] = plane.columns
+    runs.flags.writeable = False  # as a plane's own are, or numba would compile the kernels twice
     return runs
 
 

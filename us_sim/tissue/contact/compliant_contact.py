@@ -80,7 +80,9 @@ class CompliantContact:
         self._forward = only_forward(collider, spacing)
         self._rest = np.ascontiguousarray(rest)
         self._spacing = spacing
-        self._compliance = compliance
+        # Read-only always, since numba would compile the kernels again for what was just made.
+        self._compliance = compliance.view()
+        self._compliance.flags.writeable = False
         self.forces = np.zeros((len(rest), 3))  # (S, 3), N, of the probe on the tissue
         self.displacement = np.zeros((len(rest), 3))  # (S, 3), m; exact at `near` nodes
         self.near = np.zeros(len(rest), dtype=bool)  # (S,), nodes that the last press considered

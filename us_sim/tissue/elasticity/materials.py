@@ -119,7 +119,9 @@ def label_fractions(
             f"{indices.min(axis=0).round(1).tolist()} to {indices.max(axis=0).round(1).tolist()}, "
             f"the volume has shape {list(labels.shape)}"
         )
-    counts = _count_labels(indices, mesh.tetrahedra, np.asarray(labels), _simplex_points(_SAMPLES))
+    labels = labels.view()
+    labels.flags.writeable = False  # as a volume's are, or numba would compile the kernel twice
+    counts = _count_labels(indices, mesh.tetrahedra, labels, _simplex_points(_SAMPLES))
     present = np.flatnonzero(counts.any(axis=0))
     return present.astype(np.uint8), counts[:, present] / _SAMPLES
 

@@ -164,6 +164,8 @@ def _refined(
     matrix[:3, :3], matrix[:3, 3] = rotation, position
     normal = np.empty((6, 6))
     residuals = np.empty_like(pixels)
+    points = points.view()
+    points.flags.writeable = False  # as a body's are, or numba would compile the kernel twice
     misfit = _descend(points, pixels, *camera.lens, deviation, matrix, normal, residuals)
     if not np.isfinite(misfit):
         return None

@@ -41,7 +41,8 @@ def plane_poses(
     turns = np.empty((2, 3, 3))
     shifts = np.empty((2, 3))
     errors = np.empty(2)
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = np.ascontiguousarray(points, dtype=np.float64).view()
+    points.flags.writeable = False  # as a marker's are, or numba would compile the kernel twice
     if not _solve(points, np.ascontiguousarray(rays, dtype=np.float64), turns, shifts, errors):
         return []
     return [(turns[i], shifts[i]) for i in np.argsort(errors) if np.isfinite(errors[i])]

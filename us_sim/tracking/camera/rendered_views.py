@@ -143,7 +143,8 @@ class RenderedView:
             light *= self._gradient(conditions.gradient, random)
         noise = np.random.default_rng([seed, frame]).standard_normal(light.shape, np.float32)
         image8 = np.empty(light.shape, dtype=np.uint8)
-        _expose(light, noise, conditions.read_noise**2, conditions.shot_noise, image8)
+        read, shot = float(conditions.read_noise) ** 2, float(conditions.shot_noise)
+        _expose(light, noise, read, shot, image8)
         return image8
 
     def _moments(self, pose: Pose, motion: NDArray[np.float64] | None) -> list[Pose]:
