@@ -152,7 +152,7 @@ class _Image:
         return matrix
 
     def moved(self, step: NDArray[np.float64], free: bool) -> _Image:
-        """The image turned by step[:3] about the body's axes, moved by [3:6], and scaled if free."""
+        """The image turned by step[:3] about the body's axes, moved by [3:6], scaled if free."""
         first = 8 if free else 6
         return _Image(
             Rotation.from_rotvec(step[:3]).as_matrix() @ self.rotation,
