@@ -14,15 +14,16 @@ from slicing_cases import KINDS, SIZE, noise_volume, random_case
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import SLICERS
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
-from us_sim.slicing.cutting.slicer import METHODS, create_slicer
+from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.cutting.trilinear import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-every_method = pytest.mark.parametrize("method", METHODS)
+every_method = pytest.mark.parametrize("method", SLICERS)
 LOW, HIGH = -SIZE / [2, 2, 1] * [1, 1, 0], SIZE / [2, 2, 1]
 
 

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from us_sim.errors import MeshError, VolumeError
+from us_sim.errors import MeshError, SettingsError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting import location, resampling, section, trilinear
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
-from us_sim.slicing.cutting.row_subdivision import RowSubdivision
+from us_sim.slicing.cutting.row_subdivision import RowSubdivision, RowSubdivisionSettings
 from us_sim.slicing.cutting.slicer import warm_up
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
@@ -126,7 +126,12 @@ def test_row_subdivision_equals_a_search_of_every_pixel(seed, strength, regions,
         nodes = mesh.nodes + (nodes - mesh.nodes) * 0.3
     pose = Pose(rng.uniform(-0.5, 0.5, 3) * SIZE, rng.normal(size=4))
     plane = LinearProbe(rng.uniform(0.01, 0.12), rng.uniform(0.01, 0.12), *shape).plane(pose)
-    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra, regions=regions)
+    slicer = RowSubdivision(
+        volume_around_the_box(),
+        mesh.nodes,
+        mesh.tetrahedra,
+        settings=RowSubdivisionSettings(regions=regions),
+    )
     np.testing.assert_allclose(
         slicer.rest_coordinates(nodes, plane), expected_rest(mesh, nodes, plane), atol=1e-9
     )
@@ -254,9 +259,13 @@ def test_threads_and_regions_do_not_change_a_byte():
     plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
     nodes = pressed(mesh)
     images = [
-        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions=regions, threads=threads).image(
-            nodes, plane
-        )
+        RowSubdivision(
+            volume,
+            mesh.nodes,
+            mesh.tetrahedra,
+            threads=threads,
+            settings=RowSubdivisionSettings(regions=regions),
+        ).image(nodes, plane)
         for regions, threads in ((32, 1), (32, 2), (32, 3), (7, 2), (1, 4))
     ]
     for image in images[1:]:
@@ -294,8 +303,8 @@ def test_a_rest_mesh_that_cannot_be_is_refused(nodes, tetrahedra, words):
 
 def test_other_bad_input_is_refused():
     mesh, volume = box((2, 2, 2)), volume_around_the_box()
-    with pytest.raises(ValueError, match="at least one region"):
-        RowSubdivision(volume, mesh.nodes, mesh.tetrahedra, regions=0)
+    with pytest.raises(SettingsError, match=r"slice\.regions: 0 is outside 1 to 4096"):
+        RowSubdivisionSettings(regions=0)
     plain = Volume(volume.intensities, volume.index_to_patient)
     with pytest.raises(VolumeError, match="has no labels"):
         RowSubdivision(plain, mesh.nodes, mesh.tetrahedra).labels(

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from dataclasses import asdict, dataclass
@@ -18,8 +19,6 @@ from scipy.stats import qmc
 
 from us_sim.evaluation.stability.meshes import MESHES, fixed_nodes, mesh_named
 from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import rules_of
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -218,13 +217,11 @@ def model_of(case: StabilityCase) -> TissueModel:
 
 
 def _scaled(collider: Collider, scale: float) -> Collider:
-    """A collider of the same shape, as near to so many times its size as a probe may be."""
-    sizes, rules = asdict(collider), rules_of(type(collider))
-    ranges = [(size, rules[name].quantity or Quantity("length")) for name, size in sizes.items()]
-    least = max(allowed.minimum / size for size, allowed in ranges)
-    most = min(allowed.maximum / size for size, allowed in ranges)
-    factor = min(max(scale, least), most)
-    return type(collider)(**{name: factor * size for name, size in sizes.items()})
+    """The collider so many times as large, also beyond the sizes that settings allow a probe."""
+    scaled = copy.copy(collider)
+    for name, size in asdict(collider).items():
+        object.__setattr__(scaled, name, scale * size)
+    return scaled
 
 
 def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:

@@ -47,7 +47,7 @@ class MsdsSettings(SpringSettings):
     section = "msds"
 
     steps: int = setting(COUNT, "time steps in a frame", default=20)
-    time_step: float = setting(Quantity("time", 1e-12, 10.0), "of one step", default=0.01)
+    time_step: float = setting(Quantity("time", 1e-18, 10.0), "of one step", default=0.01)
     stabilisation: str = setting(
         choices=("mass_scaling", "substeps", "none"),
         default="mass_scaling",
