@@ -16,7 +16,7 @@ def test_the_pose_along_a_way_is_the_product_of_its_matrices():
     np.testing.assert_allclose(tree.pose(tree.chain("5", "0")).matrix, product, atol=1e-12)
 
 
-def test_frames_that_do_not_meet_or_go_round_have_no_way():
+def test_frames_that_do_not_meet_or_go_round_have_no_chain():
     tree = FrameTree()
     tree.place("a", "b", Pose())
     tree.place("b", "a", Pose())

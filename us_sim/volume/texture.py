@@ -1,5 +1,4 @@
-"""Random textures of tissue: smooth noise with lengths in metres, and the thin sheets where it is
-0.
+"""Random textures of tissue: smooth noise, and the thin sheets where it is zero.
 
 The noise is fixed by its seed and its lengths alone, so the same tissue comes out of every voxel
 size.

@@ -301,6 +301,6 @@ def _blend_pair(pair, weight):
 
 @njit(inline="always", error_model="numpy")
 def _blend(low, high, weight):
-    """The linear blend of two values, all in 64ths; ``weight`` is the higher's, in 32768ths."""
+    """The linear blend of two values, all in 64ths; ``weight`` is the second's, in 32768ths."""
     to_high = np.int16(np.int16(high - low) << np.int16(1))
     return np.int16(low + np.int16((np.int32(to_high) * np.int32(weight)) >> np.int32(16)))

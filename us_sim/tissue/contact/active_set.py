@@ -66,7 +66,7 @@ class ActiveSet:
         self.push[:] = 0.0
 
     def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
-        """Take nodes on the probe's surface as touched; a revision lets go those it pulls."""
+        """Take nodes on the probe's surface as touched; a revision lets go the pulled ones."""
         gap, self.normal = self._gap(pose, self._rest + displacement)
         self.touched = gap < _NEAR
         self.push[:] = 0.0

@@ -189,7 +189,7 @@ def _turn(tetrahedra: NDArray[np.integer], numbers: NDArray[np.intp]) -> NDArray
 def _check_hinges(
     tetrahedra: NDArray[np.integer], one: NDArray[np.intp], other: NDArray[np.intp]
 ) -> None:
-    """Whether what is connected is so by faces; the pairs (P,) and (P,) have one in common."""
+    """Whether tetrahedra hang together by faces; the pairs (P,) and (P,) have one in common."""
     count = len(tetrahedra)
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(count, count))
     bodies, body = connected_components(graph, directed=False)

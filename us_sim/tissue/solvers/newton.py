@@ -43,10 +43,10 @@ from us_sim.tissue.model import TissueModel
 __all__ = ["Newton"]
 
 _SINGLE_CONTRAST = 1e4
-"""Ratio of Young's moduli beyond which rounding to single precision hides the softer forces."""
+"""Ratio of Young's moduli beyond which rounding in single precision hides the softer forces."""
 
 _SINGLE_BULK = 1e3
-"""Bulk over shear modulus beyond which rounding to single precision hides the shear's forces."""
+"""Bulk over shear modulus beyond which rounding in single precision hides the shear's forces."""
 
 _BACKTRACKS = 6
 """Step lengths that are tried, each half the last."""

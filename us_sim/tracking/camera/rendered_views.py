@@ -347,7 +347,7 @@ def _print(image, rays, inverse, cells, black, white):
             total, inside = 0.0, 0
             for k in range(_SAMPLES):
                 for m in range(_SAMPLES):
-                    # No two samples lie on a line or a column, so that no slant is favoured.
+                    # No two samples lie in a row or a column, so that no slant is favoured.
                     s = (k + (m + 0.5) / _SAMPLES) / _SAMPLES
                     t = (m + (k + 0.5) / _SAMPLES) / _SAMPLES
                     across = (1 - t) * ((1 - s) * xa + s * xb) + t * ((1 - s) * xc + s * xd)
