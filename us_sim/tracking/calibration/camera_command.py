@@ -24,31 +24,31 @@ __all__ = ["calibrate_photos", "find_photos"]
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 
-def calibrate_photos(asked: CameraSettings, progress: Progress | None = None) -> str:
+def calibrate_photos(settings: CameraSettings, progress: Progress | None = None) -> str:
     """Calibrate a camera and write its info and a picture; returns a sentence with the result.
 
     Args:
-        asked: the photos, what they show, the camera's name, and the file to write.
+        settings: the photos, what they show, the camera's name, and the file to write.
         progress: told the fraction of the photos that is done, and how many show the board.
 
     Raises:
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
             write exists.
     """
-    out = asked.out
+    out = settings.out
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
     board = Board(
-        asked.board,
-        *columns_and_rows(asked.size),
-        asked.square,
-        asked.marker,
-        asked.separation,
-        asked.dictionary or ("" if asked.board == "chessboard" else "4X4_50"),
-        asked.legacy,
+        settings.board,
+        *columns_and_rows(settings.size),
+        settings.square,
+        settings.marker,
+        settings.separation,
+        settings.dictionary or ("" if settings.board == "chessboard" else "4X4_50"),
+        settings.legacy,
     )
-    photos = find_photos(asked.photos)
+    photos = find_photos(settings.photos)
     names, views, blank, size = _views(photos, board, progress)
     if not views:
         raise CalibrationError(
@@ -63,7 +63,7 @@ def calibrate_photos(asked: CameraSettings, progress: Progress | None = None) ->
         "photos_without_board": blank,
         "photos_left_out": far_off,
     }
-    write_camera_info(out, found.camera, asked.name, notes)
+    write_camera_info(out, found.camera, settings.name, notes)
     draw_coverage(picture, found, views, names)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"

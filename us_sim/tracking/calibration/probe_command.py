@@ -24,36 +24,36 @@ _POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "q
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated
 
 
-def calibrate_image(asked: ProbeSettings, _: Progress | None = None) -> str:
+def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
     """Find where the image lies on the probe and write it; returns a sentence with the result.
 
     Raises:
         UsSimError: the files cannot be read or do not determine the image's place.
     """
-    out = asked.out
-    to_phantom = read_transform(asked.registration) if asked.registration else Pose()
-    if asked.recording is None:
-        seen = _with_poses(asked.sightings, to_phantom)
+    out = settings.out
+    to_phantom = read_transform(settings.registration) if settings.registration else Pose()
+    if settings.recording is None:
+        seen = _with_poses(settings.sightings, to_phantom)
     else:
-        seen = _with_times(asked.sightings, asked.recording, asked.pose, to_phantom)
-    phantom = _features(asked.phantom) if asked.phantom else {}
+        seen = _with_times(settings.sightings, settings.recording, settings.pose, to_phantom)
+    phantom = _features(settings.phantom) if settings.phantom else {}
     unknown = sorted({sighting.feature for sighting in seen} - set(phantom))
     if phantom and unknown:
         raise CalibrationError(
-            f"{asked.phantom}: has no {unknown[0]}, which {asked.sightings} shows; its features "
-            f"are {', '.join(phantom)}"
+            f"{settings.phantom}: has no {unknown[0]}, which {settings.sightings} shows; its "
+            f"features are {', '.join(phantom)}"
         )
     found = calibrate_probe(
-        seen, phantom, spacing=None if asked.pixel is None else np.array(asked.pixel)
+        seen, phantom, spacing=None if settings.pixel is None else np.array(settings.pixel)
     )
     deviations = np.sqrt(np.diag(found.covariance))
     rejected = int((~found.inliers).sum())
     write_transform(
         out,
-        found.probe_pose(*asked.origin),
+        found.probe_pose(*settings.origin),
         from_frame="probe",
         to_frame="body",
-        method=f"probe calibration, {asked.sightings.name}",
+        method=f"probe calibration, {settings.sightings.name}",
         residuals={
             "rms": found.rms,  # m
             "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
@@ -62,7 +62,7 @@ def calibrate_image(asked: ProbeSettings, _: Progress | None = None) -> str:
         },
         more={
             "pixel_spacing": found.spacing,  # m, between columns and between rows
-            "origin_pixel": list(asked.origin),  # column, row
+            "origin_pixel": list(settings.origin),  # column, row
             "image_to_body": found.image_to_body,  # m, from (column, row, 0, 1)
             "standard_deviations": {
                 "position": deviations[:3],  # m, of pixel (0, 0)

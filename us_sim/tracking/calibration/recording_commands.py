@@ -38,21 +38,21 @@ __all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
 _TABLES = {".csv", ".txt", ".xml"}
 
 
-def calibrate_tip(asked: PivotSettings, _: Progress | None = None) -> str:
+def calibrate_tip(settings: PivotSettings, _: Progress | None = None) -> str:
     """Find a stylus' tip and write it; returns a sentence with the result.
 
     Raises:
         UsSimError: the recording cannot be read or does not determine the tip.
     """
-    out = asked.out
-    motion = read_motion(asked.recording, asked.pose)
+    out = settings.out
+    motion = read_motion(settings.recording, settings.pose)
     found = calibrate_pivot(motion.poses)
     write_transform(
         out,
         Pose(found.tip),
         from_frame="tip",
         to_frame=motion.topic,
-        method=f"pivot about one point, {asked.recording.name}",
+        method=f"pivot about one point, {settings.recording.name}",
         residuals={"rms": found.rms, "poses": len(found.inliers), "rejected": found.rejected},
         more={
             "standard_deviations": {"position": found.deviations},  # m
@@ -68,7 +68,7 @@ def calibrate_tip(asked: PivotSettings, _: Progress | None = None) -> str:
     )
 
 
-def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -> str:
+def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None) -> str:
     """Register a device to the patient by landmarks; returns a sentence with the result.
 
     Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
@@ -77,7 +77,12 @@ def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
     """
-    known_file, measured_file, to, out = asked.known, asked.measured, asked.to, asked.out
+    known_file, measured_file, to, out = (
+        settings.known,
+        settings.measured,
+        settings.to,
+        settings.out,
+    )
     known = read_landmarks(known_file)
     if measured_file.suffix.lower() in _TABLES:
         measured, frame = read_landmarks(measured_file), "tracker"
@@ -88,12 +93,12 @@ def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -
                 f"landmarks alike"
             )
     else:
-        measured, frame = _touched(list(known), measured_file, asked.tip, asked.pose)
+        measured, frame = _touched(list(known), measured_file, settings.tip, settings.pose)
         names = list(known)
     theirs = np.array([measured[landmark] for landmark in names])
     ours = np.array([known[landmark] for landmark in names])
     found = register_landmarks(theirs, ours, names)
-    if asked.invert:
+    if settings.invert:
         found, frame, to = register_landmarks(ours, theirs, names), to, frame
     left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
     write_transform(
@@ -125,7 +130,7 @@ def calibrate_registration(asked: LandmarkSettings, _: Progress | None = None) -
     )
 
 
-def calibrate_clock(asked: ClockSettings, progress: Progress | None = None) -> str:
+def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
     A picture of both signals goes beside the file.
@@ -133,20 +138,20 @@ def calibrate_clock(asked: ClockSettings, progress: Progress | None = None) -> s
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
     """
-    out = asked.out
+    out = settings.out
     picture = out.with_suffix(".png")
     if picture.exists():
         raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    moving = read_signal(asked.moving, asked.pose, progress=progress)
-    name = asked.fixed_pose or asked.pose
-    fixed = read_signal(asked.fixed, name, images=asked.images, progress=progress)
-    found = find_time_offset(moving, fixed, largest=asked.largest)
+    moving = read_signal(settings.moving, settings.pose, progress=progress)
+    name = settings.fixed_pose or settings.pose
+    fixed = read_signal(settings.fixed, name, images=settings.images, progress=progress)
+    found = find_time_offset(moving, fixed, largest=settings.largest)
     write_calibration(
         out,
         {
             "time_offset": found.offset,  # s, to add to the device's stamps
             "standard_deviation": found.deviation,  # s
-            "method": f"correlation of {asked.moving.name} with {asked.fixed.name}",
+            "method": f"correlation of {settings.moving.name} with {settings.fixed.name}",
             "residuals": {
                 "correlation": found.correlation,
                 "unexplained": found.residual,  # of the fixed signal's standard deviation

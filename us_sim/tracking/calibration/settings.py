@@ -1,4 +1,4 @@
-"""What a calibration is asked for: each field is an option of ``us-sim calibrate``.
+"""The settings of a calibration: each field is an option of ``us-sim calibrate``.
 
 >>> from us_sim.tracking.calibration.settings import ClockSettings
 >>> ClockSettings("tracker.mcap", "video.mcap", largest="300 ms").largest
