@@ -1,4 +1,4 @@
-"""What a tissue solver returns for a probe pose, and the state that solvers hand to each other.
+"""A tissue solver's result for a probe pose, and the state that solvers hand to each other.
 
 >>> import numpy as np
 >>> from us_sim.tissue.deformation import TissueState

@@ -1,4 +1,4 @@
-"""From what a device measured to where the probe is: registered, checked, filtered.
+"""The probe's poses from a device's measurements: registered, checked, filtered.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose

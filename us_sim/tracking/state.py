@@ -1,4 +1,4 @@
-"""Whether the probe is being tracked, by the time since its last pose.
+"""The state of tracking, by the time since the probe's last pose.
 
 >>> from us_sim.tracking.state import TrackingClock
 >>> clock = TrackingClock(coast_for=0.3, lost_after=1.0)

@@ -1,4 +1,4 @@
-"""Whether an image file holds the bytes that its header promises: MetaImage and NIfTI.
+"""A check that an image file holds the bytes that its header promises: MetaImage and NIfTI.
 
 ITK fills what is missing from a cut NIfTI file with zeros and ignores what is too much in a
 MetaImage file, so a broken copy would pass for a dark image. (NRRD's reader does notice.)

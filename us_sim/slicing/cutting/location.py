@@ -1,4 +1,4 @@
-"""Which tetrahedron of a section each pixel of an image lies in.
+"""Point location: the tetrahedron of a section that each pixel of an image lies in.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose

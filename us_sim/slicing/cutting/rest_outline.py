@@ -1,4 +1,4 @@
-"""Where an image meets the mesh at rest, from its outer faces alone.
+"""The area where an image cuts the mesh at rest, from the mesh's outer faces alone.
 
 Tissue that was there and moved away leaves black behind. How often the outer faces wind around a
 pixel says whether it lies in the mesh: their crossings with its row are counted from the left.

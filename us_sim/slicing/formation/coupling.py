@@ -1,4 +1,4 @@
-"""How well the transducer's face is coupled to the skin, line by line.
+"""The acoustic coupling of the transducer's face to the skin, line by line.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose

@@ -1,4 +1,4 @@
-"""From the level of an echo to a grey value: gain, time gain, dynamic range and grey map.
+"""Tables from echo levels to grey values: gain, time gain, dynamic range and grey map.
 
 A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
 and 0 is no echo, which no gain makes visible. The faintest echoes fade to black over the

@@ -1,4 +1,4 @@
-"""Which nodes the probe pushes, for solvers that prescribe their displacement.
+"""The set of nodes that the probe pushes, for solvers that prescribe their displacement.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere

@@ -1,4 +1,4 @@
-"""How far, and in which direction, the probe must push the nodes that it has entered.
+"""The gap between nodes and the probe, and the direction in which the probe pushes them.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere

@@ -1,4 +1,4 @@
-"""How the tissue's wrench on the probe changes as the probe moves: the tangent of the contact.
+"""The contact stiffness: how the tissue's wrench on the probe changes as the probe moves.
 
 The touched nodes stay on the probe and slide along it without friction. With f the pushes along
 the normals, what the probe's motion does to gaps, normals and arms is linear, and the tissue's

@@ -1,4 +1,4 @@
-"""How far the elastic forces of a moving tissue are from balance with a frictionless probe.
+"""The residual of a moving tissue: its elastic forces against those of a frictionless probe.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.elastic_balance import ElasticBalance

@@ -1,4 +1,4 @@
-"""Where points lie in a tetrahedral mesh, or how far outside it they are.
+"""Location of points in a tetrahedral mesh, and their distance from it outside.
 
 >>> import numpy as np
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh

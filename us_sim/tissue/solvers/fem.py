@@ -45,7 +45,7 @@ _ROUNDING = 1e-5
 """Rounding error of the fields, over the force, above which it is measured anew in every frame."""
 
 _EXTENSIONS = 10
-"""How often nodes that were overlooked, because they were far from the probe, are added."""
+"""Times that nodes overlooked at first, being far from the probe, may be added in a frame."""
 
 
 @dataclass(frozen=True)

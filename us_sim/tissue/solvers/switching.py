@@ -46,7 +46,7 @@ def difference(first: NDArray[np.float64], second: NDArray[np.float64]) -> Diffe
 
 @dataclass(frozen=True)
 class Plan:
-    """How a tissue is to be deformed."""
+    """The solvers and settings with which a tissue is to be deformed."""
 
     solver: str  # name of the method
     compared: str = ""  # name of a second method that runs beside it, '' for none
@@ -111,7 +111,7 @@ class SwitchableTissue:
         return self._beside.name if self._beside else ""
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Of the solver in use, see `TissueSolver.contact_stiffness`."""
+        """`TissueSolver.contact_stiffness` of the solver in use."""
         return self._solver.contact_stiffness()
 
     def make(self, plan: Plan, progress: Callable[[float, str], None] | None = None) -> Prepared:

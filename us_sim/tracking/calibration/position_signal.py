@@ -1,4 +1,4 @@
-"""One number over time from what moved: positions of a body, or images of a line.
+"""Motion as one number over time, from positions of a body or images of a line.
 
 >>> import numpy as np
 >>> from us_sim.tracking.calibration.position_signal import signal_of_positions

@@ -1,4 +1,4 @@
-"""How a body moved in a recording: a bag, or a tracker recording of Plus; or what images showed.
+"""The motion of a body in a recording: a bag, a tracker recording of Plus, or images.
 
 >>> import pathlib, tempfile
 >>> from us_sim.tracking.calibration.recorded_motion import read_motion

@@ -77,12 +77,8 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
     """
-    known_file, measured_file, to, out = (
-        settings.known,
-        settings.measured,
-        settings.to,
-        settings.out,
-    )
+    known_file, measured_file = settings.known, settings.measured
+    to, out = settings.to, settings.out
     known = read_landmarks(known_file)
     if measured_file.suffix.lower() in _TABLES:
         measured, frame = read_landmarks(measured_file), "tracker"

@@ -17,7 +17,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS
 
 Progress = Callable[[float, str], None]
-"""What a calibration tells the fraction that is done, and what is being done."""
+"""A callback that is told the fraction done, and what is being done."""
 
 __all__ = [
     "BOARDS",
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
-"""What a camera can be calibrated with."""
+"""The kinds of boards for calibrating a camera."""
 BOARD_LENGTH = Quantity("length", 0.0, 10.0)
 """Sides and distances on a board; 0 where the board has none such."""
 _PIXEL = Quantity("length", 1e-6, 0.01)

@@ -1,4 +1,4 @@
-"""Where four squares of a chessboard meet, fitted to the pixels along the edges that cross there.
+"""Corners of a chessboard's squares, fitted to the pixels along the edges that cross there.
 
 >>> import numpy as np
 >>> from us_sim.tracking.camera.chessboard_corners import refined_crossing

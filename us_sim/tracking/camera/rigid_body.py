@@ -52,7 +52,7 @@ class Chessboard:
 
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
-        """As OpenCV has it."""
+        """OpenCV's own object for the board."""
         size = (self.columns, self.rows)
         board = cv2.aruco.CharucoBoard(
             size, float(self.square), float(self.size), dictionary(self.dictionary)
@@ -164,7 +164,7 @@ class RigidBody:
 
     @cached_property
     def rows(self) -> dict[int, int]:
-        """Which of `ids` a number is."""
+        """Index in `ids` of each marker's number."""
         return {int(number): row for row, number in enumerate(self.ids)}
 
     @cached_property

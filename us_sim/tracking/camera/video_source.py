@@ -127,7 +127,7 @@ class VideoSource:
 
 
 def _hush() -> None:
-    """What OpenCV and FFmpeg print when nothing is there, the caller says in a sentence."""
+    """Silence OpenCV and FFmpeg, as the caller says in a sentence when nothing is there."""
     # OpenCV 5 has moved it.
     set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
     set_level(_ERRORS_ONLY)

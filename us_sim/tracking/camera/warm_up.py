@@ -1,4 +1,4 @@
-"""One image tracked before there is a camera, so that the first real one finds all compiled.
+"""Tracking of a drawn image at the start, so that the first real one finds all compiled.
 
 >>> from us_sim.tracking.camera.warm_up import practice
 >>> from us_sim.tracking.camera.rigid_body import RigidBody

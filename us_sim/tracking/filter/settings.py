@@ -1,4 +1,4 @@
-"""How a tracker's poses are filtered, and which of them are not believed.
+"""The settings of the filters of a tracker's poses, and of the gate that refuses some.
 
 >>> from us_sim.tracking.filter.settings import OneEuroSettings
 >>> OneEuroSettings(minimum_cutoff="2 Hz").minimum_cutoff

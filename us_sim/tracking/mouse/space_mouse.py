@@ -26,7 +26,7 @@ from us_sim.errors import TrackingError
 __all__ = ["SpaceMouse", "SpaceMouseReports"]
 
 FULL_DEFLECTION = 350.0
-"""What the device reports at most."""
+"""The largest number that the device reports."""
 
 _TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3  # numbers of reports
 # The device's axes are right, towards the person, and down. Forward is against its second.

@@ -70,7 +70,7 @@ class OpenIGTLinkServer:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of clients connected."""
         return len(self._clients)
 
     def send(self, name: str, message: bytes) -> None:
