@@ -1,8 +1,6 @@
 """One solver on one extreme case: did it stay finite and bounded, come back, and say the truth.
 
->>> from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
-from us_sim.evaluation.row import Row
-from us_sim.evaluation.stability.cases import StabilityCase
+>>> from us_sim.evaluation.stability.cases import StabilityCase
 >>> from us_sim.evaluation.stability.points import try_case
 >>> trial = try_case("fem_cg", StabilityCase("soft", young_modulus=1.0))
 >>> trial.finite, trial.bounded, trial.truthful, trial.recovered_mm

@@ -1,8 +1,8 @@
 """Planes that are near each other where a probe touches, and farther apart elsewhere.
 
 >>> from us_sim.evaluation.tissue.graded_planes import graded_planes
->>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01).round(4)
-array([0.    , 0.01  , 0.02  , 0.032 , 0.05  ])
+>>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01).round(4).tolist()
+[0.0, 0.01, 0.02, 0.032, 0.05]
 """
 
 from __future__ import annotations
