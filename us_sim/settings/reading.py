@@ -99,6 +99,11 @@ class Reader:
         return made
 
     def _value(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
+        listed = get_args(kind)[0] if get_origin(kind) is tuple else None
+        if isinstance(listed, type) and issubclass(listed, Settings):
+            if not isinstance(value, list):
+                raise self._refused(path, f"must be a list, not {shown(value)}")
+            return tuple(self.read(listed, each, f"{path}[{i}]") for i, each in enumerate(value))
         try:
             made = convert(kind, value, rule, lambda k, v, r: self._other(k, v, r, path))
         except Refusal as refusal:

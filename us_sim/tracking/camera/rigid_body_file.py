@@ -18,6 +18,7 @@ array([[0., 0., 1.],
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +27,117 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import PoseError, TrackingError
+from us_sim.geometry.placement import PLACE
 from us_sim.geometry.pose import Pose
+from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import Reader
+from us_sim.settings.setting import Settings, setting
 from us_sim.tracking.camera.markers import square
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.settings import MARKER_SIZE
 
 __all__ = ["read_rigid_body"]
 
-_LENGTH = Quantity("length", -10.0, 10.0)
-_BOARDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "grid": (("columns", "rows", "size", "separation"), ("first",)),
-    "charuco": (("columns", "rows", "square", "size"), ("legacy",)),
-}
+_NUMBER = Quantity("number", 0, 65535)
+_COUNT = Quantity("number", 1, 1000)
+_Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Marker(Settings):
+    """A marker of a body: its corners, or its size and where it is."""
+
+    error = TrackingError
+
+    id: int = setting(_NUMBER, "number in the dictionary")
+    size: float | None = setting(MARKER_SIZE, "edge of its black square", default=None)
+    position: _Point = setting(PLACE, "of its middle in the body", default=(0.0, 0.0, 0.0))
+    orientation: tuple[float, float, float, float] = setting(
+        Quantity("number", -1e6, 1e6), "quaternion x, y, z, w", default=(0.0, 0.0, 0.0, 1.0)
+    )
+    corners: tuple[_Point, _Point, _Point, _Point] | None = setting(
+        PLACE, "in the body, in place of size, position and orientation", default=None
+    )
+
+    def check(self) -> None:
+        """A size or corners."""
+        if (self.size is None) == (self.corners is None):
+            raise self.refused("size", "give a size, or corners in place of it")
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(4, 3) m, the corners in the body."""
+        if self.corners is not None:
+            return np.array(self.corners)
+        assert self.size is not None
+        try:
+            pose = Pose(np.array(self.position), np.array(self.orientation))
+        except PoseError as error:
+            raise self.refused("orientation", str(error)) from error
+        return pose.apply(square(self.size))
+
+
+@dataclass(frozen=True)
+class GridBoard(Settings):
+    """A flat grid of markers."""
+
+    error = TrackingError
+
+    columns: int = setting(_COUNT, "markers across")
+    rows: int = setting(_COUNT, "markers down")
+    size: float = setting(MARKER_SIZE, "edge of a marker")
+    separation: float = setting(MARKER_SIZE, "between markers")
+    first: int = setting(_NUMBER, "number of the first marker", default=0)
+
+    def body(self, dictionary: str) -> RigidBody:
+        """The board of markers of a dictionary."""
+        return RigidBody.grid(dictionary, **asdict(self))
+
+
+@dataclass(frozen=True)
+class CharucoBoard(Settings):
+    """A chessboard with markers in its white squares."""
+
+    error = TrackingError
+
+    columns: int = setting(_COUNT, "squares across")
+    rows: int = setting(_COUNT, "squares down")
+    square: float = setting(MARKER_SIZE, "side of a square")
+    size: float = setting(MARKER_SIZE, "edge of a marker")
+    legacy: bool = setting(description="as OpenCV before 4.6 drew it", default=False)
+
+    def body(self, dictionary: str) -> RigidBody:
+        """The board with markers of a dictionary."""
+        return RigidBody.charuco(dictionary, **asdict(self))
+
+
+_BOARDS = Choice(
+    "board",
+    key="kind",
+    needs=True,
+    error=TrackingError,
+    grid=f"{__name__}:GridBoard",
+    charuco=f"{__name__}:CharucoBoard",
+)
+
+
+@dataclass(frozen=True)
+class _Body(Settings):
+    """The file."""
+
+    error = TrackingError
+
+    dictionary: str | None = setting(description="of the markers", default=None)
+    markers: tuple[_Marker, ...] = setting(description="one by one", default=())
+    board: Chosen | None = setting(description="in place of markers", choice=_BOARDS, default=None)
+
+    def check(self) -> None:
+        """Markers or a board."""
+        if bool(self.markers) == (self.board is not None):
+            raise self.refused("markers", "give a list of markers, or a board in place of it")
+
+
 _PLUS_DICTIONARIES = {
     "ARUCO": "ARUCO_ORIGINAL",
     "ARUCO_MIP_36H12": "ARUCO_MIP_36h12",
@@ -83,9 +182,10 @@ def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> Rig
         content = _yaml(text)
         if "aruco_bc_markers" in content:
             return _marker_map(content, dictionary)
-        return _body(content, dictionary)
+        return _body(path, content, dictionary)
     except TrackingError as error:
-        raise TrackingError(f"{path}: {error}") from error
+        said = str(error)
+        raise TrackingError(said if said.startswith(f"{path}: ") else f"{path}: {said}") from error
 
 
 def _table(text: str, dictionary: str) -> RigidBody:
@@ -140,58 +240,14 @@ def _marker_map(content: Mapping[str, Any], dictionary: str) -> RigidBody:
     return RigidBody(dictionary, np.array(ids), np.array(corners))
 
 
-def _body(content: Mapping[str, Any], dictionary: str) -> RigidBody:
-    _require_keys(content, (), ("dictionary", "markers", "board"), "the file")
-    dictionary = content.get("dictionary", dictionary)
-    if ("markers" in content) == ("board" in content):
-        raise TrackingError("it must have either markers or board")
-    if "board" in content:
-        return _board(content["board"], dictionary)
-    ids, corners = [], []
-    for i, marker in enumerate(_list(content, "markers")):
-        where = f"markers[{i}]"
-        ids.append(_number(marker, where))
-        if "corners" in marker:
-            _require_keys(marker, ("id", "corners"), (), where)
-            corners.append(_corners(marker, where))
-        else:
-            _require_keys(marker, ("id", "size"), ("position", "orientation"), where)
-            corners.append(_placed(marker, where))
-    return RigidBody(dictionary, np.array(ids), np.array(corners))
-
-
-def _board(board: Any, dictionary: str) -> RigidBody:
-    kind = board.get("kind") if isinstance(board, Mapping) else None
-    if kind not in _BOARDS:
-        raise TrackingError(f"board.kind: {kind!r} is not one of {', '.join(_BOARDS)}")
-    required, optional = _BOARDS[kind]
-    _require_keys(board, ("kind", *required), optional, "board")
-    values: dict[str, Any] = {key: board[key] for key in board if key != "kind"}
-    for key, value in values.items():
-        if key in ("columns", "rows", "first"):
-            if not isinstance(value, int) or isinstance(value, bool):
-                raise TrackingError(f"board.{key}: {value!r} is not a whole number")
-        elif key == "legacy":
-            if not isinstance(value, bool):
-                raise TrackingError(f"board.legacy: {value!r} is not true or false")
-        else:
-            values[key] = _length(value, MARKER_SIZE, f"board.{key}")
-    make: Any = RigidBody.grid if kind == "grid" else RigidBody.charuco
-    return make(dictionary, **values)  # type: ignore[no-any-return]
-
-
-def _placed(marker: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    """Corners of a marker that is described by its size and pose."""
-    size = _length(marker["size"], MARKER_SIZE, f"{where}.size")
-    position = marker.get("position", [0.0, 0.0, 0.0])
-    if not isinstance(position, list) or len(position) != 3:
-        raise TrackingError(f"{where}.position: it must be 3 lengths, not {position!r}")
-    place = [_length(value, _LENGTH, f"{where}.position") for value in position]
-    try:
-        orientation = np.array(marker.get("orientation", [0, 0, 0, 1]), dtype=np.float64)
-        return Pose(np.array(place), orientation).apply(square(size))
-    except (PoseError, TypeError, ValueError) as error:
-        raise TrackingError(f"{where}.orientation: {error}") from error
+def _body(path: Path, content: Mapping[str, Any], dictionary: str) -> RigidBody:
+    body = Reader(str(path), error=TrackingError).read(_Body, content)
+    dictionary = body.dictionary or dictionary
+    if body.board is not None:
+        board: GridBoard | CharucoBoard = body.board.settings(_BOARDS)
+        return board.body(dictionary)
+    corners = np.array([marker.points for marker in body.markers])
+    return RigidBody(dictionary, np.array([marker.id for marker in body.markers]), corners)
 
 
 def _list(content: Mapping[str, Any], key: str) -> list[Any]:
@@ -216,22 +272,3 @@ def _corners(marker: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     if corners.shape != (4, 3):
         raise TrackingError(f"{where}.corners: they must be 4 × 3 numbers in metres")
     return corners
-
-
-def _length(value: object, quantity: Quantity, where: str) -> float:
-    try:
-        return quantity.parse(value)
-    except ValueError as error:
-        raise TrackingError(f"{where}: {error}") from error
-
-
-def _require_keys(
-    content: Mapping[str, Any], required: tuple[str, ...], optional: tuple[str, ...], where: str
-) -> None:
-    for key in required:
-        if key not in content:
-            raise TrackingError(f"{where}: {key} is missing")
-    unknown = [str(key) for key in content if key not in required + optional]
-    if unknown:
-        known = ", ".join(required + optional)
-        raise TrackingError(f"{where}: {unknown[0]} is not known; there are {known}")
