@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.setting import rules_of
 from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.formation.imaging import GREY_MAPS, Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
@@ -113,17 +114,17 @@ def test_black_stays_black():
     ("change", "words"),
     [
         ({"gain": 61}, r"imaging.gain: 61 dB is outside -60 to 60 dB"),
-        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level: its units are dB"),
+        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level: its unit is dB"),
         ({"gain": float("nan")}, "imaging.gain: nan is not finite"),
-        ({"time_gain": 3.0}, "imaging.time_gain: 3.0 is not a list"),
-        ({"time_gain": [0, 99]}, "imaging.time_gain: 99 dB is outside"),
+        ({"time_gain": 3.0}, "imaging.time_gain: must be a list, not 3.0"),
+        ({"time_gain": [0, 99]}, r"imaging.time_gain\[1\]: 99 dB is outside"),
         ({"dynamic_range": 5}, "imaging.dynamic_range: 5 dB is outside 10 to 120 dB"),
         ({"elevation_planes": 2.5}, "imaging.elevation_planes: 2.5 is not a whole number"),
         ({"elevation_planes": 16}, "imaging.elevation_planes: 16 is outside 1 to 15"),
         ({"elevation_width": 3}, "imaging.elevation_width: .* did you mean '3 mm'"),
         ({"lateral_resolution": -1e-3}, "imaging.lateral_resolution: -0.001 m is outside"),
         ({"axial_resolution": "5 cm"}, "imaging.axial_resolution: 0.05 m is outside"),
-        ({"contact": 1}, "imaging.contact: 1 is not true or false"),
+        ({"contact": 1}, "imaging.contact: must be true or false, not 1"),
         ({"reverberation": 1}, "imaging.reverberation: 1 dB is outside -60 to 0 dB"),
     ],
 )
@@ -138,5 +139,5 @@ def test_units_may_be_written():
 
 
 def test_every_setting_says_what_it_is():
-    for field in dataclasses.fields(Imaging):
-        assert len(field.metadata["description"]) > 10, field.name
+    for name, rule in rules_of(Imaging).items():
+        assert len(rule.description) > 10, name
