@@ -7,6 +7,23 @@ import pytest
 
 import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 
+WORKERS = 2
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """All tests run in two processes, where pytest-xdist is installed and nothing else is asked.
+
+    Nearly all of their time is that of one thread: compiling, and small meshes.
+    """
+    asked, is_worker = config.option, "PYTEST_XDIST_WORKER" in os.environ
+    everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not asked.keyword
+    free = getattr(asked, "numprocesses", 0) is None and not asked.usepdb
+    if everything and free and not is_worker:
+        asked.numprocesses = WORKERS
+        asked.dist = "loadfile"  # what a file's tests share is made once
+
+
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -54,4 +71,7 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _own_corner() -> None:
     """Keep the tests' DDS on this host and out of other simulations' domain."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    own = str(1 + os.getpid() % 100)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ["ROS_DOMAIN_ID"] = own  # the workers must not hear each other
+    os.environ.setdefault("ROS_DOMAIN_ID", own)

@@ -103,6 +103,8 @@ def _runs_within(spans: NDArray[np.int32], rows: int, columns: int) -> NDArray[n
             f"{runs.max(initial=0)}: give two runs of columns, 0 to {columns}, of each of the "
             f"{rows} rows"
         )
+    runs = runs.view()
+    runs.flags.writeable = False  # as a probe's own are, or numba would compile the kernels twice
     return runs
 
 
