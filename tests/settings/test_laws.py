@@ -48,6 +48,8 @@ def strategy(kind: Any, rule: Rule) -> st.SearchStrategy[Any] | None:
     if get_origin(kind) is tuple:
         items = get_args(kind)
         each = strategy(items[0], rule)
+        if each is None:
+            return None
         if items[-1] is Ellipsis:
             return st.lists(each, max_size=4).map(tuple)
         return st.tuples(*[each] * len(items))
