@@ -43,7 +43,7 @@ MEMBERS = {
         "wait_for_node",
         "waitables",
     },
-    "Publisher": {"assert_liveliness", "handle"},
+    "Publisher": {"assert_liveliness", "handle", "wait_for_all_acked"},
     "QoSPresetProfiles": {"BEST_AVAILABLE"},
     "QoSProfile": {"get_c_qos_profile"},
     "ReliabilityPolicy": {"BEST_AVAILABLE"},

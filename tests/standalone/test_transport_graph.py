@@ -50,21 +50,21 @@ def test_a_service_answers_its_client(participant, neighbour, bell):
     other = ServiceClient(neighbour, "/node/set", "std_srvs/srv/SetBool", RELIABLE)
     assert not client.service_is_ready()
     server = ServiceServer(participant, "/node/set", "std_srvs/srv/SetBool", RELIABLE)
-    client.on_data = bell.ring
+    client.set_on_data(bell.ring)
     bell.wait_until(client.service_is_ready)
 
     def answer():
-        while (taken := server.take_request()) is not None:
+        while (taken := server.take()) is not None:
             request = deserialize(taken[0], SetBool.Request)
             response = SetBool.Response(success=not request.data, message="ünïcode")
             assert server.send_response(serialize(response), taken[1])
 
-    server.on_data = answer
+    server.set_on_data(answer)
     numbers = [client.send_request(serialize(SetBool.Request(data=data))) for data in (True, False)]
     received = []
 
     def both_came():
-        while (taken := client.take_response()) is not None:
+        while (taken := client.take()) is not None:
             received.append(taken)
         return len(received) == 2
 
@@ -73,7 +73,7 @@ def test_a_service_answers_its_client(participant, neighbour, bell):
     responses = [deserialize(data, SetBool.Response) for data, _ in received]
     assert [response.success for response in responses] == [False, True]
     assert responses[0].message == "ünïcode"
-    assert other.take_response() is None
+    assert other.take() is None
     server.close()
     bell.wait_until(lambda: not client.service_is_ready())
 

@@ -73,7 +73,7 @@ class CdrLayout(ABC):
                 self.element(field, term)
             else:
                 self.elements(field, term)
-        if definition.is_empty:
+        if not definition.fields:
             self.primitive("B", placeholder)
 
     def primitive(self, code: str, term: str) -> None:

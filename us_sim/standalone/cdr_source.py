@@ -6,22 +6,9 @@ Consecutive primitives whose alignment is known beforehand go through one ``stru
 rosbags, which the types come from, generates such functions too (`Typestore.serialize_cdr`). They
 do not serve here. They read and make rosbags' own objects, whose sequences are NumPy arrays, where
 rclpy has ``array.array``: each message would have to be rebuilt around each call. And they pack
-number by number, with a call for each. Even given its own objects, rosbags 0.11.9 takes longer
-(µs, the least of three runs on an AMD EPYC with Python 3.11):
-
-=========================== ======================= =======================
-message                     written here / rosbags  read here / rosbags
-=========================== ======================= =======================
-PoseStamped                 1.2 / 4.7               2.2 / 7.2
-DiagnosticArray, 10 values  10 / 21                 12 / 30
-PointCloud2, 3,000 points   4.5 / 12                5.8 / 14
-Image, 512 by 512           13 / 531                16 / 16
-Marker, 3,000 points        508 / 1,691             1,545 / 3,115
-=========================== ======================= =======================
-
->>> from us_sim.standalone.cdr_source import writer_source
->>> print(writer_source("geometry_msgs/msg/Point").splitlines()[-2].strip())
-add(c0(v0._x, v0._y, v0._z)); pos += 24
+number by number, with a call for each. Even given its own objects, rosbags 0.11.9 takes longer:
+three times as long for a PoseStamped, two to three times for 3,000 points, 40 times to write an
+image of 512 by 512.
 """
 
 from __future__ import annotations
@@ -38,7 +25,7 @@ from .field_setters import ARRAY_TYPES
 from .interfaces import Field
 from .message_class import Message, message_class
 
-__all__ = ["compiled_reader", "compiled_writer", "writer_source"]
+__all__ = ["compiled_reader", "compiled_writer"]
 
 
 @cache
@@ -55,11 +42,6 @@ def compiled_reader(type_name: str, order: str) -> Callable[[bytes, memoryview],
     may return a position beyond the end of truncated data.
     """
     return _Reader(type_name, order).compile("read(data, view)")
-
-
-def writer_source(type_name: str) -> str:
-    """The source of the writer, for those who want to see it."""
-    return "\n".join(_Writer(type_name).lines)
 
 
 class _Writer(CdrLayout):

@@ -196,7 +196,6 @@ _declare(_INT, "dds_writecdr", Entity, Pointer)
 _declare(_INT, "dds_takecdr", Entity, _OUT, ct.c_uint32, _OUT, ct.c_uint32)
 _declare(_INT, "dds_take", Entity, _OUT, _OUT, ct.c_size_t, ct.c_uint32)
 _declare(_INT, "dds_return_loan", Entity, _OUT, ct.c_int32)
-_declare(_INT, "dds_wait_for_acks", Entity, _DURATION)
 
 _declare(_INT, "dds_get_matched_subscriptions", Entity, _OUT, ct.c_size_t)
 _declare(_INT, "dds_get_matched_publications", Entity, _OUT, ct.c_size_t)

@@ -6,8 +6,7 @@ import ctypes as ct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from . import ddsc
 from .ddsc import DdsError, IoVector, RawSampleInfo, check, guid_of, lib
@@ -39,19 +38,12 @@ class _IncompatibleQos(ct.Structure):
     )
 
 
-@dataclass(frozen=True)
-class SampleInfo:
-    """Where a sample came from.
+class SampleInfo(NamedTuple):
+    """Where a sample came from."""
 
-    Attributes:
-        source_timestamp: ns since 1970, when it was written, by the writer's clock.
-        received_timestamp: ns since 1970, when it was taken here.
-        publication_handle: this process's number for the writer.
-    """
-
-    source_timestamp: int
-    received_timestamp: int
-    publication_handle: int
+    source_timestamp: int  # ns since 1970, when it was written, by the writer's clock
+    received_timestamp: int  # ns since 1970, when it was taken here
+    publication_handle: int  # this process's number for the writer
 
 
 class Endpoint:
@@ -91,9 +83,7 @@ class Endpoint:
         """The USER_DATA of each endpoint that is connected to this one."""
         handles = (ct.c_uint64 * (self.matched_count() + 8))()
         found = self._matched(handles, len(handles))
-        data = [
-            self._user_data_of(handle) for handle in handles[: min(max(found, 0), len(handles))]
-        ]
+        data = map(self.user_data_of, handles[: min(max(found, 0), len(handles))])
         return [entry for entry in data if entry is not None]
 
     def close(self) -> None:
@@ -117,7 +107,8 @@ class Endpoint:
     def _matched(self, handles: Any, size: int) -> int:
         return getattr(lib, f"dds_get_matched_{self._side}s")(self._handle, handles, size)
 
-    def _user_data_of(self, handle: int) -> dict[str, str] | None:
+    def user_data_of(self, handle: int) -> dict[str, str] | None:
+        """The USER_DATA of an endpoint that is connected to this one; None if it has gone."""
         endpoint = getattr(lib, f"dds_get_matched_{self._side}_data")(self._handle, handle)
         if not endpoint:
             return None
@@ -194,15 +185,6 @@ class Writer(Endpoint):
         check(returned, "a sample cannot be written; the writer may have been closed")
         return True
 
-    def wait_for_acked(self, timeout: float) -> bool:
-        """Whether all readers had acknowledged all samples within ``timeout`` seconds."""
-        duration = ddsc.INFINITY if timeout < 0 else int(timeout * 1e9)
-        returned = lib.dds_wait_for_acks(self._handle, duration)
-        if returned == ddsc.RETURN_TIMEOUT:
-            return False
-        check(returned, "nothing can be acknowledged to a closed writer")
-        return True
-
 
 class Reader(Endpoint):
     """Receives serialized samples."""
@@ -211,13 +193,8 @@ class Reader(Endpoint):
     _incompatible = (1 << 4, "requested")
     _on_data: Callable[[], None] | None = None
 
-    @property
-    def on_data(self) -> Callable[[], None] | None:
-        """Called from another thread when samples may be waiting, and once after it was set."""
-        return self._on_data
-
-    @on_data.setter
-    def on_data(self, callback: Callable[[], None] | None) -> None:
+    def set_on_data(self, callback: Callable[[], None] | None) -> None:
+        """Have a function called from another thread now and when samples may be waiting."""
         self._on_data = callback
         if callback is not None:
             self._dispatcher.call_soon(callback)
@@ -226,12 +203,8 @@ class Reader(Endpoint):
         """The oldest sample that is waiting, removed from the reader; None if there is none."""
         serialized, info = ct.c_void_p(), RawSampleInfo()
         with self._in_use:
-            while not self._closed and (
-                lib.dds_takecdr(
-                    self._handle, ct.byref(serialized), 1, ct.byref(info), ddsc.ANY_STATE
-                )
-                > 0
-            ):
+            arguments = (ct.byref(serialized), 1, ct.byref(info), ddsc.ANY_STATE)
+            while not self._closed and lib.dds_takecdr(self._handle, *arguments) > 0:
                 data = _bytes_of(serialized) if info.valid_data else None
                 lib.ddsi_serdata_unref(serialized)
                 if data is not None:
@@ -239,10 +212,6 @@ class Reader(Endpoint):
                         info.source_timestamp, time.time_ns(), info.publication_handle
                     )
         return None
-
-    def user_data_of(self, publication_handle: int) -> dict[str, str] | None:
-        """The USER_DATA of a writer that is connected to this reader; None if it has gone."""
-        return self._user_data_of(publication_handle)
 
     def _notify(self, status: int) -> None:
         callback = self._on_data

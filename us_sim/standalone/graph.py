@@ -96,7 +96,7 @@ class Graph:
             hash_of_type,
             ignore_own=True,
         )
-        self._reader.on_data = self._refresh  # or they would pile up until somebody asks
+        self._reader.set_on_data(self._refresh)  # or they would pile up until somebody asks
 
     def endpoints(self, topic: str | None = None) -> list[GraphEndpoint]:
         """All endpoints, or those on one DDS topic."""

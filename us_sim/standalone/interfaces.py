@@ -11,6 +11,7 @@ The .msg files come from rosbags' type store; the services, which it lacks, are 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -68,12 +69,7 @@ _DEFAULTS = {
     ("type_description_interfaces/msg/FieldType", "type_id"): 0,
 }
 
-_IDL_NAMES = {
-    "bool": "boolean",
-    "byte": "octet",
-    "float32": "float",
-    "float64": "double",
-}
+_IDL_NAMES = {"bool": "boolean", "byte": "octet", "float32": "float", "float64": "double"}
 
 
 class InterfaceError(Exception):
@@ -126,11 +122,6 @@ class Interface:
     fields: tuple[Field, ...]
     constants: dict[str, Any]
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether it has no fields, so that a placeholder byte goes over the wire."""
-        return not self.fields
-
 
 @cache
 def interface(name: str) -> Interface:
@@ -158,15 +149,16 @@ def interface(name: str) -> Interface:
 
 def message_names(package: str) -> list[str]:
     """The short names of a package's messages, sorted."""
-    prefix = f"{package}/msg/"
-    names = _typestore().fielddefs
-    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
+    return _short_names(_typestore().fielddefs, f"{package}/msg/")
 
 
 def service_names(package: str) -> list[str]:
     """The short names of a package's services, sorted."""
-    prefix = f"{package}/srv/"
-    return sorted(name.removeprefix(prefix) for name in _SERVICES if name.startswith(prefix))
+    return _short_names(_SERVICES, f"{package}/srv/")
+
+
+def _short_names(names: Iterable[str], prefix: str) -> list[str]:
+    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
 
 
 def packages() -> list[str]:
@@ -177,7 +169,7 @@ def packages() -> list[str]:
 
 @cache
 def type_hash(name: str) -> str:
-    """The ``RIHS01_…`` hash of a message, request, response or service (REP 2016).
+    """The ``RIHS01_…`` hash of a message, request or response (REP 2016).
 
     Raises:
         InterfaceError: there is no such type.
@@ -193,10 +185,7 @@ def _typestore() -> Any:
     """rosbags' Jazzy store with the services' messages, as rosidl derives them, added."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, (constants, fields) in store.fielddefs.items():
-        store.fielddefs[name] = (
-            constants,
-            [(field, _without_char(kind)) for field, kind in fields],
-        )
+        store.fielddefs[name] = constants, [(field, _without_char(kind)) for field, kind in fields]
     for service, texts in _SERVICES.items():
         package = service.split("/")[0]
         for part, text in zip(("Request", "Response"), texts, strict=True):
@@ -204,22 +193,6 @@ def _typestore() -> Any:
             # The parser only takes names in msg/, so give it one and move the result.
             parsed = get_types_from_msg(text, f"{package}/msg/Moved")[f"{package}/msg/Moved"]
             store.fielddefs[name] = parsed
-        store.fielddefs[f"{service}_Event"] = (
-            [],
-            [
-                ("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")),
-                ("request", (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_Request"), 1))),
-                ("response", (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_Response"), 1))),
-            ],
-        )
-        store.fielddefs[service] = (
-            [],
-            [
-                ("request_message", (Nodetype.NAME, f"{service}_Request")),
-                ("response_message", (Nodetype.NAME, f"{service}_Response")),
-                ("event_message", (Nodetype.NAME, f"{service}_Event")),
-            ],
-        )
     return store
 
 

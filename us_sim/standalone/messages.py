@@ -48,7 +48,6 @@ class Service:
     __msgtype__: ClassVar[str]
     Request: ClassVar[type[Message]]
     Response: ClassVar[type[Message]]
-    Event: ClassVar[type[Message]]
 
     def __init__(self) -> None:
         raise TypeError("Service classes can not be instantiated")
@@ -74,7 +73,6 @@ def service_class(name: str) -> type[Service]:
             "__msgtype__": name,
             "Request": message_class(f"{name}_Request"),
             "Response": message_class(f"{name}_Response"),
-            "Event": message_class(f"{name}_Event"),
         },
     )
 
@@ -109,9 +107,7 @@ class _InterfaceModule(ModuleType):
         prefix = self.__name__.replace(".", "/")
         if name in self.__all__:
             cls: Any = self._build(f"{prefix}/{name}")
-        elif name.endswith(("_Request", "_Response", "_Event")) and (
-            name.rpartition("_")[0] in self.__all__
-        ):
+        elif name.endswith(("_Request", "_Response")) and (name.rpartition("_")[0] in self.__all__):
             cls = message_class(f"{prefix}/{name}")
         else:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")

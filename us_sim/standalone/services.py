@@ -10,12 +10,11 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 from .interfaces import type_hash
-from .transport import Participant
+from .transport import Participant, SampleInfo
 
 __all__ = ["RequestHeader", "ServiceClient", "ServiceServer"]
 
@@ -26,81 +25,64 @@ _endpoint_numbers = count(1)
 _request_numbers = count(1)
 
 
-@dataclass(frozen=True)
-class RequestHeader:
-    """Which request of which client, and when.
+class RequestHeader(NamedTuple):
+    """Which request of which client, and when."""
 
-    Attributes:
-        client: the client's number.
-        sequence: the request's number.
-        publication_handle: this process's number for the writer of the request or response.
-        source_timestamp, received_timestamp: ns since 1970.
-    """
-
-    client: int
-    sequence: int
-    publication_handle: int
-    source_timestamp: int
-    received_timestamp: int
+    client: int  # the client's number
+    sequence: int  # the request's number
+    info: SampleInfo
 
 
 class _ServiceEndpoint:
     """A writer of one direction and a reader of the other."""
 
-    def __init__(
-        self, participant: Participant, service: str, type_name: str, qos: Any, is_server: bool
-    ) -> None:
+    _key: str  # what the id is called in the USER_DATA
+
+    def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
+        """Offer or use a service.
+
+        Args:
+            service: the full ROS name, ``/node/get_parameters``.
+            type_name: ``rcl_interfaces/srv/GetParameters``.
+            qos: rclpy's QoSProfile or an EndpointQos.
+        """
         package, folder, name = type_name.split("/")
         number = next(_endpoint_numbers)
         identity = participant.gid[:12] + number.to_bytes(4, "big")
-        key = "serviceid" if is_server else "clientid"
-        self._id = ".".join(f"{byte:x}" for byte in identity)
+        own_id = ".".join(f"{byte:x}" for byte in identity)
 
         def arguments(prefix: str, suffix: str, part: str) -> tuple[str, str, Any, str]:
             return (
                 f"{prefix}{service}{suffix}",
                 f"{package}::{folder}::dds_::{name}_{part}_",
                 qos,
-                f"{key}={self._id};typehash={type_hash(f'{type_name}_{part}')};",
+                f"{self._key}={own_id};typehash={type_hash(f'{type_name}_{part}')};",
             )
 
         request = arguments("rq", "Request", "Request")
         response = arguments("rr", "Reply", "Response")
+        is_server = isinstance(self, ServiceServer)
         self._writer = participant.create_writer(*(response if is_server else request))
         self._reader = participant.create_reader(*(request if is_server else response))
+        self.gids = [self._reader.gid], [self._writer.gid]
 
-    @property
-    def on_data(self) -> Callable[[], None] | None:
-        """Called from another thread when a request or response may be waiting."""
-        return self._reader.on_data
-
-    @on_data.setter
-    def on_data(self, callback: Callable[[], None] | None) -> None:
-        self._reader.on_data = callback
-
-    @property
-    def gids(self) -> tuple[list[bytes], list[bytes]]:
-        """Of the reader and of the writer."""
-        return [self._reader.gid], [self._writer.gid]
+    def set_on_data(self, callback: Callable[[], None] | None) -> None:
+        """Have a function called from another thread when a request or response may be waiting."""
+        self._reader.set_on_data(callback)
 
     def close(self) -> None:
         """Leave both topics."""
         self._reader.close()
         self._writer.close()
 
-    def _take(self) -> tuple[bytes, RequestHeader] | None:
+    def take(self) -> tuple[bytes, RequestHeader] | None:
+        """The next request or response, serialized, with its origin; None if there is none."""
         while (sample := self._reader.take()) is not None:
             data, info = sample
             if len(data) < 4 + _HEADER.size:
                 continue
             client, sequence = _HEADER.unpack_from(data, 4)
-            header = RequestHeader(
-                client,
-                sequence,
-                info.publication_handle,
-                info.source_timestamp,
-                info.received_timestamp,
-            )
+            header = RequestHeader(client, sequence, info)
             return data[:4] + data[4 + _HEADER.size :], header
         return None
 
@@ -113,24 +95,12 @@ class _ServiceEndpoint:
 class ServiceServer(_ServiceEndpoint):
     """Takes requests for a service and sends the responses."""
 
-    def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
-        """Offer a service.
-
-        Args:
-            service: the full ROS name, ``/node/get_parameters``.
-            type_name: ``rcl_interfaces/srv/GetParameters``.
-            qos: rclpy's QoSProfile or an EndpointQos.
-        """
-        super().__init__(participant, service, type_name, qos, is_server=True)
-
-    def take_request(self) -> tuple[bytes, RequestHeader] | None:
-        """The next request, serialized, and what its response needs; None if there is none."""
-        return self._take()
+    _key = "serviceid"
 
     def send_response(self, data: bytes, header: RequestHeader) -> bool:
         """Answer a request; False if the client's reader was not there within 0.1 s."""
         deadline = time.monotonic() + _LONGEST_WAIT
-        while not self._client_listens(header.publication_handle):
+        while not self._client_listens(header.info.publication_handle):
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.002)
@@ -148,9 +118,10 @@ class ServiceServer(_ServiceEndpoint):
 class ServiceClient(_ServiceEndpoint):
     """Sends requests to a service and takes the responses to its own."""
 
+    _key = "clientid"
+
     def __init__(self, participant: Participant, service: str, type_name: str, qos: Any) -> None:
-        """Prepare to call a service; arguments as for `ServiceServer`."""
-        super().__init__(participant, service, type_name, qos, is_server=False)
+        super().__init__(participant, service, type_name, qos)
         self._number = self._writer.instance_handle()
 
     def service_is_ready(self) -> bool:
@@ -168,9 +139,9 @@ class ServiceClient(_ServiceEndpoint):
         self._send(data, self._number, sequence)
         return sequence
 
-    def take_response(self) -> tuple[bytes, RequestHeader] | None:
+    def take(self) -> tuple[bytes, RequestHeader] | None:
         """The next response to one of this client's requests; None if there is none."""
-        while (response := self._take()) is not None:
+        while (response := super().take()) is not None:
             if response[1].client == self._number:
                 return response
         return None

@@ -46,15 +46,7 @@ def init(
     domain_id: int | None = None,
     signal_handler_options: SignalHandlerOptions | None = None,
 ) -> None:
-    """Start.
-
-    Args:
-        args: command line, `sys.argv` when None.
-        context: what to initialise, the default context when None.
-        domain_id: DDS domain; None takes ROS_DOMAIN_ID, or 0.
-        signal_handler_options: which signals shut down; None means all for the default context,
-            none for another.
-    """
+    """Start; a default context is shut down by signals unless told otherwise."""
     context = get_default_context() if context is None else context
     if signal_handler_options is None:
         is_default = context is get_default_context()
@@ -80,12 +72,7 @@ def _end_global_executor() -> None:
 
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
-    """Stop: executors end, nodes leave the network.
-
-    Args:
-        context: what to shut down, the default context when None.
-        uninstall_handlers: whether signals are given back; None means only for the default context.
-    """
+    """Stop: executors end, nodes leave the network."""
     is_default = context is None or context is get_default_context()
     _shutdown(context=context)
     if uninstall_handlers or (uninstall_handlers is None and is_default):
@@ -113,11 +100,7 @@ def spin_once(
 
 
 def spin(node: Node, executor: Executor | None = None) -> None:
-    """Run a node's callbacks until the context is shut down.
-
-    Raises:
-        ExternalShutdownException: it was shut down meanwhile, by SIGTERM for example.
-    """
+    """Run a node's callbacks until the context is shut down."""
     executor = get_global_executor() if executor is None else executor
     try:
         executor.add_node(node)

@@ -36,40 +36,32 @@ class NodeLink:
     wake: Callable[[], None]
 
 
-def open_writer(
-    link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
-) -> Writer:
-    """A DDS writer for a topic, given its name as the node wrote it and the absolute one.
+def open_writer(link: NodeLink, msg_type: Any, topic: str, *described: Any) -> Writer:
+    """A DDS writer for a topic, given its name as the node wrote it, the absolute one, and the QoS.
 
     Raises:
         NoTypeSupportImportedException: the class is none of messages.
         RCLError: the quality of service is refused.
     """
-    warn = _warning(link, _REFUSED_BY_WRITER, topic)
-    try:
-        return link.context.participant.create_writer(
-            *_described(msg_type, full_name, qos), on_incompatible=warn
-        )
-    except DdsError as error:
-        raise RCLError(f"failed to create publisher: {error}") from None
+    create = link.context.participant.create_writer
+    return _open("publisher", create, _REFUSED_BY_WRITER, link, topic, msg_type, *described)
 
 
-def open_reader(
-    link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
-) -> Reader:
+def open_reader(link: NodeLink, msg_type: Any, topic: str, *described: Any) -> Reader:
     """A DDS reader for a topic; arguments and errors as for `open_writer`."""
-    warn = _warning(link, _REFUSED_BY_READER, topic)
+    create = link.context.participant.create_reader
+    return _open("subscription", create, _REFUSED_BY_READER, link, topic, msg_type, *described)
+
+
+def _open(kind: str, create: Any, refusal: str, link: NodeLink, topic: str, *described: Any) -> Any:
+    logger = get_logger(link.logger_name)
     try:
-        return link.context.participant.create_reader(
-            *_described(msg_type, full_name, qos), on_incompatible=warn
+        return create(
+            *_described(*described),
+            on_incompatible=lambda policy: logger.warning(refusal.format(topic, policy)),
         )
     except DdsError as error:
-        raise RCLError(f"failed to create subscription: {error}") from None
-
-
-def _warning(link: NodeLink, text: str, topic: str) -> Callable[[str], None]:
-    logger = get_logger(link.logger_name)
-    return lambda policy: logger.warning(text.format(topic, policy))
+        raise RCLError(f"failed to create {kind}: {error}") from None
 
 
 def _described(msg_type: Any, full_name: str, qos: QoSProfile) -> tuple[str, str, QoSProfile, str]:
@@ -141,12 +133,10 @@ class Receiver(Connected):
 
     _executor_event = False
 
-    def __init__(
-        self, link: NodeLink, full_name: str, endpoint: Any, take: Callable[[], Any]
-    ) -> None:
+    def __init__(self, link: NodeLink, full_name: str, endpoint: Any) -> None:
         super().__init__(full_name, endpoint)
-        self._inbox = Inbox(take, link.wake)
-        endpoint.on_data = self._inbox.notify
+        self._inbox = Inbox(endpoint.take, link.wake)
+        endpoint.set_on_data(self._inbox.notify)
 
     def _stirred(self) -> bool:
         return self._inbox.ready

@@ -6,7 +6,6 @@ Levels belong to logger names: a logger without one takes its parent's, and at t
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -130,8 +129,3 @@ def _write(record: Record) -> None:
         stream.flush()
     except (OSError, ValueError):
         pass  # a closed or broken stream must not end the node that logs
-
-
-def now() -> int:
-    """Nanoseconds since the epoch."""
-    return time.time_ns()

@@ -23,7 +23,6 @@ __all__ = [
     "error_in_node_name",
     "error_in_topic_name",
     "expand",
-    "require_full_name",
     "require_namespace",
     "require_node_name",
     "require_topic_name",
@@ -34,6 +33,18 @@ Fault = tuple[str, int] | None
 _LONGEST_TOPIC = 247
 _LONGEST_NAMESPACE = 245
 _LONGEST_NODE_NAME = 255
+
+_TOPIC_FAULTS = (  # each ends with the offending character
+    (r"^[0-9]", "token must not start with a number"),
+    (r"[{}]", "must not have a {substitution}, not known without ROS 2"),
+    (
+        r"[^A-Za-z0-9_/~]",
+        "must not contain characters other than alphanumerics, '_', '~', '{', or '}'",
+    ),
+    (r".~", "must not have tilde '~' unless it is the first character"),
+    (r"^~[^/](?=.)", "must not have a tilde '~' that is not followed by a forward slash '/'"),
+    (r"/[0-9]", "token must not start with a number"),
+)
 
 
 def error_in_node_name(name: str) -> Fault:
@@ -95,50 +106,11 @@ def error_in_topic_name(name: str) -> Fault:
     """What is wrong with a topic or service name as a person writes it, if anything."""
     if not name:
         return "topic name must not be empty string", 0
-    if name[0].isdigit():
-        return "topic name token must not start with a number", 0
     if name[-1] == "/":
         return "topic name must not end with a forward slash", len(name) - 1
-    if error := _error_in_characters(name):
-        return error
-    if name[0] == "~" and len(name) > 2 and name[1] != "/":
-        return (
-            "topic name must not have a tilde '~' that is not followed by a forward slash '/'",
-            1,
-        )
-    if bad := re.search(r"/[0-9]", name):
-        return "topic name token must not start with a number", bad.start() + 1
-    return None
-
-
-def _error_in_characters(name: str) -> Fault:
-    """Unallowed characters, a misplaced tilde, and everything about {substitutions}."""
-    opened: int | None = None
-    for index, character in enumerate(name):
-        if opened is not None:
-            if character == "}":
-                opened = None
-            elif not re.match(r"[A-Za-z0-9_]", character):
-                return (
-                    "substitution name must not contain characters other than alphanumerics or '_'",
-                    index,
-                )
-            elif character.isdigit() and index == opened + 1:
-                return "substitution name must not start with a number", index
-        elif character == "{":
-            opened = index
-        elif character == "}":
-            return "topic name must not have unmatched (unbalanced) curly braces '{}'", index
-        elif character == "~" and index:
-            return "topic name must not have tilde '~' unless it is the first character", index
-        elif not re.match(r"[A-Za-z0-9_/~]", character):
-            return (
-                "topic name must not contain characters other than alphanumerics, "
-                "'_', '~', '{', or '}'",
-                index,
-            )
-    if opened is not None:
-        return "topic name must not have unmatched (unbalanced) curly braces '{}'", opened
+    for pattern, sentence in _TOPIC_FAULTS:
+        if bad := re.search(pattern, name):
+            return f"topic name {sentence}", bad.end() - 1
     return None
 
 
@@ -154,18 +126,14 @@ def require_namespace(namespace: str) -> None:
         raise InvalidNamespaceException(namespace, *error)
 
 
-def require_topic_name(name: str, *, is_service: bool) -> None:
-    """Raise InvalidTopicNameException, or InvalidServiceNameException, as a person writes it."""
-    _refuse(name, error_in_topic_name(name), is_service)
+def require_topic_name(name: str, *, is_service: bool, is_full: bool = False) -> None:
+    """Raise InvalidTopicNameException, or InvalidServiceNameException, when it is not allowed.
 
-
-def require_full_name(name: str, *, is_service: bool) -> None:
-    """As `require_topic_name`, for an expanded name."""
-    _refuse(name, error_in_full_topic_name(name), is_service)
-
-
-def _refuse(name: str, error: Fault, is_service: bool) -> None:
-    if error:
+    Args:
+        is_service: whether it is the name of a service.
+        is_full: whether it was expanded, rather than written by a person.
+    """
+    if error := (error_in_full_topic_name if is_full else error_in_topic_name)(name):
         kind = InvalidServiceNameException if is_service else InvalidTopicNameException
         raise kind(name, *error)
 
@@ -174,8 +142,7 @@ def expand(name: str, node_name: str, namespace: str) -> str:
     """The absolute name of a topic or service for a node in an absolute namespace.
 
     Raises:
-        ValueError: the name, the node's name or the namespace is not allowed, or a
-            {substitution} is unknown.
+        ValueError: the name, the node's name or the namespace is not allowed.
     """
     for kind, error in (
         (f"topic name '{name}'", error_in_topic_name(name)),
@@ -187,11 +154,4 @@ def expand(name: str, node_name: str, namespace: str) -> str:
     prefix = "" if namespace == "/" else namespace
     if name.startswith("~"):
         name = f"{prefix}/{node_name}{name[1:]}"
-    known = {"{node}": node_name, "{ns}": namespace, "{namespace}": namespace}
-    for substitution in re.findall(r"\{[^}]*\}", name):
-        if substitution not in known:
-            raise ValueError(
-                f"topic name '{name}' is invalid: unknown substitution: {substitution}"
-            )
-        name = name.replace(substitution, known[substitution])
     return name if name.startswith("/") else f"{prefix}/{name}"

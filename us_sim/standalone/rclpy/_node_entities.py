@@ -1,14 +1,17 @@
 """The parts of a node that executors run, and its publishers: made, listed and destroyed here."""
 
 import inspect
+import weakref
 from collections.abc import Callable, Iterator
 from itertools import chain
+from operator import attrgetter
 from typing import Any
 
-from ._context_handle import ContextHandle, LocalNode
+from ._context_handle import LocalNode
 from ._endpoints import NodeLink
-from ._names import expand, require_full_name, require_topic_name
-from ._node_declarations import NodeDeclarations
+from ._names import require_topic_name
+from ._node_parameters import NodeParameters
+from ._remapping import SERVICE, TOPIC
 from ._rosout import Rosout
 from .callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from .client import Client
@@ -27,16 +30,14 @@ from .timer import Timer
 __all__ = ["NodeEntities"]
 
 
-class NodeEntities(NodeDeclarations):
+class NodeEntities(NodeParameters):
     """Publishers, subscriptions, clients, services, timers and guard conditions."""
 
     _context: Context
-    _rcl_context_handle: ContextHandle
     _rcl_link: NodeLink
     _rcl_local_node: LocalNode
-    _rcl_name: str
-    _rcl_namespace: str
     _rcl_rosout: Rosout | None = None
+    _rcl_executor_weakref: weakref.ReferenceType[Any] | None = None
 
     def __init__(self) -> None:
         self._publishers: list[Publisher] = []
@@ -47,33 +48,31 @@ class NodeEntities(NodeDeclarations):
         self._guards: list[GuardCondition] = []
         self._default_callback_group = MutuallyExclusiveCallbackGroup()
 
-    @property
-    def publishers(self) -> Iterator[Publisher]:
-        yield from self._publishers
+    publishers = property(lambda self: iter(self._publishers))
+    subscriptions = property(lambda self: iter(self._subscriptions))
+    clients = property(lambda self: iter(self._clients))
+    services = property(lambda self: iter(self._services))
+    timers = property(lambda self: iter(self._timers))
+    guards = property(lambda self: iter(self._guards))
+    default_callback_group = property(attrgetter("_default_callback_group"))
 
     @property
-    def subscriptions(self) -> Iterator[Subscription]:
-        yield from self._subscriptions
+    def executor(self) -> Any:
+        """The executor that runs this node's callbacks, None when there is none."""
+        return None if self._rcl_executor_weakref is None else self._rcl_executor_weakref()
 
-    @property
-    def clients(self) -> Iterator[Client]:
-        yield from self._clients
-
-    @property
-    def services(self) -> Iterator[Service]:
-        yield from self._services
-
-    @property
-    def timers(self) -> Iterator[Timer]:
-        yield from self._timers
-
-    @property
-    def guards(self) -> Iterator[GuardCondition]:
-        yield from self._guards
-
-    @property
-    def default_callback_group(self) -> CallbackGroup:
-        return self._default_callback_group
+    @executor.setter
+    def executor(self, new_executor: Any) -> None:
+        current = self.executor
+        if current is new_executor:
+            return
+        if current is not None:
+            current.remove_node(self)
+        if new_executor is None:
+            self._rcl_executor_weakref = None
+        else:
+            new_executor.add_node(self)
+            self._rcl_executor_weakref = weakref.ref(new_executor)
 
     def create_publisher(
         self,
@@ -84,19 +83,7 @@ class NodeEntities(NodeDeclarations):
         callback_group: CallbackGroup | None = None,  # noqa: ARG002 (for events, which we lack)
         qos_overriding_options: QoSOverridingOptions | None = None,
     ) -> Publisher:
-        """Publish a topic.
-
-        Args:
-            msg_type: class of the messages.
-            topic: relative, private (~/…) or absolute name.
-            qos_profile: quality of service, or the depth of a reliable history.
-            callback_group: without effect, since there are no event callbacks.
-            qos_overriding_options: which policies parameters may override.
-
-        Raises:
-            InvalidTopicNameException: the name is not allowed.
-            NoTypeSupportImportedException: the class is none of messages.
-        """
+        """Publish a topic; there are no event callbacks, so the group has no effect."""
         full_name = self._rcl_full_or_refused(topic)
         qos = overridden(
             "publisher", self, full_name, _profile_of(qos_profile), qos_overriding_options
@@ -117,21 +104,7 @@ class NodeEntities(NodeDeclarations):
         qos_overriding_options: QoSOverridingOptions | None = None,
         raw: bool = False,
     ) -> Subscription:
-        """Subscribe to a topic.
-
-        Args:
-            msg_type: class of the messages.
-            topic: relative, private (~/…) or absolute name.
-            callback: takes a message, or a message and a dict about where it came from.
-            qos_profile: quality of service, or the depth of a reliable history.
-            callback_group: the node's default when None.
-            qos_overriding_options: which policies parameters may override.
-            raw: whether the callback takes serialized messages.
-
-        Raises:
-            InvalidTopicNameException: the name is not allowed.
-            NoTypeSupportImportedException: the class is none of messages.
-        """
+        """Subscribe to a topic; a callback may take a second argument, where a message is from."""
         full_name = self._rcl_full_or_refused(topic)
         _refuse_coroutine(callback)
         qos = overridden(
@@ -151,7 +124,7 @@ class NodeEntities(NodeDeclarations):
         qos_profile: QoSProfile = qos_profile_services_default,
         callback_group: CallbackGroup | None = None,
     ) -> Client:
-        """Use a service; raises InvalidServiceNameException when the name is not allowed."""
+        """Use a service."""
         _require_service_class(srv_type)
         full_name = self._rcl_full_or_refused(srv_name, is_service=True)
         group = callback_group or self._default_callback_group
@@ -169,10 +142,7 @@ class NodeEntities(NodeDeclarations):
         qos_profile: QoSProfile = qos_profile_services_default,
         callback_group: CallbackGroup | None = None,
     ) -> Service:
-        """Offer a service; raises InvalidServiceNameException when the name is not allowed.
-
-        The callback takes a request and an empty response, and returns the response.
-        """
+        """Offer a service; the callback takes a request and a response, which it returns."""
         _require_service_class(srv_type)
         _refuse_coroutine(callback)
         full_name = self._rcl_full_or_refused(srv_name, is_service=True)
@@ -236,22 +206,10 @@ class NodeEntities(NodeDeclarations):
         """Stop listening to triggers; False when it is none of this node's."""
         return self._rcl_destroy(guard, self._guards)
 
-    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
-        """The absolute name that a topic has for this node, remapped unless `only_expand`."""
-        raise NotImplementedError
-
-    def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
-        """The absolute name that a service has for this node, remapped unless `only_expand`."""
-        raise NotImplementedError
-
     def _rcl_entities(self) -> Iterator[Any]:
         """What executors run, in the order in which rclpy looks at it."""
-        return chain(
-            list(self._timers),
-            list(self._subscriptions),
-            list(self._guards),
-            list(self._clients),
-            list(self._services),
+        return iter(
+            [*self._timers, *self._subscriptions, *self._guards, *self._clients, *self._services]
         )
 
     def _rcl_keep(self, entity: Any, entities: list[Any], group: CallbackGroup) -> Any:
@@ -269,25 +227,15 @@ class NodeEntities(NodeDeclarations):
         return True
 
     def _rcl_destroy_all(self) -> None:
-        kinds: tuple[list[Any], ...] = (
-            self._publishers,
-            self._subscriptions,
-            self._clients,
-            self._services,
-            self._timers,
-            self._guards,
-        )
-        for entities in kinds:
+        kinds = (self._publishers, self._subscriptions, self._clients, self._services)
+        for entities in (*kinds, self._timers, self._guards):
             for entity in list(entities):
                 self._rcl_destroy(entity, entities)
 
     def _rcl_changed(self) -> None:
         """Tell others which endpoints this node has now, and the executor to look anew."""
         owners: Iterator[Any] = chain(
-            self._publishers,
-            self._subscriptions,
-            self._clients,
-            self._services,
+            *(self._publishers, self._subscriptions, self._clients, self._services),
             [self._rcl_rosout.publisher] if self._rcl_rosout else [],
         )
         gids = [owner._gids for owner in owners]
@@ -299,18 +247,17 @@ class NodeEntities(NodeDeclarations):
         self._rcl_wake_executor()
 
     def _rcl_wake_executor(self) -> None:
-        raise NotImplementedError
+        executor = self.executor
+        if executor is not None:
+            executor.wake()
 
     def _rcl_full_or_refused(self, name: str, is_service: bool = False) -> str:
         """The absolute, remapped name, or the error that says what is wrong with the given one."""
         try:
-            if is_service:
-                return self.resolve_service_name(name)
-            return self.resolve_topic_name(name)
+            return self._rcl_resolve(name, SERVICE if is_service else TOPIC, only_expand=False)
         except RuntimeError:
             require_topic_name(name, is_service=is_service)
-            full_name = expand(name, self._rcl_name, self._rcl_namespace)
-            require_full_name(full_name, is_service=is_service)
+            self._rcl_full_name(name, is_service)
             raise
 
 

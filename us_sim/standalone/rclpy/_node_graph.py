@@ -1,10 +1,12 @@
-"""What a node can ask about all nodes and topics that it sees."""
+"""A node's own names, and what it can ask about all nodes and topics that it sees."""
 
 from typing import Any
 
 from ..graph import Graph, GraphEndpoint
 from ._context_handle import ContextHandle
-from ._names import expand, require_full_name
+from ._names import error_in_full_topic_name, expand, require_topic_name
+from ._rclpy_pybind11 import RCLError
+from ._remapping import SERVICE, TOPIC, RemapRule, remap
 from .duration import Duration, Infinite
 from .qos import QoSProfile
 from .topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
@@ -13,15 +15,32 @@ __all__ = ["NodeGraph"]
 
 
 class NodeGraph:
-    """The questions; `Node` answers what its own name and context are."""
+    """Names and questions; `Node` says what its own name and context are."""
 
     _rcl_context_handle: ContextHandle
     _rcl_name: str
     _rcl_namespace: str
+    _rcl_remap_rules: list[RemapRule]
 
-    @property
-    def _rcl_graph(self) -> Graph:
-        return self._rcl_context_handle.graph
+    def get_name(self) -> str:
+        """This node's name, without namespace."""
+        return self._rcl_name
+
+    def get_namespace(self) -> str:
+        """This node's namespace, which begins with a slash."""
+        return self._rcl_namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """This node's absolute name."""
+        return f"{self._rcl_namespace.rstrip('/')}/{self._rcl_name}"
+
+    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
+        """The absolute name that a topic has for this node, remapped unless `only_expand`."""
+        return self._rcl_resolve(topic, TOPIC, only_expand)
+
+    def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
+        """The absolute name that a service has for this node, remapped unless `only_expand`."""
+        return self._rcl_resolve(service, SERVICE, only_expand)
 
     def get_node_names(self) -> list[str]:
         """The names of all nodes, without namespaces."""
@@ -65,12 +84,27 @@ class NodeGraph:
         """Everything known about the subscriptions to a topic; a DDS topic if not to be mangled."""
         return self._rcl_infos(topic_name, no_mangle, is_writer=False)
 
-    def _rcl_remapped_topic(self, name: str) -> str:
-        raise NotImplementedError
+    @property
+    def _rcl_graph(self) -> Graph:
+        return self._rcl_context_handle.graph
 
-    def _rcl_full_name(self, name: str) -> str:
+    def _rcl_resolve(self, name: str, kind: int, only_expand: bool) -> str:
+        try:
+            full = expand(name, self._rcl_name, self._rcl_namespace)
+            if not only_expand:
+                full = self._rcl_remapped(kind, full)
+        except ValueError as error:
+            raise RCLError(f"failed to resolve name: {error}") from None
+        if fault := error_in_full_topic_name(full):
+            raise RCLError(f"failed to resolve name: {fault[0]}")
+        return full
+
+    def _rcl_remapped(self, kind: int, name: str) -> str:
+        return remap(self._rcl_remap_rules, kind, name, self._rcl_name, self._rcl_namespace)
+
+    def _rcl_full_name(self, name: str, is_service: bool = False) -> str:
         full = expand(name, self._rcl_name, self._rcl_namespace)
-        require_full_name(full, is_service=False)
+        require_topic_name(full, is_service=is_service, is_full=True)
         return full
 
     def _rcl_endpoints_on(self, dds_topic: str, is_writer: bool) -> list[GraphEndpoint]:
@@ -78,14 +112,22 @@ class NodeGraph:
 
     def _rcl_infos(self, name: str, no_mangle: bool, is_writer: bool) -> list[TopicEndpointInfo]:
         if not no_mangle:
-            name = f"rt{self._rcl_remapped_topic(self._rcl_full_name(name))}"
+            name = f"rt{self._rcl_remapped(TOPIC, self._rcl_full_name(name))}"
         owners = {
-            gid: node
+            gid: (node.name, node.namespace)
             for node in self._rcl_graph.nodes()
             for gid in (node.writer_gids if is_writer else node.reader_gids)
         }
+        unknown = ("_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_")
+        kinds = TopicEndpointTypeEnum
         return [
-            _info(endpoint, owners.get(endpoint.gid))
+            TopicEndpointInfo(
+                *owners.get(endpoint.gid, unknown),
+                topic_type=_type_name(endpoint.type_name),
+                endpoint_type=kinds.PUBLISHER if is_writer else kinds.SUBSCRIPTION,
+                endpoint_gid=list(endpoint.gid),
+                qos_profile=_profile(endpoint.qos),
+            )
             for endpoint in self._rcl_endpoints_on(name, is_writer)
         ]
 
@@ -98,29 +140,8 @@ def _type_name(dds_type: str) -> str:
     return f"{package.replace('::', '/')}/{rest[:-1]}"
 
 
-def _info(endpoint: GraphEndpoint, owner: Any) -> TopicEndpointInfo:
-    kinds = TopicEndpointTypeEnum
-    return TopicEndpointInfo(
-        node_name="_NODE_NAME_UNKNOWN_" if owner is None else owner.name,
-        node_namespace="_NODE_NAMESPACE_UNKNOWN_" if owner is None else owner.namespace,
-        topic_type=_type_name(endpoint.type_name),
-        endpoint_type=kinds.PUBLISHER if endpoint.is_writer else kinds.SUBSCRIPTION,
-        endpoint_gid=list(endpoint.gid),
-        qos_profile=_profile(endpoint.qos),
-    )
-
-
 def _profile(qos: Any) -> QoSProfile:
-    def duration(nanoseconds: int) -> Duration:
-        return Duration(nanoseconds=nanoseconds) if nanoseconds else Infinite
-
-    return QoSProfile(
-        history=qos.history,
-        depth=qos.depth,
-        reliability=qos.reliability,
-        durability=qos.durability,
-        lifespan=duration(qos.lifespan),
-        deadline=duration(qos.deadline),
-        liveliness=qos.liveliness,
-        liveliness_lease_duration=duration(qos.liveliness_lease_duration),
-    )
+    policies = vars(qos).copy()
+    for name in ("lifespan", "deadline", "liveliness_lease_duration"):
+        policies[name] = Duration(nanoseconds=policies[name]) if policies[name] else Infinite
+    return QoSProfile(**policies)

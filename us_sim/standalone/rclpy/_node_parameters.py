@@ -1,18 +1,30 @@
-"""The parameters of a node: getting, listing and setting them, and who has a say in it."""
+"""The parameters of a node: declaring, getting and setting them, and who has a say in it."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..messages import message_class
+from ._node_graph import NodeGraph
 from ._parameter_ranges import reason_against
 from .clock import ROSClock
-from .exceptions import ParameterNotDeclaredException, ParameterUninitializedException
+from .exceptions import (
+    InvalidParameterException,
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterAlreadyDeclaredException,
+    ParameterImmutableException,
+    ParameterNotDeclaredException,
+    ParameterUninitializedException,
+)
 from .parameter import PARAMETER_SEPARATOR_STRING, Parameter
 from .publisher import Publisher
 
 __all__ = ["NodeParameters"]
 
 ParameterDescriptor: Any = message_class("rcl_interfaces/msg/ParameterDescriptor")
+ParameterValue: Any = message_class("rcl_interfaces/msg/ParameterValue")
+ParameterMsg: Any = message_class("rcl_interfaces/msg/Parameter")
 ParameterEvent: Any = message_class("rcl_interfaces/msg/ParameterEvent")
 SetParametersResult: Any = message_class("rcl_interfaces/msg/SetParametersResult")
 ListParametersResult: Any = message_class("rcl_interfaces/msg/ListParametersResult")
@@ -20,8 +32,8 @@ ListParametersResult: Any = message_class("rcl_interfaces/msg/ListParametersResu
 _RECURSIVE = 0  # ListParameters.Request.DEPTH_RECURSIVE
 
 
-class NodeParameters:
-    """A node's parameters by name; `Node` publishes the events."""
+class NodeParameters(NodeGraph):
+    """A node's parameters by name, which have to be declared before they are used."""
 
     PARAM_REL_TOL = 1e-06
 
@@ -39,25 +51,145 @@ class NodeParameters:
         self._on_set_parameters_callbacks: list[Callable[..., Any]] = []
         self._post_set_parameters_callbacks: list[Callable[..., Any]] = []
 
-    def get_fully_qualified_name(self) -> str:
-        """This node's absolute name."""
-        raise NotImplementedError
+    def declare_parameter(
+        self,
+        name: str,
+        value: Any = None,
+        descriptor: Any = None,
+        ignore_override: bool = False,
+    ) -> Parameter:
+        """Make a parameter known.
+
+        Raises:
+            ParameterAlreadyDeclaredException, InvalidParameterException: the name is taken, or
+                not allowed.
+            InvalidParameterTypeException, InvalidParameterValueException: the value is of another
+                type than the default, out of range, or refused by a callback.
+        """
+        parameter: tuple[Any, ...] = (name,)
+        if value is not None or descriptor is not None:
+            parameter = (name, value, ParameterDescriptor() if descriptor is None else descriptor)
+        return self.declare_parameters("", [parameter], ignore_override)[0]
+
+    def declare_parameters(
+        self,
+        namespace: str,
+        parameters: Sequence[tuple[Any, ...]],
+        ignore_override: bool = False,
+    ) -> list[Parameter]:
+        """Make several parameters known; raises as `declare_parameter`."""
+        values: list[Parameter] = []
+        descriptors: dict[str, Any] = {}
+        for index, declaration in enumerate(parameters):
+            name, value, descriptor = self._rcl_read_declaration(namespace, index, declaration)
+            if not ignore_override and name in self._parameter_overrides:
+                value = self._parameter_overrides[name].value
+            values.append(Parameter(name, value=value))
+            descriptors[name] = descriptor
+        declared = [parameter.name for parameter in values if parameter.name in self._parameters]
+        if declared:
+            raise ParameterAlreadyDeclaredException(declared)
+        for parameter in values:
+            result = self._rcl_set_all([parameter], descriptors)
+            if not result.successful:
+                if result.reason.startswith("Wrong parameter type"):
+                    raise InvalidParameterTypeException(
+                        parameter, Parameter.Type(descriptors[parameter.name].type).name
+                    )
+                raise InvalidParameterValueException(parameter.name, parameter.value, result.reason)
+        return [self._parameters[parameter.name] for parameter in values]
+
+    def _rcl_read_declaration(
+        self, namespace: str, index: int, declaration: tuple[Any, ...]
+    ) -> tuple[str, Any, Any]:
+        """Full name, default and completed descriptor of one declaration."""
+        if not 1 <= len(declaration) <= 3:
+            raise TypeError(
+                f"Invalid parameter tuple length at index {index} in parameters list: "
+                f"{declaration}; expecting length between 1 and 3"
+            )
+        name, second, descriptor = (*declaration, None, None)[:3]
+        if not isinstance(name, str):
+            raise TypeError(
+                f"First element {name} at index {index} in parameters list is not a str."
+            )
+        if namespace:
+            name = f"{namespace}.{name}"
+        if not name:
+            raise InvalidParameterException(name)
+        if len(declaration) < 3:
+            descriptor = ParameterDescriptor()
+        if not isinstance(descriptor, ParameterDescriptor):
+            raise TypeError(
+                f"Third element {descriptor} at index {index} in parameters list "
+                "is not a ParameterDescriptor."
+            )
+        if len(declaration) == 1:
+            warnings.warn(
+                f"when declaring parameter named '{name}', declaring a parameter only providing "
+                "its name is deprecated. You have to either:\n"
+                "\t- Pass a name and a default value different to 'PARAMETER NOT SET' "
+                "(and optionally a descriptor).\n"
+                "\t- Pass a name and a parameter type.\n"
+                "\t- Pass a name and a descriptor with `dynamic_typing=True",
+                stacklevel=4,
+            )
+            descriptor.dynamic_typing = True
+        if isinstance(second, Parameter.Type):
+            if second is Parameter.Type.NOT_SET:
+                raise ValueError(
+                    f"Cannot declare parameter {{{name}}} as statically typed of type NOT_SET"
+                )
+            if descriptor.dynamic_typing:
+                raise ValueError(
+                    f"When declaring parameter {{{name}}} passing a descriptor with"
+                    "`dynamic_typing=True` is not allowed when the parameter type is provided"
+                )
+            descriptor.type = second.value
+            return name, None, descriptor
+        if isinstance(second, ParameterValue):
+            second = Parameter.from_parameter_msg(ParameterMsg(name=name, value=second)).value
+        if not descriptor.dynamic_typing:
+            descriptor.type = Parameter.Type.from_parameter_value(second).value
+            if descriptor.type == 0:
+                raise ValueError(
+                    "Cannot declare a statically typed parameter with default value "
+                    "of type PARAMETER_NOT_SET"
+                )
+        return name, second, descriptor
+
+    def undeclare_parameter(self, name: str) -> None:
+        """Forget a parameter."""
+        if name not in self._parameters:
+            raise ParameterNotDeclaredException(name)
+        if self._descriptors[name].read_only:
+            raise ParameterImmutableException(name)
+        del self._parameters[name]
+        del self._descriptors[name]
+
+    def describe_parameter(self, name: str) -> Any:
+        """The `rcl_interfaces/msg/ParameterDescriptor` of a parameter."""
+        if name in self._descriptors:
+            return self._descriptors[name]
+        if self._allow_undeclared_parameters:
+            return ParameterDescriptor()
+        raise ParameterNotDeclaredException(name)
+
+    def describe_parameters(self, names: list[str]) -> list[Any]:
+        """The descriptors of several parameters."""
+        return [self.describe_parameter(name) for name in names]
 
     def has_parameter(self, name: str) -> bool:
         """Whether a parameter is known."""
         return name in self._parameters
 
     def get_parameter_types(self, names: list[str]) -> list[Parameter.Type]:
-        """The types of several parameters; raises as `get_parameter_type`."""
+        """The types of several parameters."""
         _require_strings(names)
         return [self.get_parameter_type(name) for name in names]
 
     def get_parameter_type(self, name: str) -> Parameter.Type:
-        """The type of a parameter as the number of a Parameter.Type.
-
-        Raises:
-            ParameterNotDeclaredException: it is not known.
-        """
+        """The type of a parameter as the number of a Parameter.Type."""
         if name in self._parameters:
             return self._parameters[name].type_.value
         if self._allow_undeclared_parameters:
@@ -65,17 +197,12 @@ class NodeParameters:
         raise ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
-        """Several parameters; raises as `get_parameter`."""
+        """Several parameters."""
         _require_strings(names)
         return [self.get_parameter(name) for name in names]
 
     def get_parameter(self, name: str) -> Parameter:
-        """A parameter.
-
-        Raises:
-            ParameterNotDeclaredException: it is not known.
-            ParameterUninitializedException: it was declared with a type and has no value yet.
-        """
+        """A parameter; raises ParameterUninitializedException when it has a type and no value."""
         parameter = self._parameters.get(name)
         if parameter is not None:
             if parameter.type_ is Parameter.Type.NOT_SET and not (
@@ -106,12 +233,7 @@ class NodeParameters:
         }
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
-        """The names of parameters, as a `rcl_interfaces/msg/ListParametersResult`.
-
-        Args:
-            prefixes: only names that are one of these or begin with one and a dot; [] for all.
-            depth: how many more parts names may have; 0 for any number.
-        """
+        """The names of parameters, as a `rcl_interfaces/msg/ListParametersResult`."""
         if not isinstance(prefixes, list):
             raise TypeError("The prefixes argument must be a list")
         if not all(isinstance(prefix, str) for prefix in prefixes):
@@ -141,18 +263,11 @@ class NodeParameters:
         return ListParametersResult(names=names, prefixes=list(groups))
 
     def set_parameters(self, parameter_list: list[Parameter]) -> list[Any]:
-        """Set parameters one after the other.
-
-        Returns:
-            A `rcl_interfaces/msg/SetParametersResult` for each.
-
-        Raises:
-            ParameterNotDeclaredException: one is not known.
-        """
+        """Set parameters one after the other; a `SetParametersResult` for each."""
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Any:
-        """Set all parameters or none; raises and returns as `set_parameters`."""
+        """Set all parameters or none."""
         if self._pre_set_parameters_callbacks:
             parameter_list = [
                 parameter
@@ -170,21 +285,14 @@ class NodeParameters:
         unknown = [p.name for p in parameter_list if p.name not in self._parameters]
         if unknown and not self._allow_undeclared_parameters:
             raise ParameterNotDeclaredException(unknown)
-        return self._rcl_set_all(parameter_list, None, declaring=False)
+        return self._rcl_set_all(parameter_list)
 
     def _rcl_set_all(
-        self, parameters: list[Parameter], descriptors: dict[str, Any] | None, declaring: bool
+        self, parameters: list[Parameter], descriptors: dict[str, Any] | None = None
     ) -> Any:
         """Check, ask the callbacks, set, and tell everybody; `descriptors` come with declaring."""
         for parameter in parameters:
-            descriptor = (self._descriptors if descriptors is None else descriptors).get(
-                parameter.name
-            )
-            reason = (
-                ""
-                if descriptor is None
-                else self._rcl_reason_against(parameter, descriptor, check_read_only=not declaring)
-            )
+            reason = self._rcl_reason_against(parameter, descriptors)
             if reason:
                 return SetParametersResult(successful=False, reason=reason)
         for callback in self._on_set_parameters_callbacks:
@@ -193,7 +301,7 @@ class NodeParameters:
                 return result
         event = ParameterEvent(node=self.get_fully_qualified_name())
         for parameter in parameters:
-            changes = self._rcl_set_one(parameter, descriptors, declaring)
+            changes = self._rcl_set_one(parameter, descriptors)
             getattr(event, changes).append(parameter.to_parameter_msg())
         event.stamp = self._clock.now().to_msg()
         if self._parameter_event_publisher is not None:
@@ -202,12 +310,10 @@ class NodeParameters:
             callback(parameters)
         return SetParametersResult(successful=True)
 
-    def _rcl_set_one(
-        self, parameter: Parameter, descriptors: dict[str, Any] | None, declaring: bool
-    ) -> str:
+    def _rcl_set_one(self, parameter: Parameter, descriptors: dict[str, Any] | None) -> str:
         """Set what was checked; returns which part of a parameter event tells it."""
         name = parameter.name
-        if not declaring and parameter.type_ is Parameter.Type.NOT_SET:
+        if descriptors is None and parameter.type_ is Parameter.Type.NOT_SET:
             self._parameters.pop(name, None)
             self._descriptors.pop(name, None)
             return "deleted_parameters"
@@ -219,12 +325,13 @@ class NodeParameters:
         self._parameters[name] = parameter
         return "new_parameters" if is_new else "changed_parameters"
 
-    def _rcl_reason_against(
-        self, parameter: Parameter, descriptor: Any, *, check_read_only: bool
-    ) -> str:
+    def _rcl_reason_against(self, parameter: Parameter, descriptors: dict[str, Any] | None) -> str:
         """Why a descriptor does not allow a value, '' when it does; completes the descriptor."""
+        descriptor = (descriptors or self._descriptors).get(parameter.name)
+        if descriptor is None:
+            return ""
         descriptor.name = parameter.name
-        if check_read_only and descriptor.read_only:
+        if descriptors is None and descriptor.read_only:
             return f"Trying to set a read-only parameter: {parameter.name}."
         not_set = parameter.type_ is Parameter.Type.NOT_SET
         if descriptor.dynamic_typing:
@@ -251,15 +358,12 @@ class NodeParameters:
         self._post_set_parameters_callbacks.insert(0, callback)
 
     def remove_pre_set_parameters_callback(self, callback: Callable[..., Any]) -> None:
-        """The counterpart of `add_pre_set_parameters_callback`; ValueError when it is not there."""
         self._pre_set_parameters_callbacks.remove(callback)
 
     def remove_on_set_parameters_callback(self, callback: Callable[..., Any]) -> None:
-        """The counterpart of `add_on_set_parameters_callback`; ValueError when it is not there."""
         self._on_set_parameters_callbacks.remove(callback)
 
     def remove_post_set_parameters_callback(self, callback: Callable[..., Any]) -> None:
-        """The counterpart of `add_post_set_parameters_callback`; ValueError when not there."""
         self._post_set_parameters_callbacks.remove(callback)
 
 

@@ -42,12 +42,6 @@ class ReentrantCallbackGroup(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:  # noqa: ARG002
         return True
 
-    def beginning_execution(self, entity: Any) -> bool:  # noqa: ARG002
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
 
 class MutuallyExclusiveCallbackGroup(CallbackGroup):
     """Callbacks of which only one runs at a time."""

@@ -36,7 +36,7 @@ class Client(Receiver):
         endpoint = ServiceClient(
             link.context.participant, full_name, srv_type.__msgtype__, qos_profile
         )
-        super().__init__(link, full_name, endpoint, endpoint.take_response)
+        super().__init__(link, full_name, endpoint)
         self.context = context
         self.srv_type = srv_type
         self.srv_name = srv_name
@@ -46,14 +46,7 @@ class Client(Receiver):
         self._lock = threading.Lock()
 
     def call(self, request: Any, timeout_sec: float | None = None) -> Any:
-        """Send a request and wait for the response, while an executor spins in another thread.
-
-        Returns:
-            The response; None when it did not come in time.
-
-        Raises:
-            TypeError: the request is of another type.
-        """
+        """Send a request and wait for the response, while an executor spins in another thread."""
         answered = threading.Event()
         future = self.call_async(request)
         future.add_done_callback(lambda _: answered.set())
@@ -65,14 +58,7 @@ class Client(Receiver):
         return future.result()
 
     def call_async(self, request: Any) -> Future:
-        """Send a request.
-
-        Returns:
-            The future of the response.
-
-        Raises:
-            TypeError: the request is of another type.
-        """
+        """Send a request; the future of its response."""
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(f"Expected {self.srv_type.Request}, got {type(request)}")
         self._require_existence()

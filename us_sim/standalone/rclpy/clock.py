@@ -9,6 +9,7 @@ Time(nanoseconds=3000000000, clock_type=ROS_TIME)
 
 import time as wall
 import weakref
+from operator import attrgetter
 from typing import Protocol
 
 from .clock_type import ClockType
@@ -26,6 +27,7 @@ class Clock:
 
     _clock_type: ClockType
     _timers: "weakref.WeakSet[_Timer]"
+    clock_type = property(attrgetter("_clock_type"))
 
     def __new__(cls, *, clock_type: ClockType = ClockType.SYSTEM_TIME) -> "Clock":
         if not isinstance(clock_type, ClockType):
@@ -40,10 +42,6 @@ class Clock:
         self._clock_type = clock_type
         self._timers = weakref.WeakSet()
         return self
-
-    @property
-    def clock_type(self) -> ClockType:
-        return self._clock_type
 
     def __repr__(self) -> str:
         return f"Clock(clock_type={self._clock_type.name})"
@@ -67,15 +65,12 @@ class ROSClock(Clock):
 
     _active: bool
     _override: int
+    ros_time_is_active = property(attrgetter("_active"))
 
     def __new__(cls) -> "ROSClock":
         self = super().__new__(Clock, clock_type=ClockType.ROS_TIME)
         assert isinstance(self, ROSClock)
         return self
-
-    @property
-    def ros_time_is_active(self) -> bool:
-        return self._active
 
     def set_ros_time_override(self, time: Time) -> None:
         """Set the time that this clock shows while ROS time is active."""

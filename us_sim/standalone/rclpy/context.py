@@ -12,6 +12,7 @@ import weakref
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from inspect import ismethod
+from operator import attrgetter
 from threading import RLock
 
 from . import _logging_outputs, signals
@@ -27,15 +28,13 @@ Callback = Callable[[], None]
 class Context(AbstractContextManager["Context"]):
     """Encapsulates the life of init and shutdown. Used as a context manager it inits itself."""
 
+    handle = property(attrgetter("_handle"))
+
     def __init__(self) -> None:
         self._lock = RLock()
         self._callbacks: list[weakref.WeakMethod[Callback] | Callback] = []
         self._handle: ContextHandle | None = None
         self._logging_initialized = False
-
-    @property
-    def handle(self) -> ContextHandle | None:
-        return self._handle
 
     def init(
         self,
@@ -44,13 +43,7 @@ class Context(AbstractContextManager["Context"]):
         initialize_logging: bool = True,
         domain_id: int | None = None,
     ) -> None:
-        """Start this context's life.
-
-        Args:
-            args: command line, `sys.argv` when None.
-            initialize_logging: whether log levels among the arguments take effect.
-            domain_id: DDS domain; None takes ROS_DOMAIN_ID, or 0.
-        """
+        """Start this context's life."""
         with self._lock:
             if domain_id is not None and domain_id < 0:
                 raise RuntimeError(f"Domain id ({domain_id}) should not be lower than zero.")

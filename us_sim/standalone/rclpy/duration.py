@@ -7,6 +7,7 @@ True
 """
 
 from functools import total_ordering
+from operator import attrgetter
 from typing import Any
 
 from ..messages import message_class
@@ -20,16 +21,13 @@ class Duration:
     """A period between two points in time; the fraction of a nanosecond is discarded."""
 
     __slots__ = ("_nanoseconds",)
+    nanoseconds = property(attrgetter("_nanoseconds"))
 
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0):
         total = int(seconds * S_TO_NS) + int(nanoseconds)
         if not -(2**63) <= total < 2**63:
             raise OverflowError("Total nanoseconds value is too large to store in C duration.")
         self._nanoseconds = total
-
-    @property
-    def nanoseconds(self) -> int:
-        return self._nanoseconds
 
     def to_msg(self) -> Any:
         """This span as a `builtin_interfaces/msg/Duration`."""

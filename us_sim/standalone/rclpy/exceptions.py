@@ -46,37 +46,35 @@ class NoTypeSupportImportedException(Exception):
 class NameValidationException(Exception):
     """A name of a node, namespace, topic or service is not allowed."""
 
-    def __init__(self, name_type: str, name: str, error_msg: str, invalid_index: int) -> None:
+    _kind = "name"
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
         pointer = " " * invalid_index + "^"
-        super().__init__(f"Invalid {name_type}: {error_msg}:\n  '{name}'\n   {pointer}")
+        super().__init__(f"Invalid {self._kind}: {error_msg}:\n  '{name}'\n   {pointer}")
 
 
 class InvalidNamespaceException(NameValidationException):
     """A namespace is not allowed."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("namespace", name, error_msg, invalid_index)
+    _kind = "namespace"
 
 
 class InvalidNodeNameException(NameValidationException):
     """A node name is not allowed."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("node name", name, error_msg, invalid_index)
+    _kind = "node name"
 
 
 class InvalidTopicNameException(NameValidationException):
     """A topic name is not allowed."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("topic name", name, error_msg, invalid_index)
+    _kind = "topic name"
 
 
 class InvalidServiceNameException(NameValidationException):
     """A service name is not allowed."""
 
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("service name", name, error_msg, invalid_index)
+    _kind = "service name"
 
 
 class ParameterException(Exception):

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from operator import attrgetter
 from typing import Any
 
 from ._rclpy_pybind11 import InvalidHandle
@@ -47,6 +48,7 @@ class Executor(AbstractContextManager["Executor"]):
     """What SingleThreadedExecutor and MultiThreadedExecutor have in common."""
 
     _runs_elsewhere = False  # callbacks run in other threads than the one that waits
+    context = property(attrgetter("_context"))
 
     def __init__(self, *, context: Context | None = None) -> None:
         self._context = get_default_context() if context is None else context
@@ -60,16 +62,8 @@ class Executor(AbstractContextManager["Executor"]):
         self._running = RunningCallbacks()
         self._round: Iterator[Any] = iter(())
 
-    @property
-    def context(self) -> Context:
-        return self._context
-
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Start no more callbacks, and wait for those that run in other threads.
-
-        Returns:
-            False when they did not end within the timeout.
-        """
+        """Start no more callbacks, and wait for those that run; False when that takes longer."""
         self._is_shutdown = True
         self.wake()
         if not self._running.wait(timeout_sec):
@@ -230,9 +224,6 @@ class Executor(AbstractContextManager["Executor"]):
 class SingleThreadedExecutor(Executor):
     """Runs callbacks in the thread that spins."""
 
-    def __init__(self, *, context: Context | None = None) -> None:
-        super().__init__(context=context)
-
 
 class MultiThreadedExecutor(Executor):
     """Runs callbacks in several threads, as far as callback groups allow."""
@@ -242,10 +233,8 @@ class MultiThreadedExecutor(Executor):
     def __init__(self, num_threads: int | None = None, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         if num_threads is None:
-            if hasattr(os, "sched_getaffinity"):
-                num_threads = len(os.sched_getaffinity(0))
-            else:
-                num_threads = os.cpu_count() or 2
+            has_affinity = hasattr(os, "sched_getaffinity")
+            num_threads = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 2
         if num_threads == 1:
             warnings.warn(
                 "MultiThreadedExecutor is used with a single thread.\n"

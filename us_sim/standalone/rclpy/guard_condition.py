@@ -45,8 +45,7 @@ class GuardCondition(Destroyable):
     def _stirred(self) -> bool:
         return self._triggered
 
-    def _fetch(self) -> bool:
-        return self._triggered
+    _fetch = _stirred
 
     def _take(self) -> Callable[..., Any] | None:
         self._triggered = False

@@ -10,6 +10,7 @@ ValueError: Type 'Type.INTEGER' and value '60.0' do not agree
 
 import array
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 from ..messages import message_class
@@ -17,19 +18,6 @@ from ..messages import message_class
 __all__ = ["PARAMETER_SEPARATOR_STRING", "Parameter"]
 
 PARAMETER_SEPARATOR_STRING = "."
-
-_FIELDS = {  # field of rcl_interfaces/msg/ParameterValue for each value of its type
-    1: "bool_value",
-    2: "integer_value",
-    3: "double_value",
-    4: "string_value",
-    5: "byte_array_value",
-    6: "bool_array_value",
-    7: "integer_array_value",
-    8: "double_array_value",
-    9: "string_array_value",
-}
-
 
 # bool before int, since a bool is an int; scalar and sequence as in ParameterType
 _PYTHON_TYPES: list[tuple[Any, int | None, int]] = [
@@ -91,6 +79,10 @@ class Parameter:
                     )
             return False
 
+    name = property(attrgetter("_name"))
+    type_ = property(attrgetter("_type"))
+    value = property(attrgetter("_value"))
+
     def __init__(self, name, type_=None, value=None):
         if type_ is None:
             type_ = Parameter.Type.from_parameter_value(value)
@@ -106,28 +98,13 @@ class Parameter:
     def from_parameter_msg(cls, param_msg):
         """The parameter that a `rcl_interfaces/msg/Parameter` holds."""
         type_ = Parameter.Type(param_msg.value.type)
-        field = _FIELDS.get(param_msg.value.type)
-        return cls(
-            param_msg.name, type_, None if field is None else getattr(param_msg.value, field)
-        )
-
-    @property
-    def name(self):
-        return self._name
-
-    @property
-    def type_(self):
-        return self._type
-
-    @property
-    def value(self):
-        return self._value
+        return cls(param_msg.name, type_, getattr(param_msg.value, _field(type_), None))
 
     def get_parameter_value(self):
         """This value as a `rcl_interfaces/msg/ParameterValue`."""
         message: Any = message_class("rcl_interfaces/msg/ParameterValue")(type=self._type.value)
-        if self._type.value in _FIELDS:
-            setattr(message, _FIELDS[self._type.value], self._value)
+        if self._value is not None:
+            setattr(message, _field(self._type), self._value)
         return message
 
     def to_parameter_msg(self):
@@ -137,3 +114,8 @@ class Parameter:
 
     def __repr__(self) -> str:
         return f"Parameter({self._name!r}, {self._type}, {self._value!r})"
+
+
+def _field(type_: Parameter.Type) -> str:
+    """The field of a `rcl_interfaces/msg/ParameterValue` that holds a value of a type."""
+    return f"{type_.name.lower()}_value"

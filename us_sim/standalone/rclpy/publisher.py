@@ -6,7 +6,6 @@ from ..messages import serialize
 from ..transport import DdsError
 from ._endpoints import Connected, NodeLink, open_writer
 from ._rclpy_pybind11 import RCLError
-from .duration import Duration
 from .logging import get_logger
 from .qos import QoSProfile
 
@@ -27,12 +26,7 @@ class Publisher(Connected):
         self.qos_profile = qos_profile
 
     def publish(self, msg: Any) -> None:
-        """Send a message, or bytes that were serialized before.
-
-        Raises:
-            TypeError: the message is of another type.
-            RCLError: the context was shut down.
-        """
+        """Send a message, or bytes that were serialized before."""
         if isinstance(msg, self.msg_type):
             msg = serialize(msg)
         elif not isinstance(msg, bytes):
@@ -59,12 +53,3 @@ class Publisher(Connected):
     @property
     def topic_name(self) -> str:
         return self._existing_name()
-
-    def wait_for_all_acked(self, timeout: Duration = Duration(seconds=-1)) -> bool:  # noqa: B008
-        """Wait until every reliable subscription has received everything.
-
-        Returns:
-            False when that did not happen within the timeout; a negative one never ends.
-        """
-        self._require_existence()
-        return self._endpoint.wait_for_acked(timeout.nanoseconds / 1e9)

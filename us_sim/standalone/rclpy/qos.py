@@ -5,7 +5,9 @@
 """
 
 import warnings
+from collections.abc import Callable
 from enum import Enum, IntEnum
+from operator import attrgetter
 from typing import Any
 
 from .duration import Duration
@@ -103,51 +105,39 @@ QoSDurabilityPolicy = DurabilityPolicy
 QoSLivelinessPolicy = LivelinessPolicy
 
 
-def _policy(slot: str, policy: type[QoSPolicyEnum]) -> property:
-    def read(self: Any) -> QoSPolicyEnum:
-        return getattr(self, slot)
-
-    def write(self: Any, value: QoSPolicyEnum | int) -> None:
-        assert isinstance(value, int)
-        setattr(self, slot, policy(value))
-
-    return property(read, write)
-
-
-def _value(slot: str, kind: type) -> property:
-    def read(self: Any) -> Any:
-        return getattr(self, slot)
-
+def _checked(
+    slot: str, kind: type, convert: Callable[[Any], Any] = lambda value: value
+) -> property:
     def write(self: Any, value: Any) -> None:
         assert isinstance(value, kind)
-        setattr(self, slot, value)
+        setattr(self, slot, convert(value))
 
-    return property(read, write)
+    return property(attrgetter(slot), write)
 
 
 class QoSProfile:
     """The policies of one endpoint. Either `history` or `depth` has to be given."""
 
-    __slots__ = (
-        "_avoid_ros_namespace_conventions",
-        "_deadline",
-        "_depth",
-        "_durability",
+    __slots__ = (  # noqa: RUF023 (as they are printed)
         "_history",
+        "_depth",
+        "_reliability",
+        "_durability",
         "_lifespan",
+        "_deadline",
         "_liveliness",
         "_liveliness_lease_duration",
-        "_reliability",
+        "_avoid_ros_namespace_conventions",
     )
 
-    history = _policy("_history", HistoryPolicy)
-    reliability = _policy("_reliability", ReliabilityPolicy)
-    durability = _policy("_durability", DurabilityPolicy)
-    liveliness = _policy("_liveliness", LivelinessPolicy)
-    lifespan = _value("_lifespan", Duration)
-    deadline = _value("_deadline", Duration)
-    liveliness_lease_duration = _value("_liveliness_lease_duration", Duration)
-    avoid_ros_namespace_conventions = _value("_avoid_ros_namespace_conventions", bool)
+    history = _checked("_history", int, HistoryPolicy)
+    reliability = _checked("_reliability", int, ReliabilityPolicy)
+    durability = _checked("_durability", int, DurabilityPolicy)
+    liveliness = _checked("_liveliness", int, LivelinessPolicy)
+    lifespan = _checked("_lifespan", Duration)
+    deadline = _checked("_deadline", Duration)
+    liveliness_lease_duration = _checked("_liveliness_lease_duration", Duration)
+    avoid_ros_namespace_conventions = _checked("_avoid_ros_namespace_conventions", bool)
 
     def __init__(self, **kwargs: Any):
         assert all("_" + key in self.__slots__ for key in kwargs), (
@@ -190,21 +180,9 @@ class QoSProfile:
     __hash__ = None  # type: ignore[assignment]
 
     def __str__(self) -> str:
-        fields = ", ".join(f"{slot[1:]}={getattr(self, slot)}" for slot in _PRINTED)
+        fields = ", ".join(f"{slot[1:]}={getattr(self, slot)}" for slot in self.__slots__)
         return f"{type(self).__name__}({fields})"
 
-
-_PRINTED = (
-    "_history",
-    "_depth",
-    "_reliability",
-    "_durability",
-    "_lifespan",
-    "_deadline",
-    "_liveliness",
-    "_liveliness_lease_duration",
-    "_avoid_ros_namespace_conventions",
-)
 
 qos_profile_unknown = QoSProfile(
     history=HistoryPolicy.UNKNOWN,

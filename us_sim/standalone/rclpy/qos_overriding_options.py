@@ -5,6 +5,7 @@
 
 import copy
 from collections.abc import Callable, Iterable
+from operator import attrgetter
 from typing import Any
 
 from ..messages import message_class
@@ -24,6 +25,10 @@ class InvalidQosOverridesError(Exception):
 class QoSOverridingOptions:
     """Which policies may be overridden, and who checks the outcome."""
 
+    policy_kinds = property(attrgetter("_policy_kinds"))
+    callback = property(attrgetter("_callback"))
+    entity_id = property(attrgetter("_entity_id"))
+
     def __init__(
         self,
         policy_kinds: Iterable[QoSPolicyKind],
@@ -35,18 +40,6 @@ class QoSOverridingOptions:
         self._callback = callback
         self._entity_id = entity_id
 
-    @property
-    def policy_kinds(self) -> Iterable[QoSPolicyKind]:
-        return self._policy_kinds
-
-    @property
-    def callback(self) -> Callable[[QoSProfile], Any] | None:
-        return self._callback
-
-    @property
-    def entity_id(self) -> str | None:
-        return self._entity_id
-
     @classmethod
     def with_default_policies(
         cls,
@@ -55,11 +48,8 @@ class QoSOverridingOptions:
         entity_id: str | None = None,
     ) -> "QoSOverridingOptions":
         """Allow history, depth and reliability to be overridden."""
-        return cls(
-            policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY),
-            callback=callback,
-            entity_id=entity_id,
-        )
+        kinds = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+        return cls(kinds, callback=callback, entity_id=entity_id)
 
 
 def overridden(

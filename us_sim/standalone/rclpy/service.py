@@ -31,7 +31,7 @@ class Service(Receiver):
         endpoint = ServiceServer(
             link.context.participant, full_name, srv_type.__msgtype__, qos_profile
         )
-        super().__init__(link, full_name, endpoint, endpoint.take_request)
+        super().__init__(link, full_name, endpoint)
         self._context = link.context
         self.srv_type = srv_type
         self.srv_name = srv_name
@@ -40,11 +40,7 @@ class Service(Receiver):
         self.qos_profile = qos_profile
 
     def send_response(self, response: Any, header: Any) -> None:
-        """Answer a request, given the header that came with it.
-
-        Raises:
-            TypeError: the response is of another type, or the header is none.
-        """
+        """Answer a request, given the header that came with it."""
         if not isinstance(response, self.srv_type.Response):
             raise TypeError(f"Expected {self.srv_type.Response}, got {type(response)}")
         if not isinstance(header, RequestHeader):

@@ -34,8 +34,9 @@ class Subscription(Receiver):
         raw: bool,
     ) -> None:
         self.callback = callback
-        reader = open_reader(link, msg_type, topic, full_name, qos_profile)
-        super().__init__(link, full_name, reader, reader.take)
+        super().__init__(
+            link, full_name, open_reader(link, msg_type, topic, full_name, qos_profile)
+        )
         self.msg_type = msg_type
         self.topic = topic
         self.callback_group = callback_group

@@ -8,6 +8,7 @@ Duration(nanoseconds=1000000000)
 """
 
 from functools import total_ordering
+from operator import attrgetter
 from typing import Any
 
 from ..messages import message_class
@@ -23,6 +24,8 @@ class Time:
     """A point in time with nanosecond precision, never before the epoch."""
 
     __slots__ = ("_clock_type", "_nanoseconds")
+    nanoseconds = property(attrgetter("_nanoseconds"))
+    clock_type = property(attrgetter("_clock_type"))
 
     def __init__(
         self,
@@ -42,14 +45,6 @@ class Time:
             raise OverflowError("Total nanoseconds value is too large to store in C time point.")
         self._nanoseconds = total
         self._clock_type = clock_type
-
-    @property
-    def nanoseconds(self) -> int:
-        return self._nanoseconds
-
-    @property
-    def clock_type(self) -> ClockType:
-        return self._clock_type
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
         """Whole seconds, and the nanoseconds beyond them."""

@@ -1,6 +1,7 @@
 """Timers, whose callbacks executors call periodically."""
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 from ._rclpy_pybind11 import Destroyable, RCLError
@@ -17,6 +18,7 @@ class Timer(Destroyable):
     """Calls back each period. Periods that were missed are skipped, not caught up with."""
 
     _executor_event = False
+    clock = property(attrgetter("_clock"))
 
     def __init__(
         self,
@@ -44,10 +46,6 @@ class Timer(Destroyable):
         clock._timers.add(self)
 
     @property
-    def clock(self) -> Clock:
-        return self._clock
-
-    @property
     def timer_period_ns(self) -> int:
         self._require_existence()
         return self._period
@@ -62,7 +60,7 @@ class Timer(Destroyable):
     def is_ready(self) -> bool:
         """Whether the callback is due."""
         self._require_existence()
-        return self._is_due()
+        return self._stirred()
 
     def is_canceled(self) -> bool:
         """Whether the timer is stopped."""
@@ -97,11 +95,8 @@ class Timer(Destroyable):
         self._canceled = True
         self._clock._timers.discard(self)
 
-    def _is_due(self) -> bool:
-        return not self._canceled and self._next_call <= self._clock._now()
-
     def _stirred(self) -> bool:
-        return self._is_due()
+        return not self._canceled and self._next_call <= self._clock._now()
 
     def _fetch(self) -> bool:
         return True
@@ -115,20 +110,13 @@ class Timer(Destroyable):
     def _take(self) -> Callable[..., Any] | None:
         if self._canceled:
             return None
-        self._advance()
+        now = self._last_call = self._clock._now()
+        if not self._period:
+            self._next_call = max(self._next_call, now)
+        else:  # the first period that is still to come
+            periods = max(1, 1 + (now - self._next_call) // self._period)
+            self._next_call += periods * self._period
         return self.callback
-
-    def _advance(self) -> None:
-        """Take note of a call: the next one is at the first period that is still to come."""
-        now = self._clock._now()
-        self._last_call = now
-        self._next_call += self._period
-        if self._next_call <= now:
-            if self._period:
-                missed = 1 + (now - self._next_call) // self._period
-                self._next_call += missed * self._period
-            else:
-                self._next_call = now
 
     def _on_time_jump(self, before: int, is_other_time: bool) -> None:
         """Keep the rest of the period when another kind of time begins; restart it when time

@@ -6,6 +6,7 @@
 """
 
 import sys
+import time
 from types import FrameType
 from typing import Any
 
@@ -54,21 +55,7 @@ class RcutilsLogger:
         return LoggingSeverity(severity) >= outputs.effective_level(self.name)
 
     def log(self, message, severity, **kwargs):
-        """Write a message; True when it was not filtered out.
-
-        Args:
-            message: the text.
-            severity: a LoggingSeverity.
-            throttle_duration_sec: write this line at most once in so many seconds.
-            throttle_time_source_type: the Clock that says when they are over.
-            skip_first: do not write this line the first time.
-            once: write this line the first time only.
-            name: another logger name.
-
-        Raises:
-            TypeError: an unknown keyword, or a filter without its required parameter.
-            ValueError: severity, name or filters differ from an earlier call on the same line.
-        """
+        """Write a message; True when it was not filtered out."""
         severity = LoggingSeverity(severity)
         if severity < outputs.effective_level(self.name):
             return False
@@ -86,7 +73,7 @@ class RcutilsLogger:
                 code.co_name,
                 code.co_filename,
                 frame.f_lineno,
-                outputs.now(),
+                time.time_ns(),
             )
         )
         return True
