@@ -14,6 +14,7 @@ NAMES = {
 """Classes and functions."""
 
 MEMBERS = {
+    "Context": {"handle"},
     "Client": {"configure_introspection", "handle"},
     "Clock": {"create_jump_callback", "handle", "sleep_for", "sleep_until"},
     "Duration": {"get_c_duration"},

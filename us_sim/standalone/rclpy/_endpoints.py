@@ -8,74 +8,68 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..messages import CdrError, deserialize, type_hash
-from ..transport import DdsError, Reader, Writer
-from ._context_handle import ContextHandle
+from ..transport import DdsError, Participant
 from ._rclpy_pybind11 import Destroyable, RCLError
-from .exceptions import NoTypeSupportImportedException
+from .context import Context
 from .logging import get_logger
 from .qos import QoSProfile
+from .serialization import require_message_class
 
-__all__ = ["Connected", "NodeLink", "Receiver", "message_of", "open_reader", "open_writer"]
+__all__ = ["Connected", "NodeLink", "Receiver", "message_of", "open_endpoint"]
 
-_REFUSED_BY_WRITER = (
-    "New subscription discovered on topic '{}', requesting incompatible QoS. "
-    "No messages will be sent to it. Last incompatible policy: {}"
-)
-_REFUSED_BY_READER = (
-    "New publisher discovered on topic '{}', offering incompatible QoS. "
-    "No messages will be received from it. Last incompatible policy: {}"
-)
+_KINDS: dict[
+    str, tuple[Callable[..., Any], str]
+] = {  # how the participant makes one, and what is said of one that does not fit
+    "publisher": (
+        Participant.create_writer,
+        "New subscription discovered on topic '{}', requesting incompatible QoS. "
+        "No messages will be sent to it. Last incompatible policy: {}",
+    ),
+    "subscription": (
+        Participant.create_reader,
+        "New publisher discovered on topic '{}', offering incompatible QoS. "
+        "No messages will be received from it. Last incompatible policy: {}",
+    ),
+}
 
 
 @dataclass(frozen=True)
 class NodeLink:
     """What an endpoint needs of its node, without keeping the node alive."""
 
-    context: ContextHandle
+    context: Context
     logger_name: str
     wake: Callable[[], None]
 
 
-def open_writer(link: NodeLink, msg_type: Any, topic: str, *described: Any) -> Writer:
-    """A DDS writer for a topic, given its name as the node wrote it, the absolute one, and the QoS.
+def open_endpoint(
+    kind: str, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
+) -> Any:
+    """A DDS writer for a 'publisher', or reader for a 'subscription'.
+
+    Args:
+        topic: the topic's name as the node wrote it.
+        full_name: its absolute name.
 
     Raises:
         NoTypeSupportImportedException: the class is none of messages.
         RCLError: the quality of service is refused.
     """
-    create = link.context.participant.create_writer
-    return _open("publisher", create, _REFUSED_BY_WRITER, link, topic, msg_type, *described)
-
-
-def open_reader(link: NodeLink, msg_type: Any, topic: str, *described: Any) -> Reader:
-    """A DDS reader for a topic; arguments and errors as for `open_writer`."""
-    create = link.context.participant.create_reader
-    return _open("subscription", create, _REFUSED_BY_READER, link, topic, msg_type, *described)
-
-
-def _open(kind: str, create: Any, refusal: str, link: NodeLink, topic: str, *described: Any) -> Any:
+    require_message_class(msg_type)
+    package, folder, name = msg_type.__msgtype__.split("/")
+    create, refusal = _KINDS[kind]
     logger = get_logger(link.logger_name)
     try:
         return create(
-            *_described(*described),
+            link.context._participant,
+            full_name[1:] if qos.avoid_ros_namespace_conventions else f"rt{full_name}",
+            f"{package}::{folder}::dds_::{name}_",
+            qos,
+            f"typehash={type_hash(msg_type.__msgtype__)};",
             on_incompatible=lambda policy: logger.warning(refusal.format(topic, policy)),
         )
     except DdsError as error:
         raise RCLError(f"failed to create {kind}: {error}") from None
-
-
-def _described(msg_type: Any, full_name: str, qos: QoSProfile) -> tuple[str, str, QoSProfile, str]:
-    """DDS topic, DDS type, quality and user data."""
-    name = getattr(msg_type, "__msgtype__", None)
-    if not isinstance(msg_type, type) or name is None or hasattr(msg_type, "Request"):
-        raise NoTypeSupportImportedException()
-    package, folder, short_name = name.split("/")
-    return (
-        full_name[1:] if qos.avoid_ros_namespace_conventions else f"rt{full_name}",
-        f"{package}::{folder}::dds_::{short_name}_",
-        qos,
-        f"typehash={type_hash(name)};",
-    )
 
 
 class Inbox:

@@ -7,7 +7,6 @@ from itertools import chain
 from operator import attrgetter
 from typing import Any
 
-from ._context_handle import LocalNode
 from ._endpoints import NodeLink
 from ._names import require_topic_name
 from ._node_parameters import NodeParameters
@@ -17,7 +16,7 @@ from .callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from .client import Client
 from .clock import Clock
 from .constants import S_TO_NS
-from .context import Context
+from .context import LocalNode
 from .exceptions import NoTypeSupportImportedException
 from .guard_condition import GuardCondition
 from .publisher import Publisher
@@ -33,7 +32,6 @@ __all__ = ["NodeEntities"]
 class NodeEntities(NodeParameters):
     """Publishers, subscriptions, clients, services, timers and guard conditions."""
 
-    _context: Context
     _rcl_link: NodeLink
     _rcl_local_node: LocalNode
     _rcl_rosout: Rosout | None = None
@@ -128,9 +126,7 @@ class NodeEntities(NodeParameters):
         _require_service_class(srv_type)
         full_name = self._rcl_full_or_refused(srv_name, is_service=True)
         group = callback_group or self._default_callback_group
-        client = Client(
-            self._context, self._rcl_link, srv_type, srv_name, full_name, qos_profile, group
-        )
+        client = Client(self._rcl_link, srv_type, srv_name, full_name, qos_profile, group)
         return self._rcl_keep(client, self._clients, group)
 
     def create_service(
@@ -243,7 +239,7 @@ class NodeEntities(NodeParameters):
         writers = [gid for _, ours in gids for gid in ours]
         if (readers, writers) != (self._rcl_local_node.readers, self._rcl_local_node.writers):
             self._rcl_local_node.readers, self._rcl_local_node.writers = readers, writers
-            self._rcl_context_handle.announce()
+            self._context._announce()
         self._rcl_wake_executor()
 
     def _rcl_wake_executor(self) -> None:

@@ -3,10 +3,10 @@
 from typing import Any
 
 from ..graph import Graph, GraphEndpoint
-from ._context_handle import ContextHandle
 from ._names import error_in_full_topic_name, expand, require_topic_name
 from ._rclpy_pybind11 import RCLError
 from ._remapping import SERVICE, TOPIC, RemapRule, remap
+from .context import Context
 from .duration import Duration, Infinite
 from .qos import QoSProfile
 from .topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
@@ -17,7 +17,7 @@ __all__ = ["NodeGraph"]
 class NodeGraph:
     """Names and questions; `Node` says what its own name and context are."""
 
-    _rcl_context_handle: ContextHandle
+    _context: Context
     _rcl_name: str
     _rcl_namespace: str
     _rcl_remap_rules: list[RemapRule]
@@ -86,7 +86,7 @@ class NodeGraph:
 
     @property
     def _rcl_graph(self) -> Graph:
-        return self._rcl_context_handle.graph
+        return self._context._graph
 
     def _rcl_resolve(self, name: str, kind: int, only_expand: bool) -> str:
         try:

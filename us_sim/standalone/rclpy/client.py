@@ -25,7 +25,6 @@ class Client(Receiver):
 
     def __init__(
         self,
-        context: Context,
         link: NodeLink,
         srv_type: Any,
         srv_name: str,
@@ -34,10 +33,10 @@ class Client(Receiver):
         callback_group: CallbackGroup,
     ) -> None:
         endpoint = ServiceClient(
-            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+            link.context._participant, full_name, srv_type.__msgtype__, qos_profile
         )
         super().__init__(link, full_name, endpoint)
-        self.context = context
+        self.context = link.context
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.qos_profile = qos_profile

@@ -22,7 +22,6 @@ from ._running import RunningCallbacks
 from ._wake_up import WakeUp
 from .constants import S_TO_NS
 from .context import Context
-from .exceptions import NotInitializedException
 from .node import Node
 from .task import Future
 from .utilities import get_default_context
@@ -52,12 +51,11 @@ class Executor(AbstractContextManager["Executor"]):
 
     def __init__(self, *, context: Context | None = None) -> None:
         self._context = get_default_context() if context is None else context
-        if self._context.handle is None:
-            raise NotInitializedException("cannot create executor")
+        self._context._require_init("executor")
         self._nodes: dict[Node, None] = {}
         self._nodes_lock = threading.RLock()
         self._wake_up = WakeUp()
-        self._context.handle.register(self._wake_up)
+        self._context._register(self._wake_up)
         self._is_shutdown = False
         self._running = RunningCallbacks()
         self._round: Iterator[Any] = iter(())

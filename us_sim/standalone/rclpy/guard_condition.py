@@ -6,7 +6,6 @@ from typing import Any
 from ._rclpy_pybind11 import Destroyable
 from .callback_groups import CallbackGroup
 from .context import Context
-from .exceptions import NotInitializedException
 from .utilities import get_default_context
 
 __all__ = ["GuardCondition"]
@@ -24,9 +23,8 @@ class GuardCondition(Destroyable):
         context: Context | None = None,
     ):
         context = get_default_context() if context is None else context
-        if context.handle is None:
-            raise NotInitializedException("cannot create guard condition")
-        self._context_handle = context.handle
+        context._require_init("guard condition")
+        self._context = context
         self._triggered = False
         self.callback = callback
         self.callback_group = callback_group
@@ -35,7 +33,7 @@ class GuardCondition(Destroyable):
         """Have the callback called soon; raises InvalidHandle after `destroy`."""
         self._require_existence()
         self._triggered = True
-        self._context_handle.wake_all()
+        self._context._wake_all()
 
     def destroy(self) -> None:
         """Forget that it was triggered, and be triggered no more."""

@@ -14,14 +14,13 @@ from operator import attrgetter
 
 from ..messages import message_class
 from ._arguments import parse_arguments
-from ._context_handle import LocalNode
 from ._endpoints import NodeLink
 from ._names import require_namespace, require_node_name
 from ._node_entities import NodeEntities
 from ._remapping import NAMESPACE, NODE_NAME, remap_node
 from ._rosout import Rosout
 from .clock import Clock, ROSClock
-from .context import Context
+from .context import Context, LocalNode
 from .exceptions import NotInitializedException
 from .logging import get_logger
 from .parameter import Parameter
@@ -53,19 +52,17 @@ class Node(NodeEntities):
         automatically_declare_parameters_from_overrides: bool = False,
     ) -> None:
         self._context = get_default_context() if context is None else context
-        handle = self._context.handle
-        if handle is None or not handle.ok():
+        if not self._context.ok():
             raise NotInitializedException("cannot create node")
-        self._rcl_context_handle = handle
         sources = [parse_arguments(cli_args or [])]
         if use_global_arguments:
-            sources.append(handle.arguments)
+            sources.append(self._context._arguments)
         self._rcl_remap_rules = [rule for source in sources for rule in source.remap_rules]
         self._rcl_name, self._rcl_namespace = self._rcl_remapped_names(node_name, namespace or "")
 
         path = self._rcl_namespace.strip("/").replace("/", ".")
         logger_name = f"{path}.{self._rcl_name}" if path else self._rcl_name
-        self._rcl_link = NodeLink(handle, logger_name, _waker_of(self))
+        self._rcl_link = NodeLink(self._context, logger_name, _waker_of(self))
         self._rcl_local_node = LocalNode(self._rcl_name, self._rcl_namespace)
         super().__init__()
         self._clock: ROSClock = ROSClock()
@@ -77,9 +74,9 @@ class Node(NodeEntities):
         overrides.update((parameter.name, parameter) for parameter in parameter_overrides or [])
         self._rcl_keep_parameters(overrides, allow_undeclared_parameters)
 
-        with handle.announced_once():
-            handle.add_node(self._rcl_local_node)
-            if enable_rosout and "rosout" not in handle.arguments.disabled_outputs:
+        with self._context._announced_once():
+            self._context._add_node(self._rcl_local_node)
+            if enable_rosout and "rosout" not in self._context._arguments.disabled_outputs:
                 self._rcl_rosout = Rosout(self._rcl_link)
             self._logger = get_logger(logger_name)
             self._parameter_event_publisher = self.create_publisher(
@@ -121,12 +118,12 @@ class Node(NodeEntities):
     def destroy_node(self):
         """Leave the graph, with everything that belongs to this node."""
         self._parameter_event_publisher = None
-        with self._rcl_context_handle.announced_once():
+        with self._context._announced_once():
             self._rcl_destroy_all()
             if self._rcl_rosout is not None:
                 self._rcl_rosout.destroy()
                 self._rcl_rosout = None
-            self._rcl_context_handle.remove_node(self._rcl_local_node)
+            self._context._remove_node(self._rcl_local_node)
         self._rcl_wake_executor()
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from ..messages import serialize
 from ..transport import DdsError
-from ._endpoints import Connected, NodeLink, open_writer
+from ._endpoints import Connected, NodeLink, open_endpoint
 from ._rclpy_pybind11 import RCLError
 from .logging import get_logger
 from .qos import QoSProfile
@@ -18,7 +18,9 @@ class Publisher(Connected):
     def __init__(
         self, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos_profile: QoSProfile
     ) -> None:
-        super().__init__(full_name, open_writer(link, msg_type, topic, full_name, qos_profile))
+        super().__init__(
+            full_name, open_endpoint("publisher", link, msg_type, topic, full_name, qos_profile)
+        )
         self._context = link.context
         self._logger = get_logger(link.logger_name)
         self.msg_type = msg_type

@@ -29,7 +29,7 @@ class Service(Receiver):
         qos_profile: QoSProfile,
     ) -> None:
         endpoint = ServiceServer(
-            link.context.participant, full_name, srv_type.__msgtype__, qos_profile
+            link.context._participant, full_name, srv_type.__msgtype__, qos_profile
         )
         super().__init__(link, full_name, endpoint)
         self._context = link.context

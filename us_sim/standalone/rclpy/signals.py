@@ -11,8 +11,6 @@ from enum import Enum
 from types import FrameType
 from typing import Any
 
-from ._context_handle import ContextHandle
-
 __all__ = [
     "SignalHandlerOptions",
     "get_current_signal_handlers_options",
@@ -31,24 +29,26 @@ class SignalHandlerOptions(Enum):
 
 
 # Replaced, never changed: a signal handler may read it at any time.
-_contexts: tuple[weakref.ReferenceType[ContextHandle], ...] = ()
+_contexts: tuple[weakref.ReferenceType[Any], ...] = ()
 _contexts_lock = threading.Lock()
 _previous: dict[int, Any] = {}
 
 
-def add_context(handle: ContextHandle) -> None:
+def add_context(context: Any) -> None:
     """Have a context shut down by the signals whose handlers are installed."""
     global _contexts
     with _contexts_lock:
         alive = tuple(reference for reference in _contexts if reference() is not None)
-        _contexts = (*alive, weakref.ref(handle))
+        _contexts = (*alive, weakref.ref(context))
 
 
-def remove_context(handle: ContextHandle) -> None:
+def remove_context(context: Any) -> None:
     """Forget a context."""
     global _contexts
     with _contexts_lock:
-        _contexts = tuple(reference for reference in _contexts if reference() not in (None, handle))
+        _contexts = tuple(
+            reference for reference in _contexts if reference() not in (None, context)
+        )
 
 
 def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
@@ -82,9 +82,9 @@ def uninstall_signal_handlers() -> None:
 def _shut_down_contexts(number: int, frame: FrameType | None) -> None:
     # Nothing here takes a lock: the interrupted code may hold it.
     for reference in _contexts:
-        handle = reference()
-        if handle is not None:
-            handle.invalidate()
+        context = reference()
+        if context is not None:
+            context._invalidate()
     previous = _previous.get(number)
     if callable(previous):
         previous(number, frame)

@@ -6,7 +6,7 @@ from enum import Enum
 from functools import partial
 from typing import Any
 
-from ._endpoints import NodeLink, Receiver, message_of, open_reader
+from ._endpoints import NodeLink, Receiver, message_of, open_endpoint
 from .callback_groups import CallbackGroup
 from .qos import QoSProfile
 
@@ -34,9 +34,8 @@ class Subscription(Receiver):
         raw: bool,
     ) -> None:
         self.callback = callback
-        super().__init__(
-            link, full_name, open_reader(link, msg_type, topic, full_name, qos_profile)
-        )
+        reader = open_endpoint("subscription", link, msg_type, topic, full_name, qos_profile)
+        super().__init__(link, full_name, reader)
         self.msg_type = msg_type
         self.topic = topic
         self.callback_group = callback_group

@@ -8,7 +8,6 @@ from ._rclpy_pybind11 import Destroyable, RCLError
 from .callback_groups import CallbackGroup
 from .clock import Clock
 from .context import Context
-from .exceptions import NotInitializedException
 from .utilities import get_default_context
 
 __all__ = ["Timer"]
@@ -31,11 +30,10 @@ class Timer(Destroyable):
         autostart: bool = True,
     ):
         context = get_default_context() if context is None else context
-        if context.handle is None:
-            raise NotInitializedException("cannot create timer")
+        context._require_init("timer")
         if timer_period_ns < 0:
             raise RCLError("failed to create timer: timer period must be non-negative")
-        self._context_handle = context.handle
+        self._context = context
         self._clock = clock
         self._period = int(timer_period_ns)
         self._last_call = clock._now()
@@ -77,7 +75,7 @@ class Timer(Destroyable):
         self._require_existence()
         self._next_call = self._clock._now() + self._period
         self._canceled = False
-        self._context_handle.wake_all()
+        self._context._wake_all()
 
     def time_since_last_call(self) -> int:
         """Nanoseconds since the callback was called, or since the timer was made."""
@@ -128,4 +126,4 @@ class Timer(Destroyable):
         elif now < self._last_call:
             self._last_call = now
             self._next_call = now + self._period
-        self._context_handle.wake_all()
+        self._context._wake_all()
