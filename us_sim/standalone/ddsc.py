@@ -210,14 +210,7 @@ _declare(None, "dds_delete_qos", Pointer)
 _declare(None, "dds_qset_data_representation", Pointer, ct.c_uint32, _OUT)
 _declare(None, "dds_qset_deadline", Pointer, _DURATION)
 _declare(None, "dds_qset_durability", Pointer, ct.c_int)
-_declare(
-    None,
-    "dds_qset_durability_service",
-    Pointer,
-    _DURATION,
-    ct.c_int,
-    *(ct.c_int32,) * 4,
-)
+_declare(None, "dds_qset_durability_service", Pointer, _DURATION, ct.c_int, *(ct.c_int32,) * 4)
 _declare(None, "dds_qset_history", Pointer, ct.c_int, ct.c_int32)
 _declare(None, "dds_qset_ignorelocal", Pointer, ct.c_int)
 _declare(None, "dds_qset_lifespan", Pointer, _DURATION)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import ctypes as ct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from .ddsc import INFINITY, DdsError, lib
@@ -87,8 +87,7 @@ def qos_of_profile(profile: Any) -> EndpointQos:
 @contextmanager
 def dds_qos(qos: EndpointQos, data: str, ignore_own: bool = False) -> Iterator[int]:
     """A dds_qos_t with these policies and USER_DATA, deleted at the end."""
-    handle = lib.dds_create_qos()
-    try:
+    with participant_qos(data) as handle:
         is_latched = qos.durability == EndpointQos.TRANSIENT_LOCAL
         keeps_all = qos.history == EndpointQos.KEEP_ALL
         history = (1, -1) if keeps_all else (0, qos.depth)
@@ -100,10 +99,8 @@ def dds_qos(qos: EndpointQos, data: str, ignore_own: bool = False) -> Iterator[i
         lib.dds_qset_durability(handle, int(is_latched))
         if is_latched:
             lib.dds_qset_durability_service(handle, 0, *history, -1, -1, -1)
-        if qos.lifespan:
-            lib.dds_qset_lifespan(handle, qos.lifespan)
-        if qos.deadline:
-            lib.dds_qset_deadline(handle, qos.deadline)
+        lib.dds_qset_lifespan(handle, qos.lifespan or INFINITY)
+        lib.dds_qset_deadline(handle, qos.deadline or INFINITY)
         lib.dds_qset_liveliness(
             handle,
             _DDS_LIVELINESS.index(qos.liveliness),
@@ -111,10 +108,7 @@ def dds_qos(qos: EndpointQos, data: str, ignore_own: bool = False) -> Iterator[i
         )
         lib.dds_qset_data_representation(handle, 1, (ct.c_int16 * 1)(0))
         lib.dds_qset_ignorelocal(handle, int(ignore_own))
-        lib.dds_qset_userdata(handle, data.encode(), len(data.encode()))
         yield handle
-    finally:
-        lib.dds_delete_qos(handle)
 
 
 @contextmanager
@@ -130,26 +124,24 @@ def participant_qos(data: str) -> Iterator[int]:
 
 def read_qos(handle: int | None) -> EndpointQos:
     """The policies in a dds_qos_t."""
-    kind, depth = ct.c_int(), ct.c_int32()
-    duration = ct.c_int64()
-    qos = EndpointQos()
+    kind, depth, duration = ct.c_int(), ct.c_int32(), ct.c_int64()
+    found: dict[str, int] = {}
     if not handle:
-        return qos
+        return EndpointQos()
     if lib.dds_qget_reliability(handle, ct.byref(kind), None):
-        qos = replace(qos, reliability=EndpointQos.RELIABLE if kind.value else 2)
+        found["reliability"] = EndpointQos.RELIABLE if kind.value else EndpointQos.BEST_EFFORT
     if lib.dds_qget_durability(handle, ct.byref(kind)):
-        qos = replace(qos, durability=_DDS_DURABILITY[min(kind.value, 1)])
+        found["durability"] = _DDS_DURABILITY[min(kind.value, 1)]
     if lib.dds_qget_history(handle, ct.byref(kind), ct.byref(depth)):
         keeps_all = kind.value == 1
-        qos = replace(qos, history=1 + keeps_all, depth=0 if keeps_all else depth.value)
+        found |= {"history": 1 + keeps_all, "depth": 0 if keeps_all else depth.value}
     if lib.dds_qget_liveliness(handle, ct.byref(kind), ct.byref(duration)):
-        lease = _specified(duration.value)
-        qos = replace(qos, liveliness=_DDS_LIVELINESS[kind.value], liveliness_lease_duration=lease)
-    if lib.dds_qget_deadline(handle, ct.byref(duration)):
-        qos = replace(qos, deadline=_specified(duration.value))
-    if lib.dds_qget_lifespan(handle, ct.byref(duration)):
-        qos = replace(qos, lifespan=_specified(duration.value))
-    return qos
+        found["liveliness"] = _DDS_LIVELINESS[kind.value]
+        found["liveliness_lease_duration"] = _specified(duration.value)
+    for name in ("deadline", "lifespan"):
+        if getattr(lib, f"dds_qget_{name}")(handle, ct.byref(duration)):
+            found[name] = _specified(duration.value)
+    return EndpointQos(**found)
 
 
 def user_data(handle: int | None) -> dict[str, str]:

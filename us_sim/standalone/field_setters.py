@@ -34,8 +34,6 @@ _INTEGERS = {
 _FLOAT_LIMITS = {"float32": 3.402823466e38, "float64": 1.7976931348623157e308}
 
 Setter = Callable[[Any, Any], None]
-
-
 Check = Callable[[Any], None]
 
 
@@ -140,9 +138,7 @@ def _packed_sequence_setter(field: Field, store: Setter, check: Check) -> Setter
             return array(code, value.tobytes())
         if isinstance(value, (bytes, bytearray, memoryview)) and code == "B":
             return array(code, bytes(value))
-        _check_collection(field, value)
-        for element in value:
-            check(element)
+        _check_collection(field, value, check)
         return array(code, value)
 
     def set_sequence(message: Any, value: Any) -> None:
@@ -169,9 +165,7 @@ def _packed_array_setter(field: Field, store: Setter, check: Check) -> Setter:
             if value.shape != (size,):
                 raise AssertionError(f"The '{name}' numpy.ndarray() must have a size of {size}")
         else:
-            _check_collection(field, value)
-            for element in value:
-                check(element)
+            _check_collection(field, value, check)
             value = np.array(list(value), dtype)
         store(message, value)
 
@@ -182,15 +176,13 @@ def _list_setter(field: Field, store: Setter, check: Check) -> Setter:
     """A setter for lists of strings, booleans, bytes and messages."""
 
     def set_list(message: Any, value: Any) -> None:
-        _check_collection(field, value)
-        for element in value:
-            check(element)
+        _check_collection(field, value, check)
         store(message, value)
 
     return set_list
 
 
-def _check_collection(field: Field, value: Any) -> None:
+def _check_collection(field: Field, value: Any, check: Check) -> None:
     if isinstance(value, str) or not hasattr(value, "__len__") or not hasattr(value, "__iter__"):
         raise AssertionError(f"The '{field.name}' field must be a set or sequence")
     length = len(value)
@@ -202,3 +194,5 @@ def _check_collection(field: Field, value: Any) -> None:
         raise AssertionError(
             f"The '{field.name}' field must be a set or sequence with length <= {field.size}"
         )
+    for element in value:
+        check(element)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,11 @@ from .transport import Participant
 
 __all__ = ["Graph", "GraphEndpoint", "GraphNode"]
 
+_BUILTIN_TOPICS = {
+    ddsc.BUILTIN_PARTICIPANT: BuiltinParticipant,
+    ddsc.BUILTIN_PUBLICATION: BuiltinEndpoint,
+    ddsc.BUILTIN_SUBSCRIPTION: BuiltinEndpoint,
+}
 _TOPIC = "ros_discovery_info"
 _TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 _DDS_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
@@ -31,36 +36,26 @@ _DDS_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 
 @dataclass(frozen=True)
 class GraphEndpoint:
-    """A reader or writer in the domain, this process's included.
+    """A reader or writer in the domain, this process's included."""
 
-    Attributes:
-        topic, type_name: DDS names.
-        gid, participant: 16 bytes each.
-        user_data: the ``key=value;`` pairs, such as ``typehash``, ``serviceid`` and ``clientid``.
-    """
-
-    topic: str
+    topic: str  # DDS name, like the type's
     type_name: str
     is_writer: bool
     qos: EndpointQos
-    gid: bytes
+    gid: bytes  # 16 bytes, like the participant's
     participant: bytes
-    user_data: dict[str, str]
+    user_data: dict[str, str]  # such as ``typehash``, ``serviceid`` and ``clientid``
 
 
 @dataclass(frozen=True)
 class GraphNode:
-    """A ROS node and the gids of its endpoints.
-
-    Attributes:
-        participant: the gid of its participant; filled in for nodes that are announced.
-    """
+    """A ROS node and the gids of its endpoints."""
 
     namespace: str
     name: str
     reader_gids: tuple[bytes, ...] = ()
     writer_gids: tuple[bytes, ...] = ()
-    participant: bytes = b""
+    participant: bytes = b""  # its gid; filled in for nodes that are announced
 
 
 class Graph:
@@ -79,11 +74,7 @@ class Graph:
                 lib.dds_create_reader(participant.handle, topic, None, None),
                 "the domain cannot be observed",
             )
-            for topic in (
-                ddsc.BUILTIN_PARTICIPANT,
-                ddsc.BUILTIN_PUBLICATION,
-                ddsc.BUILTIN_SUBSCRIPTION,
-            )
+            for topic in _BUILTIN_TOPICS
         }
         latched = EndpointQos(durability=EndpointQos.TRANSIENT_LOCAL, depth=1)
         hash_of_type = f"typehash={type_hash(_TYPE)};"
@@ -142,9 +133,8 @@ class Graph:
         with self._lock:
             if self._closed:
                 return
-            self._take_all(ddsc.BUILTIN_PARTICIPANT, BuiltinParticipant, self._take_participant)
-            self._take_all(ddsc.BUILTIN_PUBLICATION, BuiltinEndpoint, self._take_endpoint)
-            self._take_all(ddsc.BUILTIN_SUBSCRIPTION, BuiltinEndpoint, self._take_endpoint)
+            for topic, kind in _BUILTIN_TOPICS.items():
+                self._take_all(topic, kind)
             while (sample := self._reader.take()) is not None:
                 try:
                     message: Any = deserialize(sample[0], message_class(_TYPE))
@@ -153,18 +143,21 @@ class Graph:
                 gid = bytes(message.gid.data)
                 self._nodes[gid] = tuple(_from_message(message, gid))
 
-    def _take_all(self, topic: int, kind: Any, take: Callable[[Any, bool, bool], None]) -> None:
+    def _take_all(self, topic: int, kind: Any) -> None:
         reader = self._builtin[topic]
         sample, info = ct.c_void_p(), RawSampleInfo()
         while lib.dds_take(reader, ct.byref(sample), ct.byref(info), 1, 1) == 1:
             content = ct.cast(sample, ct.POINTER(kind)).contents
             is_alive = info.instance_state == ddsc.ALIVE
             if info.valid_data or not is_alive:
-                take(content, is_alive, topic == ddsc.BUILTIN_PUBLICATION)
+                if kind is BuiltinParticipant:
+                    self._take_participant(content, is_alive)
+                else:
+                    self._take_endpoint(content, is_alive, topic == ddsc.BUILTIN_PUBLICATION)
             lib.dds_return_loan(reader, ct.byref(sample), 1)
             sample.value = None
 
-    def _take_participant(self, content: Any, is_alive: bool, _is_writer: bool) -> None:
+    def _take_participant(self, content: Any, is_alive: bool) -> None:
         gid = bytes(content.key)
         if not is_alive:
             self._participants.discard(gid)

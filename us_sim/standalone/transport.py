@@ -69,59 +69,49 @@ class Participant:
         self.dispatcher = Dispatcher(self.handle)
         _open_participants.add(self)
 
-    def create_writer(
-        self,
-        dds_topic: str,
-        dds_type: str,
-        qos: Any,
-        user_data: str = "",
-        on_incompatible: Callable[[str], None] | None = None,
-    ) -> Writer:
-        """A writer on a topic.
+    def create_writer(self, *arguments: Any, **options: Any) -> Writer:
+        """A writer on a topic; arguments as for `create_reader`, except for ``ignore_own``."""
+        return self._create(Writer, *arguments, **options)
+
+    def create_reader(self, *arguments: Any, **options: Any) -> Reader:
+        """A reader on a topic.
 
         Args:
             dds_topic: for example ``rt/us/image``.
             dds_type: for example ``sensor_msgs::msg::dds_::Image_``.
             qos: a QoSProfile of rclpy's, or an EndpointQos.
             user_data: for example ``typehash=RIHS01_…;``.
-            on_incompatible: called with the name of the policy by which a reader was refused.
+            on_incompatible: called with the name of the policy by which the other side was refused.
+            ignore_own: leave out what this participant's own writers write.
 
         Raises:
             DdsError: the topic or the quality of service is refused.
         """
-        policies, handle = self._create("writer", dds_topic, dds_type, qos, user_data, False)
-        return self._remember(Writer(self.dispatcher, handle, policies, on_incompatible))
+        return self._create(Reader, *arguments, **options)
 
-    def create_reader(
+    def _create(
         self,
+        cls: type[Endpoint],
         dds_topic: str,
         dds_type: str,
         qos: Any,
         user_data: str = "",
-        ignore_own: bool = False,
         on_incompatible: Callable[[str], None] | None = None,
-    ) -> Reader:
-        """A reader on a topic; arguments as for `create_writer`.
-
-        Args:
-            ignore_own: leave out what this participant's own writers write.
-        """
-        policies, handle = self._create("reader", dds_topic, dds_type, qos, user_data, ignore_own)
-        return self._remember(Reader(self.dispatcher, handle, policies, on_incompatible))
-
-    def _create(
-        self, kind: str, dds_topic: str, dds_type: str, qos: Any, user_data: str, ignore_own: bool
-    ) -> tuple[EndpointQos, int]:
-        """The policies and the C handle of a new reader or writer."""
+        ignore_own: bool = False,
+    ) -> Any:
         if self._closed:
             raise DdsError(f"the participant is closed, so {dds_topic!r} cannot be joined")
         policies = qos if isinstance(qos, EndpointQos) else qos_of_profile(qos)
+        kind = cls.__name__.lower()
         create = getattr(lib, f"dds_create_{kind}")
         with self._lock, dds_qos(policies, user_data, ignore_own) as dds_policies:
-            return policies, check(
+            handle = check(
                 create(self.handle, self._topic(dds_topic, dds_type), dds_policies, None),
                 f"no {kind} can be made on {dds_topic!r}; check its quality of service",
             )
+        endpoint = cls(self.dispatcher, handle, policies, on_incompatible)
+        self._endpoints.add(endpoint)
+        return endpoint
 
     def close(self) -> None:
         """Leave the domain, ending every endpoint. Nothing is called back after this."""
@@ -160,10 +150,6 @@ class Participant:
                 f"there can be no topic {dds_topic!r} of type {dds_type!r}",
             )
         return self._topics[key]
-
-    def _remember(self, endpoint: Any) -> Any:
-        self._endpoints.add(endpoint)
-        return endpoint
 
 
 _open_participants: weakref.WeakSet[Participant] = weakref.WeakSet()

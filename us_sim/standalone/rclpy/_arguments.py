@@ -6,7 +6,7 @@
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,8 @@ __all__ = ["Arguments", "parse_arguments"]
 _PARAMETER = re.compile(
     r"(?:(?P<node>[A-Za-z_][A-Za-z0-9_]*):(?!=))?(?P<name>[A-Za-z0-9_./~]+?):=(?P<value>.*)", re.S
 )
-_OUTPUTS = ("rosout", "stdout", "external-lib")
+_SWITCH = re.compile(r"--(?P<turn>enable|disable)-(?P<output>rosout|stdout|external-lib)-logs")
+_SHORT = {"-p": "--param", "-r": "--remap", "-e": "--enclave"}
 
 
 @dataclass(frozen=True)
@@ -61,30 +62,19 @@ def parse_arguments(args: Sequence[str]) -> Arguments:
     rules: list[RemapRule] = []
     parameters: list[NodeParameter] = []
     levels: list[tuple[str | None, LoggingSeverity]] = []
-    settings = {"enclave": "/"}
+    enclaves = ["/"]
     disabled: set[str] = set()
     others: list[str] = []
     unknown: list[str] = []
-    takers = {
-        "parameter override rule": (
-            ("-p", "--param"),
-            lambda text: parameters.append(_parameter(text)),
-        ),
-        "remap rule": (("-r", "--remap"), lambda text: rules.append(parse_remap_rule(text))),
-        "params file": (
-            ("--params-file",),
-            lambda text: parameters.extend(read_parameter_file(text)),
-        ),
-        "log level": (("--log-level",), lambda text: levels.append(_level(text))),
-        "enclave name": (
-            ("-e", "--enclave"),
-            lambda text: settings.__setitem__("enclave", text),
-        ),
-        "log configuration file": (("--log-config-file",), lambda _: None),
-        "log file name prefix": (("--log-file-name",), lambda _: None),
+    takers: dict[str, tuple[str, Callable[[str], Any]]] = {
+        "--param": ("parameter override rule", lambda text: parameters.append(_parameter(text))),
+        "--remap": ("remap rule", lambda text: rules.append(parse_remap_rule(text))),
+        "--params-file": ("params file", lambda text: parameters.extend(read_parameter_file(text))),
+        "--log-level": ("log level", lambda text: levels.append(_level(text))),
+        "--enclave": ("enclave name", enclaves.append),
+        "--log-config-file": ("log configuration file", lambda _: None),
+        "--log-file-name": ("log file name prefix", lambda _: None),
     }
-    by_flag = {flag: (what, take) for what, (flags, take) in takers.items() for flag in flags}
-
     for_ros = False
     remaining = iter(args)
     for argument in remaining:
@@ -94,8 +84,8 @@ def parse_arguments(args: Sequence[str]) -> Arguments:
             others.append(argument)
         elif argument == "--":
             for_ros = False
-        elif argument in by_flag:
-            what, take = by_flag[argument]
+        elif (flag := _SHORT.get(argument, argument)) in takers:
+            what, take = takers[flag]
             value = next(remaining, None)
             if value is None:
                 raise RCLInvalidROSArgsError(
@@ -109,8 +99,8 @@ def parse_arguments(args: Sequence[str]) -> Arguments:
                     f"Failed to parse ROS arguments: Couldn't parse {what}: "
                     f"'{argument} {value}'. Error: {error}"
                 ) from None
-        elif (output := _switched_output(argument)) is not None:
-            (disabled.add if argument.startswith("--disable") else disabled.discard)(output)
+        elif switch := _SWITCH.fullmatch(argument):
+            (disabled.add if switch["turn"] == "disable" else disabled.discard)(switch["output"])
         else:
             unknown.append(argument)
     if unknown:
@@ -120,7 +110,7 @@ def parse_arguments(args: Sequence[str]) -> Arguments:
         parameters=tuple(parameters),
         log_level=next((level for name, level in reversed(levels) if name is None), None),
         logger_levels=tuple((name, level) for name, level in levels if name is not None),
-        enclave=settings["enclave"],
+        enclave=enclaves[-1],
         disabled_outputs=frozenset(disabled),
         others=tuple(others),
     )
@@ -140,10 +130,3 @@ def _level(text: str) -> tuple[str | None, LoggingSeverity]:
     if level.upper() not in LoggingSeverity.__members__:
         raise ValueError("Argument does not use a valid severity level")
     return name or None, LoggingSeverity[level.upper()]
-
-
-def _switched_output(argument: str) -> str | None:
-    for output in _OUTPUTS:
-        if argument in (f"--enable-{output}-logs", f"--disable-{output}-logs"):
-            return output
-    return None

@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from operator import attrgetter
 from typing import Any
 
@@ -36,11 +36,6 @@ __all__ = [
 
 class ExternalShutdownException(Exception):
     """The context was shut down."""
-
-
-def _never() -> bool:
-    """The condition of a wait that nothing but readiness and time ends."""
-    return False
 
 
 class Executor(AbstractContextManager["Executor"]):
@@ -116,7 +111,7 @@ class Executor(AbstractContextManager["Executor"]):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run one callback, waiting for one to be ready until the time is over."""
-        self._spin_once(timeout_sec, _never)
+        self._spin_once(timeout_sec, lambda: False)
 
     def spin_once_until_future_complete(
         self, future: Future, timeout_sec: float | None = None
@@ -192,23 +187,19 @@ class Executor(AbstractContextManager["Executor"]):
             return
         self._running.begin()
         try:
-            call = self._taken(entity)
+            call = None
+            try:
+                with suppress(InvalidHandle):  # it was destroyed meanwhile
+                    call = entity._take()
+            finally:  # the next data may be looked at
+                entity._executor_event = False
+                if self._runs_elsewhere:
+                    self.wake()
             if call is not None:
                 call()
         finally:
             self._running.end()
             entity.callback_group.ending_execution(entity)
-            if self._runs_elsewhere:
-                self.wake()
-
-    def _taken(self, entity: Any) -> Callable[[], Any] | None:
-        """The call that an entity's data ask for; the next data may be looked at after that."""
-        try:
-            return entity._take()
-        except InvalidHandle:  # it was destroyed meanwhile
-            return None
-        finally:
-            entity._executor_event = False
             if self._runs_elsewhere:
                 self.wake()
 
