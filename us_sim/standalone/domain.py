@@ -37,15 +37,10 @@ _LINGER = "100 ms"
 
 @dataclass(frozen=True)
 class DiscoveryRange:
-    """Where other participants are looked for.
+    """Where other participants are looked for."""
 
-    Attributes:
-        name: SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT.
-        static_peers: addresses that are asked in addition.
-    """
-
-    name: str = "SUBNET"
-    static_peers: tuple[str, ...] = ()
+    name: str = "SUBNET"  # or LOCALHOST, OFF, SYSTEM_DEFAULT
+    static_peers: tuple[str, ...] = ()  # addresses that are asked in addition
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> DiscoveryRange:

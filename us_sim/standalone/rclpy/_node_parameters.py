@@ -219,9 +219,7 @@ class NodeParameters(NodeGraph):
         parameter = self._parameters.get(name)
         if parameter is not None and parameter.type_ is not Parameter.Type.NOT_SET:
             return parameter
-        if alternative_value is None:
-            return Parameter(name, Parameter.Type.NOT_SET)
-        return alternative_value
+        return Parameter(name) if alternative_value is None else alternative_value
 
     def get_parameters_by_prefix(self, prefix: str) -> dict[str, Any]:
         """The parameters whose names begin with a prefix and a dot, by the rest of their names."""

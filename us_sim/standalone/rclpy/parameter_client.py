@@ -13,6 +13,8 @@ from .task import Future
 
 __all__ = ["AsyncParameterClient"]
 
+Callback = Callable[[Future], Any]
+
 
 class AsyncParameterClient:
     """Asks another node's parameter services; every answer is a future of the response.
@@ -58,42 +60,34 @@ class AsyncParameterClient:
         self,
         prefixes: list[str] | None = None,
         depth: int | None = None,
-        callback: Callable[..., Any] | None = None,
+        callback: Callback | None = None,
     ) -> Future:
         """Ask for names: those that begin with one of the prefixes, of a depth."""
         return self._call("list_parameters", callback, prefixes=prefixes or [], depth=depth or 0)
 
-    def get_parameters(
-        self, names: list[str], callback: Callable[..., Any] | None = None
-    ) -> Future:
+    def get_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
         """Ask for values."""
         return self._call("get_parameters", callback, names=names)
 
-    def set_parameters(
-        self, parameters: Sequence[Any], callback: Callable[..., Any] | None = None
-    ) -> Future:
+    def set_parameters(self, parameters: Sequence[Any], callback: Callback | None = None) -> Future:
         """Set Parameters or `rcl_interfaces/msg/Parameter`s one by one."""
         return self._call("set_parameters", callback, parameters=_messages(parameters))
 
-    def describe_parameters(
-        self, names: list[str], callback: Callable[..., Any] | None = None
-    ) -> Future:
+    def describe_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
         """Ask for descriptors."""
         return self._call("describe_parameters", callback, names=names)
 
-    def get_parameter_types(
-        self, names: list[str], callback: Callable[..., Any] | None = None
-    ) -> Future:
+    def get_parameter_types(self, names: list[str], callback: Callback | None = None) -> Future:
         """Ask for types."""
         return self._call("get_parameter_types", callback, names=names)
 
     def set_parameters_atomically(
-        self, parameters: Sequence[Any], callback: Callable[..., Any] | None = None
+        self, parameters: Sequence[Any], callback: Callback | None = None
     ) -> Future:
         """Set all Parameters or `rcl_interfaces/msg/Parameter`s, or none."""
         return self._call("set_parameters_atomically", callback, parameters=_messages(parameters))
 
-    def _call(self, service: str, callback: Callable[..., Any] | None, **fields: Any) -> Future:
+    def _call(self, service: str, callback: Callback | None, **fields: Any) -> Future:
         client = self._clients[service]
         future = client.call_async(client.srv_type.Request(**fields))
         if callback is not None:

@@ -7,6 +7,7 @@
 
 import sys
 import time
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
@@ -17,12 +18,14 @@ from .logging_severity import LoggingSeverity
 __all__ = ["RcutilsLogger"]
 
 _SYSTEM_CLOCK = Clock()
-_FILTER_DEFAULTS: dict[str, dict[str, Any]] = {  # a filter's parameters; None has to be given
-    "throttle": {"throttle_duration_sec": None, "throttle_time_source_type": _SYSTEM_CLOCK},
-    "skip_first": {"skip_first": None},
-    "once": {"once": None},
-}
-_PARAMETERS = [name for parameters in _FILTER_DEFAULTS.values() for name in parameters]
+_OPTIONS = ["throttle_duration_sec", "throttle_time_source_type", "skip_first", "once"]
+
+
+def _writer(severity: LoggingSeverity) -> Callable[..., bool]:
+    def write(self, message, **kwargs):
+        return self.log(message, severity, **kwargs)
+
+    return write
 
 
 class RcutilsLogger:
@@ -78,98 +81,57 @@ class RcutilsLogger:
         )
         return True
 
-    def debug(self, message, **kwargs):
-        """Write a message with severity DEBUG."""
-        return self.log(message, LoggingSeverity.DEBUG, **kwargs)
-
-    def info(self, message, **kwargs):
-        """Write a message with severity INFO."""
-        return self.log(message, LoggingSeverity.INFO, **kwargs)
-
-    def warning(self, message, **kwargs):
-        """Write a message with severity WARN."""
-        return self.log(message, LoggingSeverity.WARN, **kwargs)
-
-    def warn(self, message, **kwargs):
-        """Write a message with severity WARN."""
-        return self.warning(message, **kwargs)
-
-    def error(self, message, **kwargs):
-        """Write a message with severity ERROR."""
-        return self.log(message, LoggingSeverity.ERROR, **kwargs)
-
-    def fatal(self, message, **kwargs):
-        """Write a message with severity FATAL."""
-        return self.log(message, LoggingSeverity.FATAL, **kwargs)
+    debug = _writer(LoggingSeverity.DEBUG)
+    info = _writer(LoggingSeverity.INFO)
+    warning = warn = _writer(LoggingSeverity.WARN)
+    error = _writer(LoggingSeverity.ERROR)
+    fatal = _writer(LoggingSeverity.FATAL)
 
     def _passes_filters(
-        self, frame: FrameType, severity: LoggingSeverity, name: str, kwargs: dict[str, Any]
+        self, frame: FrameType, severity: LoggingSeverity, name: str, options: dict[str, Any]
     ) -> bool:
-        wanted = _wanted_filters(kwargs)
+        clock = _throttle_clock(options)
+        asked = {
+            "Logger severity": severity,
+            "Logger name": name,
+            "Requested logging filters": {option for option in options if options[option]},
+            "Logging filter parameters": options,
+        }
         place = (frame.f_code.co_filename, frame.f_lineno, frame.f_lasti)
-        context = self._contexts.get(place)
-        if context is None:
-            context = {"severity": severity, "name": name, "filters": wanted, **kwargs}
-            self._contexts[place] = context
-        elif severity != context["severity"]:
-            raise ValueError("Logger severity cannot be changed between calls.")
-        elif name != context["name"]:
-            raise ValueError("Logger name cannot be changed between calls.")
-        elif wanted != context["filters"]:
-            raise ValueError("Requested logging filters cannot be changed between calls.")
-        elif any(context.get(key) != value for key, value in kwargs.items()):
-            raise ValueError("Logging filter parameters cannot be changed between calls.")
-        return all(_FILTERS[kind](context) for kind in wanted)
+        context = self._contexts.setdefault(place, asked)
+        for subject, value in asked.items():
+            if value != context[subject]:
+                raise ValueError(f"{subject} cannot be changed between calls.")
+        if period := options.get("throttle_duration_sec"):
+            now = clock.now().nanoseconds
+            if now < context.get("last_logged", 0) + period * 1e9:
+                return False
+            context["last_logged"] = now
+        if options.get("skip_first") and not context.get("has_skipped"):
+            context["has_skipped"] = True
+            return False
+        if options.get("once"):
+            had_logged, context["has_logged"] = context.get("has_logged"), True
+            return not had_logged
+        return True
 
 
-def _wanted_filters(kwargs: dict[str, Any]) -> list[str]:
-    """Which filters the keywords ask for; completes the keywords with defaults."""
-    wanted = [
-        kind
-        for kind, parameters in _FILTER_DEFAULTS.items()
-        if any(kwargs.get(name) for name in parameters)
-    ]
-    for kind in wanted:
-        for name, default in _FILTER_DEFAULTS[kind].items():
-            if name not in kwargs:
-                if default is None:
-                    raise TypeError(
-                        f'required parameter "{name}" not specified '
-                        f'but is required for the the logging filter "{kind}"'
-                    )
-                kwargs[name] = default
-    for name in kwargs:
-        if name not in _PARAMETERS:
+def _throttle_clock(options: dict[str, Any]) -> Clock:
+    """The clock that throttles; raises TypeError or ValueError when the options are none."""
+    for name in options:
+        if name not in _OPTIONS:
             raise TypeError(
-                f'parameter "{name}" is not one of the recognized logging options "{_PARAMETERS}"'
+                f'parameter "{name}" is not one of the recognized logging options "{_OPTIONS}"'
             )
-    clock = kwargs.get("throttle_time_source_type", _SYSTEM_CLOCK)
+    clock = options.get("throttle_time_source_type", _SYSTEM_CLOCK)
     if not isinstance(clock, Clock):
         raise ValueError(f'Received throttle_time_source_type of "{clock}" is not a clock instance')
-    return wanted
-
-
-def _throttle(context: dict[str, Any]) -> bool:
-    now = context["throttle_time_source_type"].now().nanoseconds
-    if now < context.get("last_logged", 0) + context["throttle_duration_sec"] * 1e9:
-        return False
-    context["last_logged"] = now
-    return True
-
-
-def _skip_first(context: dict[str, Any]) -> bool:
-    skipped = context.get("has_skipped", False)
-    context["has_skipped"] = True
-    return skipped
-
-
-def _once(context: dict[str, Any]) -> bool:
-    logged = context.get("has_logged", False)
-    context["has_logged"] = True
-    return not logged
-
-
-_FILTERS = {"throttle": _throttle, "skip_first": _skip_first, "once": _once}
+    if "throttle_time_source_type" in options and "throttle_duration_sec" not in options:
+        raise TypeError(
+            'required parameter "throttle_duration_sec" not specified '
+            'but is required for the the logging filter "throttle"'
+        )
+    return clock
 
 
 def _calling_frame() -> FrameType:
