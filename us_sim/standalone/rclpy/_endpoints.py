@@ -10,6 +10,7 @@ from typing import Any
 from ..messages import CdrError, deserialize, type_hash
 from ..transport import DdsError, Participant
 from ._rclpy_pybind11 import Destroyable, RCLError
+from .callback_groups import CallbackGroup
 from .context import Context
 from .logging import get_logger
 from .qos import QoSProfile
@@ -107,7 +108,9 @@ class Inbox:
 class Connected(Destroyable):
     """What is on the network under an absolute name until `destroy`."""
 
-    def __init__(self, full_name: str, endpoint: Any) -> None:
+    def __init__(self, link: NodeLink, full_name: str, endpoint: Any, qos: QoSProfile) -> None:
+        self._context = link.context
+        self.qos_profile = qos
         self._full_name = full_name
         self._endpoint = endpoint
         self._gids: tuple[list[bytes], list[bytes]] = endpoint.gids  # of readers and writers
@@ -117,6 +120,7 @@ class Connected(Destroyable):
         super().destroy()
         self._endpoint.close()
 
+    @property
     def _existing_name(self) -> str:
         self._require_existence()
         return self._full_name
@@ -127,8 +131,11 @@ class Receiver(Connected):
 
     _executor_event = False
 
-    def __init__(self, link: NodeLink, full_name: str, endpoint: Any) -> None:
-        super().__init__(full_name, endpoint)
+    def __init__(
+        self, link: NodeLink, full_name: str, endpoint: Any, qos: QoSProfile, group: CallbackGroup
+    ) -> None:
+        super().__init__(link, full_name, endpoint, qos)
+        self.callback_group = group
         self._inbox = Inbox(endpoint.take, link.wake)
         endpoint.set_on_data(self._inbox.notify)
 

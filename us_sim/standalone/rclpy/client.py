@@ -23,6 +23,8 @@ _PAUSE = 0.01  # s, between two looks at whether a service is there
 class Client(Receiver):
     """Sends requests to one service."""
 
+    service_name = Receiver._existing_name
+
     def __init__(
         self,
         link: NodeLink,
@@ -35,12 +37,10 @@ class Client(Receiver):
         endpoint = ServiceClient(
             link.context._participant, full_name, srv_type.__msgtype__, qos_profile
         )
-        super().__init__(link, full_name, endpoint)
+        super().__init__(link, full_name, endpoint, qos_profile, callback_group)
         self.context = link.context
         self.srv_type = srv_type
         self.srv_name = srv_name
-        self.qos_profile = qos_profile
-        self.callback_group = callback_group
         self._pending_requests: dict[int, Future] = {}
         self._lock = threading.Lock()
 
@@ -91,10 +91,6 @@ class Client(Receiver):
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
         """Wait until a service is connected; whether it was within the time."""
         return wait_until(self.service_is_ready, self.context, timeout_sec)
-
-    @property
-    def service_name(self) -> str:
-        return self._existing_name()
 
     def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
         response = message_of(data, self.srv_type.Response)

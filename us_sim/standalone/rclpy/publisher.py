@@ -15,17 +15,16 @@ __all__ = ["Publisher"]
 class Publisher(Connected):
     """Sends messages of one type to one topic."""
 
+    topic_name = Connected._existing_name
+
     def __init__(
         self, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos_profile: QoSProfile
     ) -> None:
-        super().__init__(
-            full_name, open_endpoint("publisher", link, msg_type, topic, full_name, qos_profile)
-        )
-        self._context = link.context
+        writer = open_endpoint("publisher", link, msg_type, topic, full_name, qos_profile)
+        super().__init__(link, full_name, writer, qos_profile)
         self._logger = get_logger(link.logger_name)
         self.msg_type = msg_type
         self.topic = topic
-        self.qos_profile = qos_profile
 
     def publish(self, msg: Any) -> None:
         """Send a message, or bytes that were serialized before."""
@@ -51,7 +50,3 @@ class Publisher(Connected):
         """How many subscriptions are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
-
-    @property
-    def topic_name(self) -> str:
-        return self._existing_name()

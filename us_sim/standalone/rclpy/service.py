@@ -18,6 +18,8 @@ __all__ = ["Service"]
 class Service(Receiver):
     """Calls back with each request, and answers with what the callback returns."""
 
+    service_name = Receiver._existing_name
+
     def __init__(
         self,
         link: NodeLink,
@@ -31,13 +33,10 @@ class Service(Receiver):
         endpoint = ServiceServer(
             link.context._participant, full_name, srv_type.__msgtype__, qos_profile
         )
-        super().__init__(link, full_name, endpoint)
-        self._context = link.context
+        super().__init__(link, full_name, endpoint, qos_profile, callback_group)
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
-        self.callback_group = callback_group
-        self.qos_profile = qos_profile
 
     def send_response(self, response: Any, header: Any) -> None:
         """Answer a request, given the header that came with it."""
@@ -48,10 +47,6 @@ class Service(Receiver):
         self._require_existence()
         if self._context.ok():
             self._endpoint.send_response(serialize(response), header)
-
-    @property
-    def service_name(self) -> str:
-        return self._existing_name()
 
     def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
         try:

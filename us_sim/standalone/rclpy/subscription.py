@@ -16,6 +16,8 @@ __all__ = ["Subscription"]
 class Subscription(Receiver):
     """Calls back with each message that is received on one topic."""
 
+    topic_name = Receiver._existing_name
+
     class CallbackType(Enum):
         """Whether a callback takes the message only, or also where it came from."""
 
@@ -35,21 +37,15 @@ class Subscription(Receiver):
     ) -> None:
         self.callback = callback
         reader = open_endpoint("subscription", link, msg_type, topic, full_name, qos_profile)
-        super().__init__(link, full_name, reader)
+        super().__init__(link, full_name, reader, qos_profile, callback_group)
         self.msg_type = msg_type
         self.topic = topic
-        self.callback_group = callback_group
-        self.qos_profile = qos_profile
         self.raw = raw
 
     def get_publisher_count(self) -> int:
         """How many publishers are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
-
-    @property
-    def topic_name(self) -> str:
-        return self._existing_name()
 
     @property
     def callback(self) -> Callable[..., Any]:
