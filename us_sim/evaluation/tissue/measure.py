@@ -194,10 +194,8 @@ class _Bench:
     def _nonlinear(self, trial: Trial, model: TissueModel) -> tuple[Outcome, str]:
         if "nonlinear" not in self._exact:
             reference = self._references[trial.scene.name]
-            solution = reference.solution
-            force, volume = float(solution.force[2]), solution.volume
-            self._exact["nonlinear"] = (
-                Outcome(solution.at(model.mesh.nodes), force, volume),
-                f"nonlinear: scikit-fem, {reference.unknowns} unknowns",
-            )
+            there = reference.solution
+            outcome = Outcome(there.at(model.mesh.nodes), float(there.force[2]), there.volume)
+            words = f"nonlinear: scikit-fem, {reference.unknowns} unknowns"
+            self._exact["nonlinear"] = outcome, words
         return self._exact["nonlinear"]

@@ -30,7 +30,7 @@ from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["Bench", "Point", "View", "mirrored", "visible"]
+__all__ = ["Bench", "Point", "View", "mirrored", "those", "views_of", "visible"]
 
 _FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
@@ -125,6 +125,17 @@ class Point(Row):
     def turned(self, percent: float) -> float:
         """Degrees, percentile of the rotation's error."""
         return _percentile([view.degrees for view in self.found], percent)
+
+
+def those(points: Sequence[Point], **case: object) -> list[Point]:
+    """Points whose case has these values, such as ``marker="aruco_40mm", distance=0.4``."""
+    wanted = case.items()
+    return [p for p in points if all(getattr(p.case, name) == value for name, value in wanted)]
+
+
+def views_of(points: Sequence[Point], **case: object) -> list[View]:
+    """All views of these."""
+    return [view for point in those(points, **case) for view in point.views]
 
 
 class Bench:
