@@ -31,11 +31,8 @@ class TrackedPath:
     @property
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
-        summary: dict[str, Any] = {
-            "images": self.images,
-            "shown": self.shown,
-            "tracked": len(self.mm),
-        }
+        summary: dict[str, Any] = {"images": self.images, "shown": self.shown}
+        summary["tracked"] = len(self.mm)
         for name, values in (("error_mm", self.mm), ("error_deg", self.degrees)):
             median, most = np.percentile(values, [50, 95])
             summary[name] = {

@@ -70,14 +70,9 @@ def register_landmarks(
     residuals = np.linalg.norm(pose.apply(measured) - known, axis=1)
     fre = math.sqrt(float((residuals**2).mean()))
     _check_fit(measured, known, residuals, names)
-    return LandmarkRegistration(
-        pose,
-        names,
-        residuals,
-        fre,
-        _leave_one_out(measured, known),
-        _deviations(known, pose.position, residuals),
-    )
+    left_out = _leave_one_out(measured, known)
+    deviations = _deviations(known, pose.position, residuals)
+    return LandmarkRegistration(pose, names, residuals, fre, left_out, deviations)
 
 
 def _check(measured: NDArray[np.float64], known: NDArray[np.float64], names: Sequence[str]) -> None:

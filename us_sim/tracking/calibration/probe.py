@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -212,16 +212,8 @@ class _Sightings:
 
     def only(self, which: NDArray[np.bool_]) -> _Sightings:
         """The sightings that a mask selects."""
-        return _Sightings(
-            self.pixels[which],
-            self.rotations[which],
-            self.positions[which],
-            self.targets[which],
-            self.across[which],
-            self.unknown[which],
-            self.unknowns,
-            self.spacing,
-        )
+        arrays = ("pixels", "rotations", "positions", "targets", "across", "unknown")
+        return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
     def distances(self, image: _Image) -> NDArray[np.float64]:
         """(N, 3) m from the features to their pixels, across wires."""

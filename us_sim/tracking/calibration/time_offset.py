@@ -88,15 +88,10 @@ def find_time_offset(
     correlation = match.correlation(shift)
     without = [match.without(block).refined(shift, 10 * step) for block in _blocks(len(times))]
     spread = np.asarray(without) - np.mean(without)
-    return TimeOffset(
-        sign * shift,
-        float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum())),
-        correlation,
-        float(np.sqrt(max(1.0 - correlation**2, 0.0))),
-        float(np.ptp(times)),
-        sign * tried,
-        correlations,
-    )
+    deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum()))
+    residual = float(np.sqrt(max(1.0 - correlation**2, 0.0)))
+    fit = (sign * shift, deviation, correlation, residual)
+    return TimeOffset(*fit, float(np.ptp(times)), sign * tried, correlations)
 
 
 @dataclass(frozen=True, eq=False)
