@@ -202,13 +202,11 @@ def neo_hookean_forces(
     """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N.
 
     (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
-    2018, without its logarithmic barrier.) J - 1 is computed as a polynomial in the displacement's
-    gradient, so that nothing cancels at rest.
+    2018, without its logarithmic barrier.)
     """
     shear, whole, volume, gradient = _elements(mesh, materials)
     slope = _slopes(mesh, gradient, displacement)
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    swelling = _trace(slope) + minors + np.linalg.det(slope)
+    swelling = _swelling(slope)
     own, nodal = _bulk_parts(shear, whole)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
     pressure += shear * _crowding(1 + swelling)
@@ -265,8 +263,7 @@ def volume_forces(
     """
     gradient = _gradients(mesh)
     slope = _slopes(mesh, gradient, displacement)
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    swelling = _trace(slope) + minors + np.linalg.det(slope)
+    swelling = _swelling(slope)
     cofactor = _cofactors(slope + np.eye(3))
     left = np.ones(len(swelling))
     if yielding:
@@ -369,6 +366,12 @@ def _around(mesh: TetrahedralMesh, weight: Array, value: Array) -> Array:
     np.add.at(sum_of, mesh.tetrahedra, (weight * value)[:, None])
     mean = np.divide(sum_of, total, out=np.zeros_like(total), where=total > 0)
     return np.asarray(mean[mesh.tetrahedra].mean(axis=1))
+
+
+def _swelling(slope: Array) -> Array:
+    """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
+    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
+    return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
 
 
 def _trace(matrices: Array) -> Array:
