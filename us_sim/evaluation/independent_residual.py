@@ -127,9 +127,7 @@ Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
 """Makes what checks the residuals of one method on a model."""
 
 
-def solid_residual(
-    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array],
-) -> Residual:
+def solid_residual(forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array]) -> Residual:
     """For a method of finite elements, whose nodes are held by those ``forces``."""
 
     def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
@@ -250,11 +248,7 @@ def spring_forces(
 
 
 def volume_forces(
-    mesh: TetrahedralMesh,
-    element: Array,
-    nodal: Array,
-    displacement: Array,
-    yielding: bool = False,
+    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array, yielding: bool = False
 ) -> Array:
     """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
 

@@ -73,10 +73,7 @@ class LinearEquations:
         return self._product(displacement.ravel()).reshape(-1, 3)
 
     def solve(
-        self,
-        touched: NDArray[np.int32],
-        normals: NDArray[np.float64],
-        depths: NDArray[np.float64],
+        self, touched: NDArray[np.int32], normals: NDArray[np.float64], depths: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Equilibrium with known displacements of the touched nodes along their normals.
 
