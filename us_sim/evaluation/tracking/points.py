@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -156,15 +156,18 @@ class Bench:
         if key not in self._rooms:
             self._rooms = {key: RenderedView(camera, seen.body)}
         room = self._rooms[key]
+        conditions, _ = CONDITIONS[case.condition]
         views: list[View] = []
         parts: list[tuple[float, float]] = []
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
         try:
             for number in range(sequences):
-                images = _images(room, case, number)
                 source = CameraSource(camera, seen.body)
-                for frame, (pose, image) in enumerate(images):
+                seed = zlib.crc32(f"{case} {number}".encode())
+                for frame, pose in enumerate(case.sequence(number)):
+                    # The hand and the light stay as they are through a sequence, not the noise.
+                    image = room.render(pose, conditions, seed, case.motion(number), frame)
                     views.append(_view(source, seen, frame, pose, image))
                     if frame == 0:
                         parts.append(_parts(camera, seen, image))
@@ -173,17 +176,6 @@ class Bench:
         detector = _percentile([part[0] for part in parts], 50)
         solver = _percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
         return Point(case, tuple(views), detector, solver)
-
-
-def _images(
-    room: RenderedView, case: Case, number: int
-) -> Iterator[tuple[Pose, NDArray[np.uint8]]]:
-    """Poses of a sequence and how they look."""
-    conditions, _ = CONDITIONS[case.condition]
-    seed = zlib.crc32(f"{case} {number}".encode())
-    for frame, pose in enumerate(case.sequence(number)):
-        # The hand and the light stay as they are through a sequence, the noise does not.
-        yield pose, room.render(pose, conditions, seed, case.motion(number), frame)
 
 
 def _view(
@@ -212,9 +204,8 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
     off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
     angle = rotation_angle(found, true)
     other = rotation_angle(found, mirrored(true, middle, seen.front))
-    error = np.concatenate(
-        [true.position - found.position, rotation_between(found.orientation, true.orientation)]
-    )
+    turn = rotation_between(found.orientation, true.orientation)
+    error = np.concatenate([true.position - found.position, turn])
     square = np.nan
     if measured.covariance is not None:
         square = float(error @ np.linalg.pinv(measured.covariance, hermitian=True) @ error)
