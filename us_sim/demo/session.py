@@ -159,9 +159,7 @@ class Session:
             "recorder": self._recorded(),
         }
         if stamps:
-            summary["latency_ms"]["end_to_end"] = dict(
-                zip(("p50", "p99"), self.end_to_end(), strict=True)
-            )
+            latency["end_to_end"] = dict(zip(("p50", "p99"), self.end_to_end(), strict=True))
         if areas is not None:
             summary["areas"] = _areas(areas)
         return summary

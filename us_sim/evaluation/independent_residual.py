@@ -7,13 +7,11 @@ the returned nodes, so that what a solver rounds, or leaves out, shows.
 >>> import numpy as np
 >>> from us_sim.evaluation.independent_residual import hooke_forces
 >>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
->>> materials = uniform_material(mesh, Material(10e3, 0.25))
->>> pulled = mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
->>> forces = hooke_forces(mesh, materials, pulled)
->>> f"{forces[mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
+>>> from us_sim.tissue.model import TissueModel
+>>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
+>>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
+>>> forces = hooke_forces(block.mesh, block.materials, pulled)
+>>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
 '1.200 N'
 """
 
@@ -273,9 +271,7 @@ def volume_forces(
 def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
     """N, about the norm of the forces that arise when coordinates are rounded to doubles.
 
-    Args:
-        mesh: whose nodes are rounded.
-        modulus: (M,) Pa, the stiffest of each tetrahedron.
+    ``modulus`` is (M,) Pa, the stiffest of each tetrahedron.
     """
     steep = np.linalg.norm(_gradients(mesh), axis=2)
     digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -127,16 +127,18 @@ def _worst(tried: Sequence[Tried]) -> list[str]:
     parts = []
     far = [one for one in ran if one.trial.recovery_frames is None]
     if far:
-        far.sort(key=lambda one: -one.trial.recovered_mm)
-        lines = [f"- {one.trial.recovered_mm:.3g} mm: {_described(one)}" for one in far[:5]]
-        parts += ["Farthest from rest after release:", "\n".join(lines)]
+        parts += ["Farthest from rest after release:"]
+        parts += [_largest(far, lambda trial: trial.recovered_mm, " mm")]
     large = [one for one in ran if one.trial.residual_checked > 1e-2]
     if large:
-        large.sort(key=lambda one: -one.trial.residual_checked)
-        lines = [f"- {one.trial.residual_checked:.3g}: {_described(one)}" for one in large[:5]]
         parts += [f"Residual above 1e-2 under the probe in {len(large)} cases; the largest:"]
-        parts += ["\n".join(lines)]
+        parts += [_largest(large, lambda trial: trial.residual_checked)]
     return parts
+
+
+def _largest(tried: Sequence[Tried], value: Callable[[Trial], float], unit: str = "") -> str:
+    worst = sorted(tried, key=lambda one: -value(one.trial))[:5]
+    return "\n".join(f"- {value(one.trial):.3g}{unit}: {_described(one)}" for one in worst)
 
 
 def _described(one: Tried) -> str:

@@ -127,13 +127,10 @@ class _Bench:
         """The trial's rows: against its own equations, and against the nonlinear reference."""
         model = self._model(trial)
         threads = int(trial.setting.get("threads", 1))
+        setting = ", ".join(f"{key}={value}" for key, value in trial.setting.items()) or "default"
         empty = Point(
-            trial.scene.name,
-            trial.method,
-            len(model.mesh.nodes),
-            len(model.mesh.tetrahedra),
-            threads,
-            ", ".join(f"{key}={value}" for key, value in trial.setting.items()) or "default",
+            *(trial.scene.name, trial.method, len(model.mesh.nodes), len(model.mesh.tetrahedra)),
+            *(threads, setting),
             default=not {key for key in trial.setting if key != "threads"} and threads == 1,
         )
         try:

@@ -223,10 +223,8 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
 def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
     """The pose that a plane seen from afar may be taken for: tilted to the other side.
 
-    Args:
-        pose: of the body in ``camera_optical``.
-        middle: (3,) m, of the body, in its own frame.
-        front: (3,) unit, normal of its plane, in its own frame.
+    The pose is of the body in ``camera_optical``; its middle (3,) m, and the unit normal (3,) of
+    its front, are in its own frame.
     """
     sight = pose.apply(middle[None])[0]
     sight = sight / np.linalg.norm(sight)

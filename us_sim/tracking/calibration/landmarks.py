@@ -91,15 +91,12 @@ def _check(measured: Array, known: Array, names: Sequence[str]) -> None:
             raise CalibrationError(f"landmark {bad}: its {what} coordinates are not finite")
         length, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _FLATTEST * length or length == 0.0:
+            # A tenth of the landmarks' extent; 10 mm where they have none.
+            advised = max(1e2 * 2.0 * length / math.sqrt(len(points)), 10.0)
             raise CalibrationError(
                 f"the {what} landmarks lie on a line, about which the registration may turn: add "
-                f"one at least {_advised(length, len(points)):.0f} mm beside it"
+                f"one at least {advised:.0f} mm beside it"
             )
-
-
-def _advised(length: float, count: int) -> float:
-    """mm, a tenth of the landmarks' extent; 10 where they have none."""
-    return max(1e2 * 2.0 * length / math.sqrt(count), 10.0)
 
 
 def _check_fit(measured: Array, known: Array, residuals: Array, names: Sequence[str]) -> None:

@@ -162,12 +162,10 @@ def _solve(means: Array, rotations: Array, positions: Array) -> Array:
 
 
 def _squared_distances(rotations: Array, positions: Array, solution: Array) -> Array:
-    squares: Array = ((rotations @ solution[:3] + positions - solution[3:]) ** 2).sum(axis=1)
-    return squares
+    return np.asarray(((rotations @ solution[:3] + positions - solution[3:]) ** 2).sum(axis=1))
 
 
 def _near(squares: Array) -> NDArray[np.bool_]:
     """Distances that a normal error of the median's size would have; at least rounding errors."""
     variance = float(np.median(squares)) / _MEDIAN_SQUARE
-    near: NDArray[np.bool_] = squares <= max(variance * _LARGEST_SQUARE, 1e-18)
-    return near
+    return np.asarray(squares <= max(variance * _LARGEST_SQUARE, 1e-18))

@@ -82,8 +82,7 @@ def draw_offset(
 
 
 def _normal(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    scaled: NDArray[np.float64] = (values - values.mean()) / values.std()
-    return scaled
+    return np.asarray((values - values.mean()) / values.std())
 
 
 def _save(figure: Figure, path: Path) -> None:
