@@ -79,7 +79,8 @@ def path_video(
     _require_in_view(scene, body, seen)
     numbers = [CAMERA.lens[0], body.corners, body.ids, path.log_times - path.log_times[0]]
     numbers += [path.positions, path.orientations]
-    numbers += [part for pose in (registration, calibration) for part in _numbers(pose)]
+    for pose in (registration, calibration):
+        numbers += [pose.position, pose.orientation]
     digest = hashlib.sha256(f"{_FORM} {RATE} {_EXPOSURE} {_CODEC} {body.dictionary}".encode())
     for array in numbers:
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -152,10 +153,6 @@ def _require_in_view(scene: Scene, body: RigidBody, seen: list[Pose]) -> None:
         )
 
 
-def _numbers(pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return pose.position, pose.orientation
-
-
 def _is_whole(entry: Path) -> bool:
     """Whether a video is there as it was written."""
     try:
@@ -178,14 +175,8 @@ def _make(
     partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))
     try:
         video = partial / _NAMES[0]
-        writer = cv2.VideoWriter(
-            str(video),
-            cv2.CAP_FFMPEG,
-            cv2.VideoWriter.fourcc(*_CODEC),
-            RATE,
-            (CAMERA.width, CAMERA.height),
-            False,
-        )
+        codec, size = cv2.VideoWriter.fourcc(*_CODEC), (CAMERA.width, CAMERA.height)
+        writer = cv2.VideoWriter(str(video), cv2.CAP_FFMPEG, codec, RATE, size, False)
         if not writer.isOpened():
             raise UsSimError(
                 f"this OpenCV cannot write {_CODEC} video to {video}: install "

@@ -36,13 +36,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
         axes = figure.add_subplot(grid[divmod(i, 3)])
-        axes.imshow(
-            images[stamp],
-            cmap="gray",
-            vmin=0,
-            vmax=255,
-            extent=(left, right, bottom, top),
-        )
+        extent = (left, right, bottom, top)
+        axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
         press = session.poses[stamp].position[2] * 1e3
         axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, probe at {press:+.1f} mm")
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
@@ -91,8 +86,7 @@ def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type:
     for name, area in areas.area.items():
         percent = area / area[areas.rest] * 100
         axes.plot(areas.time, percent, color=COLOURS[name], label=f"{name} lumen", lw=2)
-    axes.set_ylabel("area, % of rest")
-    axes.set_xlabel("time, s")
+    axes.set(xlabel="time, s", ylabel="area, % of rest")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
     for time in moments:

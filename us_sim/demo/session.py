@@ -73,9 +73,7 @@ class Session:
 
     def latency(self, topic: str) -> tuple[float, float]:
         """Age of the pose when ``topic`` was published, ms: median and 99th percentile."""
-        ages = [(sent - stamp) / MILLISECOND for stamp, sent, _ in self.sent[topic]]
-        p50, p99 = np.percentile(ages, [50, 99])
-        return float(p50), float(p99)
+        return _percentiles([sent - stamp for stamp, sent, _ in self.sent[topic]])
 
     def end_to_end(self) -> tuple[float, float]:
         """Age of the pose when its image had arrived at the recorder, ms: median, 99th percentile.
@@ -86,10 +84,7 @@ class Session:
         rows = self.sent.get("/ultrasound/image", [])
         if not rows:
             raise BagError("the session holds no image on /ultrasound/image")
-        p50, p99 = np.percentile(
-            [(logged - stamp) / MILLISECOND for stamp, _, logged in rows], [50, 99]
-        )
-        return float(p50), float(p99)
+        return _percentiles([logged - stamp for stamp, _, logged in rows])
 
     def images_at(self, stamps: Collection[int]) -> dict[int, NDArray[np.uint8]]:
         """The images with those stamps, (rows, columns) each, read in one pass.
@@ -164,9 +159,7 @@ class Session:
             "recorder": self._recorded(),
         }
         if stamps:
-            summary["latency_ms"]["end_to_end"] = dict(
-                zip(("p50", "p99"), self.end_to_end(), strict=True)
-            )
+            latency["end_to_end"] = dict(zip(("p50", "p99"), self.end_to_end(), strict=True))
         if areas is not None:
             summary["areas"] = _areas(areas)
         return summary
@@ -235,6 +228,12 @@ def read_session(file: Path) -> Session:
 def write_summary(summary: dict[str, Any], file: Path) -> None:
     """The summary as indented JSON."""
     file.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _percentiles(ages: list[int]) -> tuple[float, float]:
+    """ms, median and 99th percentile of ages in ns."""
+    p50, p99 = np.percentile([age / MILLISECOND for age in ages], [50, 99])
+    return float(p50), float(p99)
 
 
 def _stamp(message: Any) -> int:

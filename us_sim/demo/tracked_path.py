@@ -31,18 +31,11 @@ class TrackedPath:
     @property
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
-        summary: dict[str, Any] = {
-            "images": self.images,
-            "shown": self.shown,
-            "tracked": len(self.mm),
-        }
+        summary: dict[str, Any] = {"images": self.images, "shown": self.shown}
+        summary["tracked"] = len(self.mm)
         for name, values in (("error_mm", self.mm), ("error_deg", self.degrees)):
-            median, most = np.percentile(values, [50, 95])
-            summary[name] = {
-                "median": round(float(median), 4),
-                "p95": round(float(most), 4),
-                "max": round(float(values.max()), 4),
-            }
+            numbers = [round(x, 4) for x in np.percentile(values, [50, 95, 100]).tolist()]
+            summary[name] = dict(zip(("median", "p95", "max"), numbers, strict=True))
         return summary
 
     def __str__(self) -> str:

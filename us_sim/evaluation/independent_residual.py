@@ -7,13 +7,11 @@ the returned nodes, so that what a solver rounds, or leaves out, shows.
 >>> import numpy as np
 >>> from us_sim.evaluation.independent_residual import hooke_forces
 >>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
->>> materials = uniform_material(mesh, Material(10e3, 0.25))
->>> pulled = mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
->>> forces = hooke_forces(mesh, materials, pulled)
->>> f"{forces[mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
+>>> from us_sim.tissue.model import TissueModel
+>>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
+>>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
+>>> forces = hooke_forces(block.mesh, block.materials, pulled)
+>>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
 '1.200 N'
 """
 
@@ -127,9 +125,7 @@ Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
 """Makes what checks the residuals of one method on a model."""
 
 
-def solid_residual(
-    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array],
-) -> Residual:
+def solid_residual(forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array]) -> Residual:
     """For a method of finite elements, whose nodes are held by those ``forces``."""
 
     def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
@@ -202,13 +198,11 @@ def neo_hookean_forces(
     """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N.
 
     (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
-    2018, without its logarithmic barrier.) J - 1 is computed as a polynomial in the displacement's
-    gradient, so that nothing cancels at rest.
+    2018, without its logarithmic barrier.)
     """
     shear, whole, volume, gradient = _elements(mesh, materials)
     slope = _slopes(mesh, gradient, displacement)
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    swelling = _trace(slope) + minors + np.linalg.det(slope)
+    swelling = _swelling(slope)
     own, nodal = _bulk_parts(shear, whole)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
     pressure += shear * _crowding(1 + swelling)
@@ -252,11 +246,7 @@ def spring_forces(
 
 
 def volume_forces(
-    mesh: TetrahedralMesh,
-    element: Array,
-    nodal: Array,
-    displacement: Array,
-    yielding: bool = False,
+    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array, yielding: bool = False
 ) -> Array:
     """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
 
@@ -265,8 +255,7 @@ def volume_forces(
     """
     gradient = _gradients(mesh)
     slope = _slopes(mesh, gradient, displacement)
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    swelling = _trace(slope) + minors + np.linalg.det(slope)
+    swelling = _swelling(slope)
     cofactor = _cofactors(slope + np.eye(3))
     left = np.ones(len(swelling))
     if yielding:
@@ -282,9 +271,7 @@ def volume_forces(
 def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
     """N, about the norm of the forces that arise when coordinates are rounded to doubles.
 
-    Args:
-        mesh: whose nodes are rounded.
-        modulus: (M,) Pa, the stiffest of each tetrahedron.
+    ``modulus`` is (M,) Pa, the stiffest of each tetrahedron.
     """
     steep = np.linalg.norm(_gradients(mesh), axis=2)
     digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
@@ -369,6 +356,12 @@ def _around(mesh: TetrahedralMesh, weight: Array, value: Array) -> Array:
     np.add.at(sum_of, mesh.tetrahedra, (weight * value)[:, None])
     mean = np.divide(sum_of, total, out=np.zeros_like(total), where=total > 0)
     return np.asarray(mean[mesh.tetrahedra].mean(axis=1))
+
+
+def _swelling(slope: Array) -> Array:
+    """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
+    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
+    return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
 
 
 def _trace(matrices: Array) -> Array:

@@ -25,12 +25,8 @@ def machine(*libraries: str) -> str:
                 break
     except OSError:
         pass
-    parts = [
-        processor,
-        f"{cpu_count()} cores",
-        platform.system(),
-        f"Python {platform.python_version()}",
-    ]
+    parts = [processor, f"{cpu_count()} cores", platform.system()]
+    parts.append(f"Python {platform.python_version()}")
     for name in libraries:
         try:
             parts.append(f"{name} {version(name)}")

@@ -21,12 +21,7 @@ T = TypeVar("T")
 
 
 class Named(dict[str, T]):
-    """A dictionary that says which names there are where one is missing.
-
-    Args:
-        what: its values are, for a person.
-        values: by name.
-    """
+    """A dictionary that says which names there are where one is missing."""
 
     def __init__(self, what: str, values: Mapping[str, T]) -> None:
         super().__init__(values)

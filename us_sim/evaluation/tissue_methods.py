@@ -83,13 +83,7 @@ _OF_SPRINGS = {
 }
 
 _ALL = (
-    TissueMethod(
-        "fem",
-        colour="#0072B2",
-        mark="o",
-        residual=solid_residual(averaged_hooke_forces),
-        patient=None,
-    ),
+    TissueMethod("fem", "#0072B2", "o", solid_residual(averaged_hooke_forces), patient=None),
     TissueMethod(
         "fem_nonlinear",
         colour="#D55E00",

@@ -152,10 +152,8 @@ def cases(quick: bool) -> list[Case]:
     found += [replace(MAIN, deformation=d, plane=p) for d in DEPTHS for p in PLANES]
     found += [replace(MAIN, counts=c, deformation=d) for c in meshes for d in DEPTHS]
     found += [replace(MAIN, counts=c, size=s) for c in meshes for s in SIZES]
-    found += [
-        replace(MAIN, size=SIZES[-1], deformation="pressed_30mm", plane=p)
-        for p in ("oblique", "corner")
-    ]
+    large = replace(MAIN, size=SIZES[-1], deformation="pressed_30mm")
+    found += [replace(large, plane=p) for p in ("oblique", "corner")]
     return list(dict.fromkeys(found))
 
 

@@ -76,10 +76,8 @@ def costs(volume: Volume, quick: bool) -> tuple[list[Cost], list[Cost]]:
     work |= {name: imaged(_LINEAR, imaging) for name, imaging in _SETTINGS.items()}
     median = _medians(work, _QUICK_IMAGES if quick else _IMAGES)
     shown = {name: float(probe.plane(pose).is_shown().mean()) for name, probe in _PROBES.items()}
-    return (
-        [Cost(name, median[name], shown[name]) for name in _PROBES],
-        [Cost(name, median[name]) for name in _SETTINGS],
-    )
+    probes = [Cost(name, median[name], shown[name]) for name in _PROBES]
+    return probes, [Cost(name, median[name]) for name in _SETTINGS]
 
 
 def _medians(work: Mapping[str, Callable[[int], object]], images: int) -> dict[str, float]:

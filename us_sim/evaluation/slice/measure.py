@@ -101,11 +101,7 @@ class _Bench:
         points: dict[tuple[str, int], Point] = {}
         for method, threads in ((m, n) for m in methods() for n in m.threads):
             point = Point(
-                method.name,
-                case.size,
-                len(mesh.nodes),
-                len(mesh.tetrahedra),
-                threads,
+                *(method.name, case.size, len(mesh.nodes), len(mesh.tetrahedra), threads),
                 deformation=case.deformation,
                 plane=case.plane,
             )

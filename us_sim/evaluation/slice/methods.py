@@ -33,24 +33,14 @@ class SlicingMethod:
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
     threads: tuple[int, ...]  # numbers of threads that it is timed with
-    is_vtk: bool = False
-
-    @property
-    def tissue_only(self) -> bool:
-        """Whether it knows nothing of the rigid volume around the tissue."""
-        return self.is_vtk
-
-    @property
-    def is_there(self) -> bool:
-        """Whether what it needs is installed."""
-        return not self.is_vtk or is_installed()
+    tissue_only: bool = False  # it knows nothing of the rigid volume around the tissue, as VTK
 
 
 _ALL = (
     SlicingMethod(OURS, "#D55E00", "D", (1, 2)),
     SlicingMethod("row_subdivision", "#0072B2", "o", (1, 2)),
     SlicingMethod("per_pixel", "#009E73", "s", (1,)),
-    SlicingMethod("vtk", "#CC79A7", "^", (1, 2), is_vtk=True),
+    SlicingMethod("vtk", "#CC79A7", "^", (1, 2), tissue_only=True),
 )
 SLICING_METHODS = Named("evaluated slicing method", {method.name: method for method in _ALL})
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
@@ -69,7 +59,7 @@ class Contender:
 
 def methods() -> list[SlicingMethod]:
     """Those that can be evaluated here."""
-    return [method for method in SLICING_METHODS.values() if method.is_there]
+    return [method for name, method in SLICING_METHODS.items() if name != "vtk" or is_installed()]
 
 
 def contender(volume: Volume, case: Case, method: str, threads: int) -> Contender:
@@ -79,7 +69,7 @@ def contender(volume: Volume, case: Case, method: str, threads: int) -> Contende
         ImportError: the method's module, or what it needs, cannot be imported.
     """
     mesh = case.mesh()
-    if SLICING_METHODS[method].is_vtk:
+    if method == "vtk":
         vtk = VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
         return Contender(
             method,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +30,6 @@ _RIGHT = 1e-14  # voxels, drawn for what is exact to the last bit
 _WRONG = "#00e5ff"
 
 
-@dataclass(frozen=True)
-class _Result:
-    """What one method made of a case."""
-
-    distance: NDArray[np.float64]  # (rows, columns) voxels; NaN where nothing is compared
-    wrong: NDArray[np.bool_]  # (rows, columns): coverage is not the reference's
-
-
 def draw_differences(volume: Volume, methods: Sequence[str], file: Path) -> None:
     """A row a case: the image, then for every method how far each pixel is from its true place."""
     columns = 1 + len(methods)
@@ -58,30 +50,28 @@ def draw_differences(volume: Volume, methods: Sequence[str], file: Path) -> None
         line[0].imshow(np.rint(exact.grey), cmap="gray", vmin=0, vmax=255)
         line[0].set_ylabel(f"{case.deformation}\n{PLANES[case.plane].words}", fontsize=8)
         for panel, method in zip(line[1:], methods, strict=True):
-            found = _result(volume, case, method, exact)
-            colours = panel.imshow(
-                np.maximum(found.distance, _RIGHT), norm=norm, cmap="magma", interpolation="nearest"
-            )
-            row, column = np.nonzero(found.wrong)
+            distance, wrong = _compared(volume, case, method, exact)
+            shown = np.maximum(distance, _RIGHT)
+            colours = panel.imshow(shown, norm=norm, cmap="magma", interpolation="nearest")
+            row, column = np.nonzero(wrong)
             panel.plot(column, row, "s", ms=3, color=_WRONG, mec="none")
-            worst = np.nanmax(found.distance, initial=0.0)
-            panel.set_xlabel(f"worst {worst:.1e} voxels, {found.wrong.sum()} px wrong", fontsize=8)
+            worst = np.nanmax(distance, initial=0.0)
+            panel.set_xlabel(f"worst {worst:.1e} voxels, {wrong.sum()} px wrong", fontsize=8)
         step, down = (np.linalg.norm(v) for v in (frame.plane.column_step, frame.plane.row_step))
         for panel in line:
-            panel.set_aspect(down / step)
-            panel.set_xticks([])
-            panel.set_yticks([])
-            panel.set_facecolor("0.85")
+            panel.set(aspect=down / step, xticks=[], yticks=[], facecolor="0.85")
     if colours is not None:
         bar = figure.colorbar(colours, ax=axes[:, 1:], shrink=0.6, pad=0.01)
         bar.set_label("distance from the true place at rest, voxels", fontsize=9)
     save(figure, file)
 
 
-def _result(volume: Volume, case: Case, method: str, exact: ExactSlice) -> _Result:
+def _compared(
+    volume: Volume, case: Case, method: str, exact: ExactSlice
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(rows, columns) voxels, NaN where nothing is compared; and where the coverage is wrong."""
     frame = case.frames(1)[0]
     rest = contender(volume, case, method, 1).rest_coordinates(frame)
     tissue_only = SLICING_METHODS[method].tissue_only
     right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
-    distance = np.where(right, voxel_distance(volume, rest, expected), np.nan)
-    return _Result(distance, wrong)
+    return np.where(right, voxel_distance(volume, rest, expected), np.nan), wrong

@@ -28,10 +28,8 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
     axes = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     for panel, (title, points) in zip(axes, panels.items(), strict=True):
         for name, method in SLICING_METHODS.items():
-            mine = sorted((p for p in points if p.method == name), key=lambda p: p.threads)
-            mine = [p for p in mine if np.isfinite(p.ms_median)]
-            if not mine:
-                continue
+            mine = [p for p in points if p.method == name and np.isfinite(p.ms_median)]
+            mine.sort(key=lambda p: p.threads)
             x = [p.cpu_ms_median if p.threads == 1 else p.ms_median for p in mine]
             y = [max(p.max_voxel_error, _SMALLEST) for p in mine]
             panel.plot(x, y, "-", color=method.colour, lw=1.2, alpha=0.8)
@@ -41,8 +39,7 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], file: Path) -> None:
         panel.set_title(title, fontsize=11, loc="left")
         panel.set_xlabel("ms an image (median; one thread: processor time)", fontsize=9)
         panel.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
-        panel.set_xscale("log")
-        panel.set_yscale("log")
+        panel.set(xscale="log", yscale="log")
         panel.margins(0.08, 0.14)
         panel.axhline(_TENTH, color="0.75", lw=1, ls="--", zorder=0)
         plain(panel)
@@ -72,9 +69,8 @@ def plot_pixels(points: Sequence[Point], title: str, file: Path) -> None:
     if first:
         largest = max(first, key=lambda p: p.size)
         pixels = np.array([min(p.size for p in first), largest.size]) ** 2
-        panel.plot(
-            pixels, largest.cpu_ms_median * pixels / pixels[-1], "--", color="0.6", lw=1, zorder=0
-        )
+        proportional = largest.cpu_ms_median * pixels / pixels[-1]
+        panel.plot(pixels, proportional, "--", color="0.6", lw=1, zorder=0)
     sizes = sorted({p.size for p in points})
     panel.set_xticks([n**2 for n in sizes], [f"{n} × {n}" for n in sizes])
     panel.set_xlabel("pixels (dashed: in proportion)")
@@ -85,16 +81,9 @@ def _times(panel: Axes, points: Sequence[Point], across: Callable[[Point], float
     for name, method in SLICING_METHODS.items():
         mine = [p for p in points if p.method == name and p.threads == 1]
         mine = sorted((p for p in mine if np.isfinite(p.cpu_ms_median)), key=across)
-        panel.plot(
-            [across(p) for p in mine],
-            [p.cpu_ms_median for p in mine],
-            method.mark + "-",
-            color=method.colour,
-            ms=6,
-            lw=1.4,
-        )
-    panel.set_xscale("log")
-    panel.set_yscale("log")
+        x, y = [across(p) for p in mine], [p.cpu_ms_median for p in mine]
+        panel.plot(x, y, method.mark + "-", color=method.colour, ms=6, lw=1.4)
+    panel.set(xscale="log", yscale="log")
     panel.axhline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
     panel.set_ylabel("processor time of an image, ms (median, one thread)")
     plain(panel)

@@ -42,11 +42,8 @@ class RecordedFan:
         """Whether images of that size hold the whole fan, to half a pixel."""
         reach = self.end * math.sin(self.half_angle)
         bottom = self.row + self.end - self.radius
-        return (
-            reach <= self.column + 0.5
-            and self.column + reach <= columns - 0.5
-            and bottom <= rows - 0.5
-        )
+        across = reach - 0.5 <= self.column <= columns - 0.5 - reach
+        return across and bottom <= rows - 0.5
 
     def probe(self, spacing: float) -> ConvexProbe:
         """The probe with pixels ``spacing`` m wide, as near as a whole number of them allows."""
@@ -58,8 +55,7 @@ class RecordedFan:
 
     def pose(self, image_to_reference: NDArray[np.float64]) -> Pose:
         """Of the probe in the sweep's frame, from a frame's (4, 4) matrix in metres."""
-        along = image_to_reference[:3, 0] / np.linalg.norm(image_to_reference[:3, 0])
-        down = image_to_reference[:3, 1] / np.linalg.norm(image_to_reference[:3, 1])
+        along, down = (step / np.linalg.norm(step) for step in image_to_reference[:3, :2].T)
         matrix = np.eye(4)
         matrix[:3, :3] = np.column_stack([along, np.cross(down, along), down])
         matrix[:3, 3] = (image_to_reference @ [self.column, self.row, 0.0, 1.0])[:3]

@@ -35,6 +35,7 @@ __all__ = ["RecordedComparison", "compare_with_recorded"]
 
 _ATTRIBUTION = "Data: ImFusion GmbH, CC BY 4.0"
 _ASKED = 0.8  # normalised cross-correlation
+_HEAD = ("normalised cross-correlation with", "lowest", "median", "highest", "at least 0.8")
 _SHOWN = 6  # frames in the picture
 _QUICK = 10  # every so many frames are compared in a quick run
 
@@ -57,10 +58,16 @@ class RecordedComparison:
     def markdown(self) -> str:
         """A paragraph, a table and what follows from it, for a report."""
         probe = self.probe
-        raw, smoothed, mirrored = (
-            np.array([getattr(row, f"ncc_{name}") for row in self.rows])
-            for name in ("raw", "smoothed", "mirrored")
-        )
+        coverage = np.mean([row.coverage for row in self.rows])
+        rows = []
+        for name, words in (
+            ("ncc_raw", "the frame as recorded"),
+            ("ncc_smoothed", f"it, smoothed by {1e3 * RESOLUTION:g} mm, as the volume is"),
+            ("ncc_mirrored", "the smoothed frame, left and right swapped"),
+        ):
+            ncc = np.array([getattr(row, name) for row in self.rows])
+            numbers = (f"{x:.3f}" for x in (ncc.min(), np.median(ncc), ncc.max()))
+            rows.append((words, *numbers, f"{(ncc >= _ASKED).sum()} of {len(ncc)}"))
         lateral, elevation, axial = 1e3 * np.abs(self.shifts).max(axis=0)
         parts = [
             f"{len(self.rows)} recorded frames beside the volume cut at their poses: a curved "
@@ -68,29 +75,9 @@ class RecordedComparison:
             f"{math.degrees(probe.opening_angle):.1f}° and {1e3 * probe.depth:.0f} mm depth, "
             f"{probe.columns} × {probe.rows} pixels of {1e3 * probe.pixel_spacing[1]:.3f} mm. "
             f"They are compared in the fan, {1e3 * MARGIN:g} mm or more inside what the sweep "
-            f"covers ({100 * self._coverage:.0f} % of the fan). {self.left_out} frames had no "
+            f"covers ({100 * coverage:.0f} % of the fan). {self.left_out} frames had no "
             f"usable pose.",
-            markdown_table(
-                (
-                    "normalised cross-correlation with",
-                    "lowest",
-                    "median",
-                    "highest",
-                    "at least 0.8",
-                ),
-                [
-                    (
-                        words,
-                        *(f"{x:.3f}" for x in (values.min(), np.median(values), values.max())),
-                        f"{(values >= _ASKED).sum()} of {len(values)}",
-                    )
-                    for words, values in (
-                        ("the frame as recorded", raw),
-                        (f"it, smoothed by {1e3 * RESOLUTION:g} mm, as the volume is", smoothed),
-                        ("the smoothed frame, left and right swapped", mirrored),
-                    )
-                ],
-            ),
+            markdown_table(_HEAD, rows),
             "The volume is the mean of these very frames: this shows that poses, geometry and "
             "sampling are right, not how well an unseen image would be foretold. Tissue at rest "
             "and the volume without tissue differ by "
@@ -102,10 +89,6 @@ class RecordedComparison:
             f"{_ATTRIBUTION}.",
         ]
         return "\n\n".join(parts)
-
-    @property
-    def _coverage(self) -> float:
-        return float(np.mean([row.coverage for row in self.rows]))
 
 
 def compare_with_recorded(

@@ -145,13 +145,8 @@ class RecordedPairs:
                 f"{sweep.path}: the volume covers nothing of frame {number}; give the volume that "
                 f"was compounded from this sweep, in the sweep's frame"
             )
-        return RecordedPair(
-            number,
-            pose,
-            self.fan.on_probe_pixels(image, self.probe, self.spacing),
-            self.slicer.image(self.nodes, plane),
-            compared,
-        )
+        recorded = self.fan.on_probe_pixels(image, self.probe, self.spacing)
+        return RecordedPair(number, pose, recorded, self.slicer.image(self.nodes, plane), compared)
 
     def compare(self, pair: RecordedPair, time: float) -> RecordedFrame:
         """How like the two are."""
@@ -160,15 +155,14 @@ class RecordedPairs:
         rigid = np.where(shown, sample_plane(self.volume, plane), np.uint8(0))
         smoothed = self._smoothed(pair.recorded, RESOLUTION)
         compared, simulated = pair.compared, pair.simulated
+        both = compared & compared[:, ::-1]
         return RecordedFrame(
             pair.frame,
             time,
             float(compared.sum() / shown.sum()),
             normalised_cross_correlation(pair.recorded, simulated, compared),
             normalised_cross_correlation(smoothed, simulated, compared),
-            normalised_cross_correlation(
-                smoothed, simulated[:, ::-1], compared & compared[:, ::-1]
-            ),
+            normalised_cross_correlation(smoothed, simulated[:, ::-1], both),
             int(np.abs(simulated.astype(np.int16) - rigid).max()),
         )
 
@@ -190,11 +184,9 @@ class RecordedPairs:
             shift = (0.0, elevation, 0.0)
             position = pair.pose.apply(np.array([shift]))[0]
             plane = self.probe.plane(replace(pair.pose, position=position))
-            found[shift] = normalised_cross_correlation(
-                recorded,
-                self._structures(sample_plane(self.volume, plane)),
-                pair.compared & self._covered(plane),
-            )
+            cut = self._structures(sample_plane(self.volume, plane))
+            both = pair.compared & self._covered(plane)
+            found[shift] = normalised_cross_correlation(recorded, cut, both)
         return np.array(max(found, key=lambda shift: (found[shift], -np.linalg.norm(shift))))
 
     def _covered(self, plane: SlicePlane) -> NDArray[np.bool_]:

@@ -36,7 +36,20 @@ class Surroundings:
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: every method in the main case, and its worst in all of them."""
-    return markdown_table(*_summary(points))
+    head = ("method", "threads", "ms", "p99", "CPU ms")
+    rows: list[Sequence[str]] = []
+    for p in main_points(points):
+        mine = [q for q in points if (q.method, q.threads) == (p.method, p.threads)]
+        mine = [q for q in mine if not q.failure]
+        times = (f"{ms:.2f}" for ms in (p.ms_median, p.ms_p99, p.cpu_ms_median))
+        worst = (
+            f"{sum(q.coverage_mismatch_px for q in mine)}",
+            f"{max(q.max_grey_difference for q in mine):g}",
+            f"{max(q.mean_grey_difference for q in mine):.2g}",
+            f"{max(q.max_voxel_error for q in mine):.2g}",
+        )
+        rows.append((p.method, f"{p.threads}", *times, *worst))
+    return markdown_table((*head, "wrong px", "max grey", "mean grey", "max voxel"), rows)
 
 
 def write_report(folder: ReportFolder, points: Sequence[Point], around: Surroundings) -> None:
@@ -76,7 +89,7 @@ def _parts(folder: ReportFolder, points: Sequence[Point], around: Surroundings) 
         "(CPU ms), which is the wall clock of one thread on a machine that does nothing else.",
         "## Error against run time",
         "![Error against run time](slice_error.png)",
-        markdown_table(*_summary(points)),
+        table(points),
         f"Times are of {MAIN.size} × {MAIN.size} pixels on {_nodes()} nodes pressed by 12 mm, the "
         "errors the worst of all cases. VTK knows nothing of the rigid volume around the block: "
         "its errors count where tissue is. A voxel error is the distance between where a pixel's "
@@ -118,38 +131,6 @@ def _parts(folder: ReportFolder, points: Sequence[Point], around: Surroundings) 
     ]
 
 
-def _summary(points: Sequence[Point]) -> tuple[Sequence[str], list[Sequence[str]]]:
-    head = (
-        "method",
-        "threads",
-        "ms",
-        "p99",
-        "CPU ms",
-        "wrong px",
-        "max grey",
-        "mean grey",
-        "max voxel",
-    )
-    rows: list[Sequence[str]] = []
-    for p in main_points(points):
-        mine = [q for q in points if (q.method, q.threads) == (p.method, p.threads)]
-        mine = [q for q in mine if not q.failure]
-        rows.append(
-            (
-                p.method,
-                f"{p.threads}",
-                f"{p.ms_median:.2f}",
-                f"{p.ms_p99:.2f}",
-                f"{p.cpu_ms_median:.2f}",
-                f"{sum(q.coverage_mismatch_px for q in mine)}",
-                f"{max(q.max_grey_difference for q in mine):g}",
-                f"{max(q.mean_grey_difference for q in mine):.2g}",
-                f"{max(q.max_voxel_error for q in mine):.2g}",
-            )
-        )
-    return head, rows
-
-
 def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
     """Processor times of every method along one axis, and the exponent."""
     steps = sorted({across(p): word(p) for p in points}.items())
@@ -165,33 +146,19 @@ def _across(points, what, across, word) -> str:  # type: ignore[no-untyped-def]
 
 
 def _cases_table(points: Sequence[Point]) -> str:
-    shown = [
-        p
-        for p in points
-        if p.threads == 1
-        and p.nodes == int(np.prod(MAIN.counts))
-        and p.size == MAIN.size
-        and not p.failure
-    ]
+    image = (1, int(np.prod(MAIN.counts)), MAIN.size)
+    shown = [p for p in points if (p.threads, p.nodes, p.size) == image and not p.failure]
     methods = list(dict.fromkeys(p.method for p in shown))
     rows = []
     for deformation in DEPTHS:
         for plane in PLANES:
             mine = {p.method: p for p in shown if (p.deformation, p.plane) == (deformation, plane)}
-            if not mine:
-                continue
             cells = [f"{mine[m].cpu_ms_median:.2f}" if m in mine else "" for m in methods]
             wrong = [f"{mine[m].coverage_mismatch_px}" if m in mine else "" for m in methods]
-            rows.append((deformation, plane, *cells, *wrong))
-    return markdown_table(
-        (
-            "deformation",
-            "plane",
-            *(f"{m}, CPU ms" for m in methods),
-            *(f"{m}, wrong px" for m in methods),
-        ),
-        rows,
-    )
+            if mine:
+                rows.append((deformation, plane, *cells, *wrong))
+    times, wrongs = [f"{m}, CPU ms" for m in methods], [f"{m}, wrong px" for m in methods]
+    return markdown_table(("deformation", "plane", *times, *wrongs), rows)
 
 
 def _vtk_apart(points: Sequence[Point]) -> list[str]:

@@ -35,13 +35,7 @@ def size_points(points: Sequence[Point]) -> list[Point]:
 def targets(
     points: Sequence[Point], peak_memory: int | None, publishing: float | None
 ) -> list[Target]:
-    """Every measure that is asked for.
-
-    Args:
-        points: all rows.
-        peak_memory: bytes that a process held with a volume of 512³ voxels, where known.
-        publishing: ms of sending an image, where known.
-    """
+    """Every measure that is asked for; the bytes of the process and ms of sending where known."""
     main = {(p.method, p.threads): p for p in main_points(points)}
     wall = {threads: p.ms_median for (method, threads), p in main.items() if method == OURS}
     own = [p for p in points if p.method == OURS and not p.failure]
@@ -49,6 +43,8 @@ def targets(
     sizes = [p for p in size_points(points) if p.method == OURS and p.threads == 1]
     image = f"{MAIN.size} × {MAIN.size} on {_tetrahedra(points)} tetrahedra pressed 12 mm"
     mismatches = sum(p.coverage_mismatch_px for p in own if p.threads == 1) if own else np.nan
+    pixels = sum(p.size**2 for p in own if p.threads == 1)
+    grey = max((p.max_grey_difference for p in own), default=np.nan)
     times = {p.nodes: p.cpu_ms_median for p in meshes}
     growth = times[max(times)] / times[min(times)] if len(times) > 1 else np.nan
     linear = exponent({p.size**2: p.cpu_ms_median for p in sizes})
@@ -58,18 +54,8 @@ def targets(
         Target.at_most(f"{image}, two cores", 1.2, wall.get(2, np.nan), "ms", form=".2f"),
         _ratio("times as fast as VTK (filter and sampling)", 20, main, "vtk"),
         _ratio("times as fast as `row_subdivision`", 5, main, "row_subdivision"),
-        Target.at_most(
-            f"pixels of {sum(p.size**2 for p in own if p.threads == 1):,} with a wrong coverage",
-            0,
-            mismatches,
-            form="g",
-        ),
-        Target.at_most(
-            "grey levels that a pixel is off",
-            1,
-            max((p.max_grey_difference for p in own), default=np.nan),
-            form="g",
-        ),
+        Target.at_most(f"pixels of {pixels:,} with a wrong coverage", 0, mismatches, form="g"),
+        Target.at_most("grey levels that a pixel is off", 1, grey, form="g"),
         Target.at_most("time on 65,536 nodes over that on 2,000", 1.5, growth, form=".2f"),
         # A measured exponent of 1.004 is linear, too.
         Target.at_most("k in time ~ pixels^k", 1, round(linear, 2), form=".2f"),
@@ -96,11 +82,8 @@ def _tetrahedra(points: Sequence[Point]) -> str:
 
 
 def _of_main_image(points: Sequence[Point]) -> list[Point]:
-    return [
-        p
-        for p in points
-        if (p.deformation, p.plane) == (MAIN.deformation, MAIN.plane) and not p.failure
-    ]
+    image = (MAIN.deformation, MAIN.plane)
+    return [p for p in points if (p.deformation, p.plane) == image and not p.failure]
 
 
 def _ratio(what: str, asked: float, main: dict[tuple[str, int], Point], slow: str) -> Target:

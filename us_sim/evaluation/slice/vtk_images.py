@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ class VtkSlicer:
         tetrahedra: NDArray[np.int32],
         threads: int = 1,
     ) -> None:
-        from vtkmodules.util.numpy_support import numpy_to_vtk
+        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
         from vtkmodules.vtkCommonCore import VTK_ID_TYPE, vtkPoints, vtkSMPTools
         from vtkmodules.vtkCommonDataModel import (
             VTK_TETRA,
@@ -64,17 +63,16 @@ class VtkSlicer:
         )
         from vtkmodules.vtkFiltersCore import vtkProbeFilter
 
-        self._workers = vtkSMPTools
+        self._workers, self._to_numpy = vtkSMPTools, vtk_to_numpy
         self._threads = threads
         self._to_index = volume.patient_to_index
         self._placed = np.empty(rest_nodes.shape)
         self._points = vtkPoints()
         self._points.SetData(numpy_to_vtk(self._placed))
         cells = vtkCellArray()
-        cells.SetData(
-            _ids(numpy_to_vtk, VTK_ID_TYPE, np.arange(0, 4 * len(tetrahedra) + 1, 4)),
-            _ids(numpy_to_vtk, VTK_ID_TYPE, tetrahedra.reshape(-1)),
-        )
+        starts = np.arange(0, 4 * len(tetrahedra) + 1, 4)
+        numbers = (starts.astype(np.int64), tetrahedra.reshape(-1).astype(np.int64))
+        cells.SetData(*(numpy_to_vtk(ids, deep=True, array_type=VTK_ID_TYPE) for ids in numbers))
         self._mesh = vtkUnstructuredGrid()
         self._mesh.SetPoints(self._points)
         self._mesh.SetCells(VTK_TETRA, cells)
@@ -103,17 +101,14 @@ class VtkSlicer:
 
     def image(self, nodes: NDArray[np.float64], plane: SlicePlane) -> NDArray[np.uint8]:
         """(rows, columns): the grey values of tissue, 0 elsewhere."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-
         begin = time.process_time()
-        self._use_threads()
         self._find(nodes, plane)
         found = time.process_time()
         self._at.SetData(self._finder.GetOutput().GetPointData().GetArray("rest"))
         self._at.Modified()
         self._sampler.Update()
-        data = self._sampler.GetOutput().GetPointData()
-        image = vtk_to_numpy(data.GetArray("grey")).reshape(plane.rows, plane.columns)
+        grey = self._sampler.GetOutput().GetPointData().GetArray("grey")
+        image = self._to_numpy(grey).reshape(plane.rows, plane.columns)
         image = np.where(self._valid(plane), image, np.uint8(0))
         self.filter_ms = (found - begin) * 1e3
         self.sampling_ms = (time.process_time() - found) * 1e3
@@ -123,11 +118,8 @@ class VtkSlicer:
         self, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> NDArray[np.float64]:
         """(rows, columns, 3) m, where each pixel's tissue lies at rest; NaN elsewhere."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-
-        self._use_threads()
         self._find(nodes, plane)
-        index = vtk_to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))
+        index = self._to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))
         to_patient = np.linalg.inv(self._to_index)
         rest = index[:, ::-1] @ to_patient[:3, :3].T + to_patient[:3, 3]
         rest = rest.reshape(plane.rows, plane.columns, 3)
@@ -135,6 +127,9 @@ class VtkSlicer:
         return np.asarray(rest)
 
     def _find(self, nodes: NDArray[np.float64], plane: SlicePlane) -> None:
+        # Threads are set for the whole process.
+        self._workers.SetBackend("Sequential" if self._threads == 1 else "STDThread")
+        self._workers.Initialize(self._threads)
         np.add(nodes @ plane.to_pixel[:, :3].T, plane.to_pixel[:, 3], out=self._placed)
         self._points.GetData().Modified()
         self._points.Modified()
@@ -143,18 +138,7 @@ class VtkSlicer:
         self._pixels.Modified()
         self._finder.Update()
 
-    def _use_threads(self) -> None:
-        """Set what is set for the whole process."""
-        self._workers.SetBackend("Sequential" if self._threads == 1 else "STDThread")
-        self._workers.Initialize(self._threads)
-
     def _valid(self, plane: SlicePlane) -> NDArray[np.bool_]:
         """(rows, columns): which pixels of the latest image lie in the mesh."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-
         mask = self._finder.GetOutput().GetPointData().GetArray("vtkValidPointMask")
-        return np.asarray(vtk_to_numpy(mask).reshape(plane.rows, plane.columns) > 0)
-
-
-def _ids(convert: Any, kind: int, numbers: NDArray[Any]) -> Any:
-    return convert(numbers.astype(np.int64), deep=True, array_type=kind)
+        return np.asarray(self._to_numpy(mask).reshape(plane.rows, plane.columns) > 0)

@@ -52,16 +52,8 @@ SPRINGS = ("algorithm_1", "fitted", "fitted with volume")
 """Spring constants of methods that have springs, and whether tetrahedra keep their volumes."""
 
 MOTIONS = (
-    "press",
-    "jump",
-    "through",
-    "tremor",
-    "slide",
-    "tilt",
-    "sideways",
-    "upside down",
-    "scribble",
-    "flicker",
+    *("press", "jump", "through", "tremor", "slide", "tilt", "sideways", "upside down"),
+    *("scribble", "flicker"),
 )
 """What the probe does, see `us_sim.evaluation.stability.motions`."""
 
@@ -205,15 +197,10 @@ def model_of(case: StabilityCase) -> TissueModel:
         modulus, np.full(count, case.poisson_ratio), np.full(count, case.density)
     )
     fixed = fixed_nodes(mesh, case.support)
-    reached = (
-        np.unique(mesh.boundary)
-        if case.motion in _REACHED_FROM_ALL_SIDES
-        else face_nodes(mesh, "top")
-    )
-    scale = float(np.ptp(mesh.nodes[:, 0])) / 0.1
-    return TissueModel(
-        mesh, materials, fixed, _scaled(COLLIDERS[case.collider], scale), reached.astype(np.int32)
-    )
+    everywhere = case.motion in _REACHED_FROM_ALL_SIDES
+    reached = np.unique(mesh.boundary) if everywhere else face_nodes(mesh, "top")
+    collider = _scaled(COLLIDERS[case.collider], float(np.ptp(mesh.nodes[:, 0])) / 0.1)
+    return TissueModel(mesh, materials, fixed, collider, reached.astype(np.int32))
 
 
 def _scaled(collider: Collider, scale: float) -> Collider:

@@ -91,7 +91,9 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
     ):
         try:
             for task, trial in zip(tasks, pool.map(_try, tasks, chunksize=_CHUNK), strict=True):
-                tried.append(_tried(task, trial))
+                case = None if isinstance(task.case, str) else task.case
+                name = case.case if case else str(task.case)
+                tried.append(Tried(task.method, name, case, trial))
                 progress(len(tried), task.method)
         except BrokenProcessPool as error:
             raise SolverError(
@@ -99,12 +101,6 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
                 f"it: run it again with PYTHONFAULTHANDLER=1 to see where"
             ) from error
     return tried
-
-
-def _tried(task: _Task, trial: Trial) -> Tried:
-    if isinstance(task.case, str):
-        return Tried(task.method, task.case, None, trial)
-    return Tried(task.method, task.case.case, task.case, trial)
 
 
 def _prepare(cache: str) -> None:

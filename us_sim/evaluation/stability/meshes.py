@@ -63,11 +63,8 @@ def parts(mesh: TetrahedralMesh) -> NDArray[np.intp]:
 
 
 def _box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
-    across = (
-        uniform_planes(-0.05 * size, 0.05 * size, nx),
-        uniform_planes(-0.05 * size, 0.05 * size, ny),
-    )
-    return box_mesh(*across, uniform_planes(0.0, 0.08 * size, nz))
+    x, y = (uniform_planes(-0.05 * size, 0.05 * size, count) for count in (nx, ny))
+    return box_mesh(x, y, uniform_planes(0.0, 0.08 * size, nz))
 
 
 def _layered() -> TetrahedralMesh:
@@ -76,28 +73,17 @@ def _layered() -> TetrahedralMesh:
     return box_mesh(across, across, [0.0, 3e-5, 0.02, 0.02003, 0.08])
 
 
-def _jittered(spread: float) -> TetrahedralMesh:
+def _jittered(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
     """Every node that is not on a face moved at random; those on faces within their face."""
-    mesh = _box(5, 4, 5)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    random = np.random.default_rng(3)
-    moved = mesh.nodes + spread * random.uniform(-1, 1, mesh.nodes.shape)
+    moved = mesh.nodes + spread * np.random.default_rng(seed).uniform(-1, 1, mesh.nodes.shape)
     on_face = (mesh.nodes == low) | (mesh.nodes == high)
-    nodes = np.where(on_face, mesh.nodes, moved)
-    return TetrahedralMesh(nodes, mesh.tetrahedra)
+    return TetrahedralMesh(np.where(on_face, mesh.nodes, moved), mesh.tetrahedra)
 
 
 def _delaunay() -> TetrahedralMesh:
     """Of scattered points, with the slivers that come of that."""
-    box = _box(5, 5, 5)
-    low, high = box.nodes.min(axis=0), box.nodes.max(axis=0)
-    random = np.random.default_rng(5)
-    moved = box.nodes + 0.0003 * random.uniform(-1, 1, box.nodes.shape)
-    points = np.where((box.nodes == low) | (box.nodes == high), box.nodes, moved)
-    return _from_points(points)
-
-
-def _from_points(points: NDArray[np.float64]) -> TetrahedralMesh:
+    points = _jittered(_box(5, 5, 5), 0.0003, seed=5).nodes
     corners = Delaunay(points).simplices
     a, b, c, d = np.moveaxis(points[corners], 1, 0)
     volume = signed_volumes(points, corners)
@@ -149,7 +135,7 @@ MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
     "box": lambda: _box(4, 4, 4),
     "fine": lambda: _box(6, 5, 5),
     "layered": _layered,
-    "perturbed": lambda: _jittered(0.004),
+    "perturbed": lambda: _jittered(_box(5, 4, 5), 0.004, seed=3),
     "delaunay": _delaunay,
     "sliver": _sliver,
     "slab": _slab,

@@ -55,9 +55,8 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
     start = TissueState(shape, np.zeros_like(nodes))
 
     def grows(step: float) -> bool:
-        solver = create_solver(
-            method, model, steps=_STEPS, time_step=step, rest_tolerance=0.0, **settings
-        )
+        going_on = {"steps": _STEPS, "rest_tolerance": 0.0, **settings}
+        solver = create_solver(method, model, time_step=step, **going_on)
         solver.take_over(start)
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)

@@ -89,11 +89,7 @@ def draw_map(method: str, mine: Sequence[Tried], file: Path) -> None:
     third = (_STEP, _DAMPING) if TISSUE_METHODS[method].has_springs else (_MOTION, _MESH)
     pairs = ((_MODULUS, _RATIO), (_CONTRAST, _DEPTH), third)
     rows: tuple[tuple[str, Callable[[Trial], float], LogNorm], ...] = (
-        (
-            "farthest from rest after release / mm",
-            lambda t: t.recovered_mm,
-            LogNorm(1e-6, 1e2),
-        ),
+        ("farthest from rest after release / mm", lambda t: t.recovered_mm, LogNorm(1e-6, 1e2)),
         ("residual under the probe", lambda t: t.residual_checked, LogNorm(1e-12, 1e2)),
     )
     panels = figure.subplots(len(rows), len(pairs), squeeze=False)
@@ -118,10 +114,7 @@ def draw_step_limits(
     upper.legend(frameon=False)
     lower.semilogx(predicted, 100 * (observed / predicted - 1), "o", markersize=4, alpha=0.6)
     lower.axhspan(-2, 2, color="0.93", zorder=0)
-    lower.set_ylim(-3, 3)
-    lower.set_xlim(low, high)
-    lower.set_xlabel("predicted / s")
-    lower.set_ylabel("deviation / %")
+    lower.set(xlim=(low, high), ylim=(-3, 3), xlabel="predicted / s", ylabel="deviation / %")
     for panel in (upper, lower):
         panel.grid(alpha=0.3)
     save(figure, file)
@@ -150,8 +143,7 @@ def _draw_cells(
     image = panel.pcolormesh(worst, cmap="viridis", norm=norm, edgecolors="white", linewidth=0.3)
     rows, columns = np.nonzero(failed)
     panel.plot(columns + 0.5, rows + 0.5, "x", color=_FAILED, markersize=8, markeredgewidth=2)
-    panel.set_xlabel(x.name)
-    panel.set_ylabel(y.name)
+    panel.set(xlabel=x.name, ylabel=y.name)
     panel.set_xticks(*x.ticks(cells))
     for label in panel.get_xticklabels() if x.categories else []:
         label.set(rotation=35, horizontalalignment="right", rotation_mode="anchor")

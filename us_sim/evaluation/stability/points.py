@@ -135,10 +135,8 @@ class Tried(Row):
             return "not finite"
         if not trial.bounded:
             return "not bounded"
-        return (
-            f"reported a residual of {trial.residual_reported:.3g}, but it is "
-            f"{trial.residual_checked:.3g}"
-        )
+        reported, checked = trial.residual_reported, trial.residual_checked
+        return f"reported a residual of {reported:.3g}, but it is {checked:.3g}"
 
 
 def try_case(method: str, case: StabilityCase) -> Trial:
@@ -292,11 +290,8 @@ def _held(model: TissueModel) -> NDArray[np.bool_]:
 def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
     """m, three times as far as any node can be pushed; unheld parts may be thrown farther."""
     nodes, box = model.mesh.nodes, model.collider.offset_box
-    reach = max(
-        float(np.linalg.norm(pose.position))
-        for pose in poses
-        if pose is not None and pose is not LIFTED
-    )
+    pressing = (pose for pose in poses if pose is not None and pose is not LIFTED)
+    reach = max(float(np.linalg.norm(pose.position)) for pose in pressing)
     size = np.ptp(nodes, axis=0)
     bound = 3 * (float(np.linalg.norm(size)) + reach + 2 * float(box[2] + box[3]) + 0.1)
     return bound if _held(model).all() else max(bound, 10 * float(size.max()))

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from us_sim.evaluation.stability.points import Trial
 from us_sim.geometry.collider import Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
@@ -74,14 +74,8 @@ def _doubled_nodes(method: str) -> None:
 
 
 def _solve(method: str, mesh: TetrahedralMesh) -> None:
-    modulus = np.full(len(mesh.tetrahedra), 1e4)
-    model = model_of(StabilityCase("unused"))
-    materials = replace(
-        model.materials,
-        young_modulus=modulus,
-        poisson_ratio=np.full(len(modulus), 0.45),
-        density=np.full(len(modulus), 1e3),
-    )
+    constants = (np.full(len(mesh.tetrahedra), value) for value in (1e4, 0.45, 1e3))
+    materials = TissueMaterials(*constants)
     fixed = mesh.nodes[:, 2] >= mesh.nodes[:, 2].max()
     reached = np.flatnonzero(mesh.nodes[:, 2] <= 0).astype(np.int32)
     create_solver(method, TissueModel(mesh, materials, fixed, Sphere(0.03), reached))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
 from us_sim.evaluation.stability.plots import draw_map, draw_step_limits
-from us_sim.evaluation.stability.points import Tried
+from us_sim.evaluation.stability.points import Trial, Tried
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
 __all__ = ["table", "write_report"]
@@ -63,8 +63,8 @@ def write_report(folder: ReportFolder, tried: Sequence[Tried]) -> None:
     ]
     for method, said in _step_limits(tried).items():
         limits = _with_step_limit(method, tried)
-        predicted = np.array([one.trial.step_limit_predicted for one in limits])
-        observed = np.array([one.trial.step_limit_observed for one in limits])
+        predicted = np.array([trial.step_limit_predicted for trial in limits])
+        observed = np.array([trial.step_limit_observed for trial in limits])
         picture = folder.picture(f"step_limit_{method}")
         draw_step_limits(method, predicted, observed, picture)
         parts += [f"## Step limit of {method}", f"{said}."]
@@ -87,12 +87,12 @@ def _numbers(method: str, tried: Sequence[Tried]) -> tuple[str, ...]:
     back = [trial.recovery_frames for trial in ran if trial.recovery_frames is not None]
     return (
         method,
-        str(len(trials)),
-        str(sum(trial.refused for trial in trials)),
-        str(sum(not trial.passed for trial in trials)),
-        str(sum(not trial.finite for trial in trials)),
-        str(sum(not trial.bounded for trial in trials)),
-        str(sum(not trial.truthful for trial in trials)),
+        f"{len(trials)}",
+        f"{sum(trial.refused for trial in trials)}",
+        *(
+            f"{sum(not getattr(trial, name) for trial in trials)}"
+            for name in ("passed", "finite", "bounded", "truthful")
+        ),
         f"{100 * len(back) / max(len(ran), 1):.1f} %",
         f"{np.median(back):.0f}" if back else "",
         str(sum(trial.kept for trial in trials)),
@@ -100,12 +100,9 @@ def _numbers(method: str, tried: Sequence[Tried]) -> tuple[str, ...]:
     )
 
 
-def _with_step_limit(method: str, tried: Sequence[Tried]) -> list[Tried]:
-    return [
-        one
-        for one in tried
-        if one.method == method and not math.isnan(one.trial.step_limit_predicted)
-    ]
+def _with_step_limit(method: str, tried: Sequence[Tried]) -> list[Trial]:
+    trials = (one.trial for one in tried if one.method == method)
+    return [trial for trial in trials if not math.isnan(trial.step_limit_predicted)]
 
 
 def _step_limits(tried: Sequence[Tried]) -> dict[str, str]:
@@ -114,10 +111,8 @@ def _step_limits(tried: Sequence[Tried]) -> dict[str, str]:
     for method in _methods(tried):
         limits = _with_step_limit(method, tried)
         if limits:
-            trials = [one.trial for one in limits]
-            deviation = np.array(
-                [abs(t.step_limit_observed / t.step_limit_predicted - 1) for t in trials]
-            )
+            ratios = [t.step_limit_observed / t.step_limit_predicted for t in limits]
+            deviation = np.abs(np.array(ratios) - 1)
             said[method] = (
                 f"{len(limits)} cases bisected, observed and predicted limits differ by "
                 f"{100 * np.median(deviation):.2f} % (median) and {100 * deviation.max():.2f} % "
@@ -132,16 +127,18 @@ def _worst(tried: Sequence[Tried]) -> list[str]:
     parts = []
     far = [one for one in ran if one.trial.recovery_frames is None]
     if far:
-        far.sort(key=lambda one: -one.trial.recovered_mm)
-        lines = [f"- {one.trial.recovered_mm:.3g} mm: {_described(one)}" for one in far[:5]]
-        parts += ["Farthest from rest after release:", "\n".join(lines)]
+        parts += ["Farthest from rest after release:"]
+        parts += [_largest(far, lambda trial: trial.recovered_mm, " mm")]
     large = [one for one in ran if one.trial.residual_checked > 1e-2]
     if large:
-        large.sort(key=lambda one: -one.trial.residual_checked)
-        lines = [f"- {one.trial.residual_checked:.3g}: {_described(one)}" for one in large[:5]]
         parts += [f"Residual above 1e-2 under the probe in {len(large)} cases; the largest:"]
-        parts += ["\n".join(lines)]
+        parts += [_largest(large, lambda trial: trial.residual_checked)]
     return parts
+
+
+def _largest(tried: Sequence[Tried], value: Callable[[Trial], float], unit: str = "") -> str:
+    worst = sorted(tried, key=lambda one: -value(one.trial))[:5]
+    return "\n".join(f"- {value(one.trial):.3g}{unit}: {_described(one)}" for one in worst)
 
 
 def _described(one: Tried) -> str:

@@ -108,24 +108,13 @@ _ALL = (
         _press(0.012) + _tilt(0.012, math.radians(20)),
         (-0.05, 0.05, 0.03),
     ),
-    Scene(
-        "press_25mm_nu0.49",
-        "pressed by 25 mm, Poisson's ratio 0.49",
-        _SPHERE,
-        _press(0.025),
-        _AROUND,
-        0.49,
-    ),
     *(
         Scene(
-            f"press_12mm_nu{ratio}",
-            f"pressed by 12 mm, Poisson's ratio {ratio}",
-            _SPHERE,
-            _press(0.012),
-            _AROUND,
-            ratio,
+            f"press_{depth}mm_nu{ratio}",
+            f"pressed by {depth} mm, Poisson's ratio {ratio}",
+            *(_SPHERE, _press(depth / 1000), _AROUND, ratio),
         )
-        for ratio in (0.49, 0.499, 0.4999)
+        for depth, ratio in ((25, 0.49), (12, 0.49), (12, 0.499), (12, 0.4999))
     ),
 )
 

@@ -68,13 +68,9 @@ def kept_reference(
     assert fine is not None
     points = fine.block.corners
     here, there = fine.at(points), coarse.at(points)
-    return Reference(
-        fine,
-        sizes[-1],
-        sizes[-2],
-        float(np.linalg.norm(there - here) / np.linalg.norm(here)),
-        float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force)),
-    )
+    difference = float(np.linalg.norm(there - here) / np.linalg.norm(here))
+    forces = float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force))
+    return Reference(fine, sizes[-1], sizes[-2], difference, forces)
 
 
 def _kept(
@@ -83,10 +79,8 @@ def _kept(
     planes = scene.reference_planes(size)
 
     def pack(solution: Solution) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        return (
-            {name: getattr(solution, name) for name in _ARRAYS},
-            {name: getattr(solution, name) for name in _NUMBERS},
-        )
+        arrays = {name: getattr(solution, name) for name in _ARRAYS}
+        return arrays, {name: getattr(solution, name) for name in _NUMBERS}
 
     def unpack(arrays: dict[str, Any], numbers: dict[str, Any]) -> Solution:
         block = NeoHookeanHexahedra(planes, scene.material)

@@ -36,8 +36,7 @@ def _elasticity(u, v, w):  # type: ignore[no-untyped-def]
 class LinearEquations:
     """Hooke's law on linear tetrahedra, with the part of the bulk stiffness that acts at nodes.
 
-    Args:
-        model: of one material throughout.
+    The model is of one material throughout.
     """
 
     def __init__(self, model: TissueModel) -> None:
@@ -52,14 +51,9 @@ class LinearEquations:
         scalars = Basis(mesh, ElementTetP1())
         gradients = np.stack([field[0].grad[:, :, 0] for field in scalars.basis])  # (4, 3, M)
         columns = 3 * mesh.t[:, None] + np.arange(3)[None, :, None]
-        divergence = csr_array(
-            (
-                gradients.transpose(2, 0, 1).ravel(),
-                columns.transpose(2, 0, 1).ravel(),
-                np.arange(0, 12 * size + 1, 12),
-            ),
-            shape=(size, 3 * count),
-        )
+        entries, places = (x.transpose(2, 0, 1).ravel() for x in (gradients, columns))
+        starts = np.arange(0, 12 * size + 1, 12)
+        divergence = csr_array((entries, places, starts), shape=(size, 3 * count))
         # A quarter of each tetrahedron belongs to each of its nodes.
         quarter = np.repeat(scalars.dx.sum(axis=1) / 4, 4)
         around = csr_array((quarter, (mesh.t.T.ravel(), np.repeat(np.arange(size), 4))))
@@ -73,10 +67,7 @@ class LinearEquations:
         return self._product(displacement.ravel()).reshape(-1, 3)
 
     def solve(
-        self,
-        touched: NDArray[np.int32],
-        normals: NDArray[np.float64],
-        depths: NDArray[np.float64],
+        self, touched: NDArray[np.int32], normals: NDArray[np.float64], depths: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Equilibrium with known displacements of the touched nodes along their normals.
 

@@ -127,13 +127,10 @@ class _Bench:
         """The trial's rows: against its own equations, and against the nonlinear reference."""
         model = self._model(trial)
         threads = int(trial.setting.get("threads", 1))
+        setting = ", ".join(f"{key}={value}" for key, value in trial.setting.items()) or "default"
         empty = Point(
-            trial.scene.name,
-            trial.method,
-            len(model.mesh.nodes),
-            len(model.mesh.tetrahedra),
-            threads,
-            ", ".join(f"{key}={value}" for key, value in trial.setting.items()) or "default",
+            *(trial.scene.name, trial.method, len(model.mesh.nodes), len(model.mesh.tetrahedra)),
+            *(threads, setting),
             default=not {key for key in trial.setting if key != "threads"} and threads == 1,
         )
         try:
@@ -194,10 +191,8 @@ class _Bench:
     def _nonlinear(self, trial: Trial, model: TissueModel) -> tuple[Outcome, str]:
         if "nonlinear" not in self._exact:
             reference = self._references[trial.scene.name]
-            solution = reference.solution
-            force, volume = float(solution.force[2]), solution.volume
-            self._exact["nonlinear"] = (
-                Outcome(solution.at(model.mesh.nodes), force, volume),
-                f"nonlinear: scikit-fem, {reference.unknowns} unknowns",
-            )
+            there = reference.solution
+            outcome = Outcome(there.at(model.mesh.nodes), float(there.force[2]), there.volume)
+            words = f"nonlinear: scikit-fem, {reference.unknowns} unknowns"
+            self._exact["nonlinear"] = outcome, words
         return self._exact["nonlinear"]

@@ -39,10 +39,8 @@ def converged(
         if deformation is before or time.perf_counter() - begin > _LONGEST:
             break
     settled = "settled" if deformation is before else "cut off"
-    return (
-        Outcome.of(model, deformation),
-        f"own equations: {method.name} {settled} at residual {deformation.residual:.0e}",
-    )
+    words = f"own equations: {method.name} {settled} at residual {deformation.residual:.0e}"
+    return Outcome.of(model, deformation), words
 
 
 def solved_independently(
@@ -56,7 +54,5 @@ def solved_independently(
     force = -float(((pushes[:, None] * normals).sum(axis=0) @ pose.rotation)[2])
     nodes = model.mesh.nodes + displacement
     volume = float(signed_volumes(nodes, model.mesh.tetrahedra).sum())
-    return (
-        Outcome(displacement, force, volume),
-        "own equations: scikit-fem and SciPy on fem's contact",
-    )
+    words = "own equations: scikit-fem and SciPy on fem's contact"
+    return Outcome(displacement, force, volume), words

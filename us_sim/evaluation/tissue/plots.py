@@ -32,8 +32,7 @@ def plot_errors(panels: Mapping[str, Sequence[Point]], title: str, file: Path) -
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for number, (name, points) in enumerate(panels.items()):
         panel = axes[divmod(number, columns)]
-        shown = [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)]
-        _errors(panel, shown)
+        _errors(panel, [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)])
         panel.set_title(name, fontsize=11, loc="left")
     for panel in axes.flat[len(panels) :]:
         panel.set_visible(False)
@@ -60,8 +59,7 @@ def plot_sizes(points: Sequence[Point], title: str, file: Path) -> None:
         (memory_panel, lambda p: p.memory / 1e6, "MB held"),
     ):
         _sizes(panel, points, value)
-        panel.set_ylabel(label)
-        panel.set_xlabel("nodes")
+        panel.set(xlabel="nodes", ylabel=label)
     time_panel.axhline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
     save(figure, file)
 
@@ -73,20 +71,12 @@ def _errors(axes: Axes, points: Sequence[Point]) -> None:
             if point.method == name:
                 families.setdefault(method.family(point.setting), []).append(point)
         for number, (family, chain) in enumerate(sorted(families.items())):
-            axes.plot(
-                [p.ms_median for p in chain],
-                [p.rel_l2_error for p in chain],
-                _LINES[number] + method.mark,
-                color=method.colour,
-                mfc="white",
-                ms=5,
-                lw=1.2,
-                label=f"{name}, {family}" if family else name,
-            )
+            x, y = [p.ms_median for p in chain], [p.rel_l2_error for p in chain]
+            look: Any = {"color": method.colour, "label": f"{name}, {family}" if family else name}
+            axes.plot(x, y, _LINES[number] + method.mark, mfc="white", ms=5, lw=1.2, **look)
             for p in (p for p in chain if p.default):
                 axes.plot(p.ms_median, p.rel_l2_error, method.mark, color=method.colour, ms=7)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
     plain(axes)
     axes.yaxis.set_major_formatter(FuncFormatter(_percent))
@@ -99,18 +89,12 @@ def _sizes(axes: Axes, points: Sequence[Point], value: Callable[[Point], float])
         mine = [p for p in mine if np.isfinite(value(p)) and value(p) > 0]
         if not mine:
             continue
-        power = exponent({p.nodes: value(p) for p in mine})
-        axes.plot(
-            [p.nodes for p in mine],
-            [value(p) for p in mine],
-            method.mark + "-",
-            color=method.colour,
-            ms=6,
-            lw=1.4,
-            label=name + (f"  ~ n$^{{{power:.2f}}}$" if np.isfinite(power) else ""),
-        )
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+        costs: dict[float, float] = {p.nodes: value(p) for p in mine}
+        power = exponent(costs)
+        label = name + (f"  ~ n$^{{{power:.2f}}}$" if np.isfinite(power) else "")
+        look: Any = {"color": method.colour, "label": label}
+        axes.plot(list(costs), list(costs.values()), method.mark + "-", ms=6, lw=1.4, **look)
+    axes.set(xscale="log", yscale="log")
     plain(axes)
     sizes = sorted({p.nodes for p in points})
     axes.set_xticks(sizes, [f"{n:,}" for n in sizes])

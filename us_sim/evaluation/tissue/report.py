@@ -24,10 +24,11 @@ _DEFAULTS = ("scene", "method", "nodes", "ms", "p99 ms", "L2 %", "max mm", "forc
 
 def table(points: Sequence[Point]) -> str:
     """What the command prints: the defaults of every method against the nonlinear reference."""
-    return markdown_table(
-        _DEFAULTS,
-        [_default_cells(p) for p in points if p.default and not p.own],
-    )
+    return markdown_table(_DEFAULTS, [_default_cells(p) for p in _defaults(points)])
+
+
+def _defaults(points: Sequence[Point]) -> list[Point]:
+    return [p for p in points if p.default and not p.own]
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -53,7 +54,7 @@ def write_report(
     meshes = {name: len({p.nodes for p in points if p.scene == name}) for name in references}
     scene = max(meshes, key=lambda name: meshes[name])
     nonlinear = [p for p in points if not p.own]
-    by_size = [p for p in nonlinear if p.default and p.scene == scene]
+    by_size = [p for p in _defaults(points) if p.scene == scene]
     panels = {
         "error": (
             f"Error against run time, to large deformation on fine quadratic elements "
@@ -137,24 +138,15 @@ def _parts(
 
 def _locking(points: Sequence[Point]) -> list[str]:
     """How the reaction grows as tissue becomes incompressible; nothing without those scenes."""
-    found = {(p.scene, p.method): p for p in points if p.default and not p.own and not p.failure}
+    found = {(p.scene, p.method): p for p in _defaults(points) if not p.failure}
     finest = {key: p for key, p in found.items() if p.nodes == _PAPERS_FINEST}
     ratios = [name for name in LOCKING if any(scene == name for scene, _ in finest)]
     if len(ratios) < 2:
         return []
     head = ["method", *(f"ν = {SCENES[name].poisson_ratio}" for name in ratios)]
-    rows = [
-        [
-            method,
-            *(
-                f"{100 * finest[name, method].force_error:.2g} %"
-                if (name, method) in finest
-                else ""
-                for name in ratios
-            ),
-        ]
-        for method in dict.fromkeys(method for _, method in finest)
-    ]
+    errors = {key: f"{100 * p.force_error:.2g} %" for key, p in finest.items()}
+    methods = dict.fromkeys(method for _, method in finest)
+    rows = [[method, *(errors.get((name, method), "") for name in ratios)] for method in methods]
     return [
         "## Locking",
         f"Error of the reaction to a press of 12 mm on {_PAPERS_FINEST:,} nodes, while the probe "
@@ -164,32 +156,25 @@ def _locking(points: Sequence[Point]) -> list[str]:
 
 
 def _reference_table(references: dict[str, Reference]) -> str:
-    return markdown_table(
-        ("scene", "elements", "unknowns", "force N", "L2 change", "force change", "penetration mm"),
-        [
-            (
-                name,
-                f"{r.coarser * 1e3:g} → {r.size * 1e3:g} mm",
-                f"{r.unknowns:,}",
-                f"{-r.solution.force[2]:.3f}",
-                f"{100 * r.difference:.2f} %",
-                f"{100 * r.force_difference:.2f} %",
-                f"{r.solution.penetration * 1e3:.3f}",
-            )
-            for name, r in references.items()
-        ],
-    )
+    head = ("scene", "elements", "unknowns", "force N", "L2 change", "force change")
+    rows = [
+        (
+            name,
+            f"{r.coarser * 1e3:g} → {r.size * 1e3:g} mm",
+            f"{r.unknowns:,}",
+            f"{-r.solution.force[2]:.3f}",
+            f"{100 * r.difference:.2f} %",
+            f"{100 * r.force_difference:.2f} %",
+            f"{r.solution.penetration * 1e3:.3f}",
+        )
+        for name, r in references.items()
+    ]
+    return markdown_table((*head, "penetration mm"), rows)
 
 
 def _table_of_defaults(points: Sequence[Point]) -> str:
-    return markdown_table(
-        (*_DEFAULTS, "smallest volume ratio"),
-        [
-            (*_default_cells(p), _number(p.smallest_volume_ratio))
-            for p in points
-            if p.default and not p.own
-        ],
-    )
+    rows = [(*_default_cells(p), _number(p.smallest_volume_ratio)) for p in _defaults(points)]
+    return markdown_table((*_DEFAULTS, "smallest volume ratio"), rows)
 
 
 def _default_cells(p: Point) -> tuple[str, ...]:
@@ -200,21 +185,12 @@ def _default_cells(p: Point) -> tuple[str, ...]:
 
 
 def _own_table(points: Sequence[Point], scene: str, nodes: int) -> str:
-    return markdown_table(
-        ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference"),
-        [
-            (
-                p.method,
-                p.setting,
-                f"{p.threads}",
-                *(_number(v) for v in (p.ms_median, 100 * p.rel_l2_error, p.max_error_mm)),
-                _number(100 * p.force_error),
-                p.reference,
-            )
-            for p in points
-            if p.own and p.scene == scene and p.nodes == nodes
-        ],
-    )
+    rows = []
+    for p in (p for p in points if p.own and (p.scene, p.nodes) == (scene, nodes)):
+        numbers = (p.ms_median, 100 * p.rel_l2_error, p.max_error_mm, 100 * p.force_error)
+        rows.append((p.method, p.setting, f"{p.threads}", *map(_number, numbers), p.reference))
+    head = ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference")
+    return markdown_table(head, rows)
 
 
 def _size_table(sizes: Sequence[Point]) -> str:
@@ -227,10 +203,9 @@ def _size_table(sizes: Sequence[Point]) -> str:
             ("MB held", lambda p: p.memory / 1e6),
             ("s to set up", lambda p: p.setup),
         ):
-            numbers = [_number(value(mine[n])) if n in mine else "" for n in counts]
-            rows.append(
-                (method, what, *numbers, _number(exponent({n: value(p) for n, p in mine.items()})))
-            )
+            costs: dict[float, float] = {n: value(p) for n, p in mine.items()}
+            numbers = [_number(costs[n]) if n in costs else "" for n in counts]
+            rows.append((method, what, *numbers, _number(exponent(costs))))
     return markdown_table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
 
 

@@ -154,9 +154,8 @@ class Case:
             moved = exp((frame - FRAMES // 2) / _RATE * velocity)
             # About the body's middle, which is what the case says the distance of.
             turned = Pose(np.zeros(3), (moved @ asked).orientation)
-            poses.append(
-                Pose(place + moved.position - turned.rotation @ middle, turned.orientation)
-            )
+            position = place + moved.position - turned.rotation @ middle
+            poses.append(Pose(position, turned.orientation))
         return poses
 
     def velocity(self, number: int) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,22 +137,12 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
     turn_noise = random.normal(0.0, _TURN_NOISE, (len(times), 3))
     covariance = np.diag([_NOISE**2] * 3 + [_TURN_NOISE**2] * 3)
     positions, turns = _position(times), _rotation(times)
-    measured = [
-        Measurement(
-            round(1e9 * moment) + 1,
-            Pose(
-                position + off,
-                (
-                    Pose(np.zeros(3), rotation_exp(turned_off))
-                    @ Pose(np.zeros(3), rotation_exp(turn))
-                ).orientation,
-            ),
-            covariance,
-        )
-        for moment, position, turn, off, turned_off in zip(
-            times, positions, turns, noise, turn_noise, strict=True
-        )
-    ]
+    measured = []
+    noisy = zip(times, positions + noise, turns, turn_noise, strict=True)
+    for moment, position, turn, turned_off in noisy:
+        turned = Pose(np.zeros(3), rotation_exp(turned_off)) @ Pose(position, rotation_exp(turn))
+        pose = Pose(position, turned.orientation)
+        measured.append(Measurement(round(1e9 * moment) + 1, pose, covariance))
     filter = create_filter(method, settings)
     filtered, stated = [], []
     began = time.thread_time()
@@ -164,7 +155,6 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
     moving = (times >= _BEGINNING) & (times < _MOVING)
     rest = times >= _MOVING + _SETTLING
     lag = delay(times[moving], found[moving], _position)
-    left = found[moving] - _position(times[moving] - lag)
     return FilterPoint(
         method,
         words,
@@ -173,19 +163,11 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
         delay(times[moving], found_turns[moving], _rotation),
         _root_mean_square(found[rest] - positions[rest]),
         _root_mean_square(found_turns[rest] - turns[rest]),
-        _root_mean_square(left),
+        _root_mean_square(found[moving] - _position(times[moving] - lag)),
         _root_mean_square(found[moving] - positions[moving]),
         float(np.median(np.array(stated)[moving])),
         seconds,
     )
-
-
-def _position(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _swayed(times, 1)
-
-
-def _rotation(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _swayed(times, 2)
 
 
 def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
@@ -199,6 +181,9 @@ def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
             amplitude = (1.0, 0.6, 0.3)[axis] * sway[what]
             total[:, axis] += amplitude * np.sin(2 * np.pi * sway[0] * times + phase)
     return total * ease[:, None]
+
+
+_position, _rotation = partial(_swayed, what=1), partial(_swayed, what=2)
 
 
 def _root_mean_square(values: NDArray[np.float64]) -> float:

@@ -24,10 +24,9 @@ def draw_views(file: Path) -> None:
         cells = []
         for name in MARKERS:
             case = Case(name, SMALL, 0.4, 30.0, condition)
-            seen = MARKERS[name]
-            pose = case.sequence(0)[0]
+            pose, body = case.sequence(0)[0], MARKERS[name].body
             image = rooms[name].render(pose, settings, 3, case.motion(0))
-            middle = WEBCAMS[SMALL].project(pose.apply(seen.body.centres.mean(axis=0)[None]))[0]
+            middle = WEBCAMS[SMALL].project(pose.apply(body.centres.mean(axis=0)[None]))[0]
             high, wide = image.shape
             top = int(np.clip(middle[1] - _CUT / 2, 0, high - _CUT))
             left = int(np.clip(middle[0] - _CUT / 2, 0, wide - _CUT))
@@ -38,14 +37,6 @@ def draw_views(file: Path) -> None:
 
 def _titled(image: np.ndarray, name: str, condition: str) -> np.ndarray:
     strip = np.full((_TITLE, image.shape[1]), 255, dtype=np.uint8)
-    cv2.putText(
-        strip,
-        f"{name}, {condition}",
-        (6, 15),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        0.45,
-        0,
-        1,
-        cv2.LINE_AA,
-    )
+    text = f"{name}, {condition}"
+    cv2.putText(strip, text, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 0, 1, cv2.LINE_AA)
     return np.vstack([strip, image])

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from us_sim.evaluation.figure import key_beside, new_figure, plain, save
 from us_sim.evaluation.tracking.cases import CONDITIONS, LARGE, MARKERS, SMALL
 from us_sim.evaluation.tracking.filters import FILTER_METHODS, FilterPoint
-from us_sim.evaluation.tracking.points import Point
+from us_sim.evaluation.tracking.points import Point, those
 
 __all__ = ["plot_conditions", "plot_filters", "plot_run_time", "plot_views"]
 
@@ -24,15 +24,12 @@ def plot_views(points: Sequence[Point], file: Path) -> None:
     figure = new_figure(
         10.5, 7.4, "Error of plain views, 640 × 480 (line: median; dashed: 95th percentile)"
     )
-    plain = [p for p in points if (p.case.condition, p.case.image_size) == ("plain", SMALL)]
+    plain = those(points, condition="plain", image_size=SMALL)
     panels = figure.subplots(2, 2, sharey="row")
     at = {
-        "distance, m (30°)": (
-            [p for p in plain if p.case.angle == 30],
-            lambda p: p.case.distance,
-        ),
+        "distance, m (30°)": (those(plain, angle=30), lambda p: p.case.distance),
         f"angle, degrees ({_DISTANCE:g} m)": (
-            [p for p in plain if p.case.distance == _DISTANCE],
+            those(plain, distance=_DISTANCE),
             lambda p: p.case.angle,
         ),
     }
@@ -42,10 +39,9 @@ def plot_views(points: Sequence[Point], file: Path) -> None:
         panels[1, column].set_xlabel(label)
     panels[0, 0].set_ylabel("position, mm")
     panels[1, 0].set_ylabel("rotation, degrees")
-    panels[0, 0].set_xscale("log")
-    panels[1, 0].set_xscale("log")
     distances = sorted({p.case.distance for p in plain})
     for panel in panels[:, 0]:
+        panel.set_xscale("log")
         panel.set_xticks(distances, [f"{value:g}" for value in distances])
         panel.xaxis.set_minor_formatter(NullFormatter())
     key_beside(panels[0, 1])
@@ -58,14 +54,14 @@ def plot_run_time(points: Sequence[Point], file: Path) -> None:
         10.5, 4.6, "Error against run time at 0.4 m (full: 640 × 480; hollow: 1920 × 1080)"
     )
     panels = figure.subplots(1, 2, sharex=True)
-    mine = [p for p in points if (p.case.condition, p.case.distance) == ("plain", _DISTANCE)]
+    mine = those(points, condition="plain", distance=_DISTANCE)
     for panel, value, label in (
         (panels[0], Point.error, "position, mm (median)"),
         (panels[1], Point.turned, "rotation, degrees (median)"),
     ):
         for name, kind in MARKERS.items():
             for size in (SMALL, LARGE):
-                some = [p for p in mine if (p.case.marker, p.case.image_size) == (name, size)]
+                some = those(mine, marker=name, image_size=size)
                 fill = kind.colour if size == SMALL else "white"
                 panel.plot(
                     [p.cpu_ms for p in some],
@@ -76,10 +72,8 @@ def plot_run_time(points: Sequence[Point], file: Path) -> None:
                     ms=7,
                     label=name if size == SMALL else None,
                 )
-        panel.set_xlabel("processor time of an image, ms (median)")
-        panel.set_ylabel(label)
-        panel.set_xscale("log")
-        panel.set_yscale("log")
+        panel.set(xlabel="processor time of an image, ms (median)", ylabel=label)
+        panel.set(xscale="log", yscale="log")
         _plain(panel)
     key_beside(panels[1])
     save(figure, file)
@@ -89,21 +83,16 @@ def plot_conditions(points: Sequence[Point], file: Path) -> None:
     """Error, and how many views in a hundred show the body to the tracker, in every condition."""
     figure = new_figure(10.5, 6.6, "Conditions at 0.4 m and 30°, 640 × 480")
     panels = figure.subplots(3, 1, sharex=True)
+    mine = those(points, image_size=SMALL, distance=_DISTANCE, angle=30)
     places = np.arange(len(CONDITIONS))
     width = 0.8 / len(MARKERS)
     for number, (name, kind) in enumerate(MARKERS.items()):
         columns: list[tuple[float, float, float]] = []
         for condition in CONDITIONS:
-            found = [
-                p
-                for p in points
-                if p.case.marker == name
-                and p.case.condition == condition
-                and (p.case.image_size, p.case.distance, p.case.angle) == (SMALL, _DISTANCE, 30)
-            ]
-            p = found[0] if found else None
-            percent = 100 * len(p.found) / max(1, len(p.views)) if p else np.nan
-            columns.append((p.error(95), p.turned(95), percent) if p else (np.nan,) * 3)
+            columns.append((np.nan,) * 3)
+            for p in those(mine, marker=name, condition=condition)[:1]:
+                percent = 100 * len(p.found) / max(1, len(p.views))
+                columns[-1] = (p.error(95), p.turned(95), percent)
         for panel, values in zip(panels, zip(*columns, strict=True), strict=True):
             at = places + (number - 0.5 * (len(MARKERS) - 1)) * width
             panel.bar(at, values, 0.9 * width, color=kind.colour, label=name)
@@ -131,20 +120,17 @@ def plot_filters(points: Sequence[FilterPoint], file: Path) -> None:
         for method, (colour, mark) in FILTER_METHODS.items():
             mine = [p for p in points if p.method == method]
             for p in mine:
-                size = 11 if p.default else 5
                 panel.plot(
                     max(1e3 * p.lag, 0.0),
                     value(p),
                     mark,
                     mec=colour,
                     mfc=colour if p.default else "white",
-                    ms=size,
+                    ms=11 if p.default else 5,
                     label=method if p is mine[0] else None,
                 )
-        panel.set_xlabel("lag in motion, ms")
-        panel.set_ylabel(label)
         panel.set_xscale("symlog", linthresh=1.0)
-        panel.set_yscale("log")
+        panel.set(xlabel="lag in motion, ms", ylabel=label, yscale="log")
         _plain(panel)
     panels[1].legend(fontsize=8, frameon=False)
     save(figure, file)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -30,7 +30,7 @@ from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["Bench", "Point", "View", "mirrored", "visible"]
+__all__ = ["Bench", "Point", "View", "mirrored", "those", "views_of", "visible"]
 
 _FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
@@ -127,6 +127,17 @@ class Point(Row):
         return _percentile([view.degrees for view in self.found], percent)
 
 
+def those(points: Sequence[Point], **case: object) -> list[Point]:
+    """Points whose case has these values, such as ``marker="aruco_40mm", distance=0.4``."""
+    wanted = case.items()
+    return [p for p in points if all(getattr(p.case, name) == value for name, value in wanted)]
+
+
+def views_of(points: Sequence[Point], **case: object) -> list[View]:
+    """All views of these."""
+    return [view for point in those(points, **case) for view in point.views]
+
+
 class Bench:
     """Renders cases and has them tracked; keeps the room of the last body."""
 
@@ -145,15 +156,18 @@ class Bench:
         if key not in self._rooms:
             self._rooms = {key: RenderedView(camera, seen.body)}
         room = self._rooms[key]
+        conditions, _ = CONDITIONS[case.condition]
         views: list[View] = []
         parts: list[tuple[float, float]] = []
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
         try:
             for number in range(sequences):
-                images = _images(room, case, number)
                 source = CameraSource(camera, seen.body)
-                for frame, (pose, image) in enumerate(images):
+                seed = zlib.crc32(f"{case} {number}".encode())
+                for frame, pose in enumerate(case.sequence(number)):
+                    # The hand and the light stay as they are through a sequence, not the noise.
+                    image = room.render(pose, conditions, seed, case.motion(number), frame)
                     views.append(_view(source, seen, frame, pose, image))
                     if frame == 0:
                         parts.append(_parts(camera, seen, image))
@@ -162,17 +176,6 @@ class Bench:
         detector = _percentile([part[0] for part in parts], 50)
         solver = _percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
         return Point(case, tuple(views), detector, solver)
-
-
-def _images(
-    room: RenderedView, case: Case, number: int
-) -> Iterator[tuple[Pose, NDArray[np.uint8]]]:
-    """Poses of a sequence and how they look."""
-    conditions, _ = CONDITIONS[case.condition]
-    seed = zlib.crc32(f"{case} {number}".encode())
-    for frame, pose in enumerate(case.sequence(number)):
-        # The hand and the light stay as they are through a sequence, the noise does not.
-        yield pose, room.render(pose, conditions, seed, case.motion(number), frame)
 
 
 def _view(
@@ -201,9 +204,8 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
     off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
     angle = rotation_angle(found, true)
     other = rotation_angle(found, mirrored(true, middle, seen.front))
-    error = np.concatenate(
-        [true.position - found.position, rotation_between(found.orientation, true.orientation)]
-    )
+    turn = rotation_between(found.orientation, true.orientation)
+    error = np.concatenate([true.position - found.position, turn])
     square = np.nan
     if measured.covariance is not None:
         square = float(error @ np.linalg.pinv(measured.covariance, hermitian=True) @ error)
@@ -221,10 +223,8 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
 def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
     """The pose that a plane seen from afar may be taken for: tilted to the other side.
 
-    Args:
-        pose: of the body in ``camera_optical``.
-        middle: (3,) m, of the body, in its own frame.
-        front: (3,) unit, normal of its plane, in its own frame.
+    The pose is of the body in ``camera_optical``; its middle (3,) m, and the unit normal (3,) of
+    its front, are in its own frame.
     """
     sight = pose.apply(middle[None])[0]
     sight = sight / np.linalg.norm(sight)

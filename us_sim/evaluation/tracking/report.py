@@ -18,7 +18,7 @@ from us_sim.evaluation.tracking.plots import (
     plot_run_time,
     plot_views,
 )
-from us_sim.evaluation.tracking.points import Point, View
+from us_sim.evaluation.tracking.points import Point, View, those, views_of
 from us_sim.evaluation.tracking.targets import targets
 
 __all__ = ["table", "write_report"]
@@ -101,22 +101,15 @@ def _parts(
 
 
 def _bodies(points: Sequence[Point]) -> str:
-    head = ("body", "image", "m", *_OF_VIEWS)
     rows = []
-    plain = [p for p in points if p.case.condition == "plain" and p.views]
+    plain = [p for p in those(points, condition="plain") if p.views]
     for name in MARKERS:
         for size in dict.fromkeys(p.case.image_size for p in plain):
             for distance in sorted({p.case.distance for p in plain}):
-                mine = [
-                    view
-                    for p in plain
-                    if (p.case.marker, p.case.image_size, p.case.distance) == (name, size, distance)
-                    for view in p.views
-                ]
-                if not mine:
-                    continue
-                rows.append((name, size, f"{distance:g}", *_cells(mine)))
-    return markdown_table(head, rows)
+                mine = views_of(plain, marker=name, image_size=size, distance=distance)
+                if mine:
+                    rows.append((name, size, f"{distance:g}", *_cells(mine)))
+    return markdown_table(("body", "image", "m", *_OF_VIEWS), rows)
 
 
 def _cells(views: Sequence[View]) -> tuple[str, ...]:
@@ -133,11 +126,10 @@ def _cells(views: Sequence[View]) -> tuple[str, ...]:
 def _times(points: Sequence[Point]) -> str:
     head = ("body", "image", "CPU ms an image", "detector, CPU ms", "solver, CPU ms")
     rows = []
-    plain = [p for p in points if (p.case.condition, p.case.distance) == ("plain", 0.4)]
+    plain = those(points, condition="plain", distance=0.4)
     for name in MARKERS:
         for size in dict.fromkeys(p.case.image_size for p in plain):
-            mine = [p for p in plain if (p.case.marker, p.case.image_size) == (name, size)]
-            mine = [p for p in mine if p.views]
+            mine = [p for p in those(plain, marker=name, image_size=size) if p.views]
             if mine:
                 cells = [
                     [view.cpu_ms for p in mine for view in p.views],
@@ -149,39 +141,25 @@ def _times(points: Sequence[Point]) -> str:
 
 
 def _conditions(points: Sequence[Point]) -> str:
-    head = ("body", "condition", *_OF_VIEWS)
-    rows = []
-    for name in MARKERS:
-        for condition in CONDITIONS:
-            mine = [
-                view
-                for p in points
-                if (p.case.marker, p.case.condition) == (name, condition)
-                and (p.case.image_size, p.case.distance) == (SMALL, 0.4)
-                for view in p.views
-            ]
-            rows.append((name, condition, *_cells(mine)))
-    return markdown_table(head, rows)
+    near = those(points, image_size=SMALL, distance=0.4)
+    rows = [
+        (name, condition, *_cells(views_of(near, marker=name, condition=condition)))
+        for name in MARKERS
+        for condition in CONDITIONS
+    ]
+    return markdown_table(("body", "condition", *_OF_VIEWS), rows)
 
 
 def _covariance(points: Sequence[Point]) -> str:
     head = ("body", "within the 95 % ellipsoid", "median error, mm", "said, mm")
     rows = []
     for name in MARKERS:
-        mine = [
-            view
-            for p in points
-            if (p.case.marker, p.case.condition) == (name, "plain")
-            for view in p.found
-        ]
-        rows.append(
-            (
-                name,
-                _percent(sum(view.inside for view in mine), len(mine)),
-                _percentiles([view.mm for view in mine])[0],
-                _percentiles([view.expected_mm for view in mine])[0],
-            )
-        )
+        plain = views_of(points, marker=name, condition="plain")
+        mine = [view for view in plain if view.detected]
+        within = _percent(sum(view.inside for view in mine), len(mine))
+        error, _ = _percentiles([view.mm for view in mine])
+        said, _ = _percentiles([view.expected_mm for view in mine])
+        rows.append((name, within, error, said))
     return markdown_table(head, rows)
 
 

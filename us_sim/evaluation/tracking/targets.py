@@ -8,17 +8,20 @@ import numpy as np
 
 from us_sim.evaluation.target import Target
 from us_sim.evaluation.tracking.cases import LARGE, RIGID_BODY, SINGLE, SMALL
-from us_sim.evaluation.tracking.points import Point, View
+from us_sim.evaluation.tracking.points import Point, View, views_of
 
-__all__ = ["body_views", "single_views", "targets"]
+__all__ = ["targets"]
+
+_BODY = {"marker": RIGID_BODY, "condition": "plain", "distance": 0.4}
 
 _VISIBLE = 4  # markers
 
 
 def targets(points: Sequence[Point]) -> list[Target]:
     """Every measure that is asked for."""
-    body = [view for view in body_views(points) if view.visible == _VISIBLE]
-    single = single_views(points)
+    views = views_of(points, **_BODY, image_size=SMALL)
+    body = [view for view in views if view.visible == _VISIBLE]
+    single = views_of(points, marker=SINGLE, condition="plain")
     found = [view for view in single if view.detected]
     tracked = sum(view.detected for view in body)
     where = f"{_VISIBLE} visible 30 mm markers at 0.4 m, 640 × 480"
@@ -48,39 +51,9 @@ def targets(points: Sequence[Point]) -> list[Target]:
     ]
 
 
-def body_views(points: Sequence[Point]) -> list[View]:
-    """Plain views of the rigid body at 0.4 m in small images."""
-    return [
-        view
-        for point in points
-        for view in point.views
-        if point.case.marker == RIGID_BODY
-        and point.case.condition == "plain"
-        and point.case.distance == 0.4
-        and point.case.image_size == SMALL
-    ]
-
-
-def single_views(points: Sequence[Point]) -> list[View]:
-    """Plain views of the single marker from everywhere, in small images and large ones."""
-    return [
-        view
-        for point in points
-        for view in point.views
-        if point.case.marker == SINGLE and point.case.condition == "plain"
-    ]
-
-
 def _ms(points: Sequence[Point], image_size: str) -> float:
     """Median processor time of plain images of the rigid body from 0.4 m."""
-    mine = [
-        view.cpu_ms
-        for point in points
-        for view in point.views
-        if point.case.marker == RIGID_BODY
-        and point.case.image_size == image_size
-        and (point.case.condition, point.case.distance) == ("plain", 0.4)
-    ]
+    mine = [view.cpu_ms for view in views_of(points, **_BODY, image_size=image_size)]
     return float(np.median(mine)) if mine else float("nan")
 
 

@@ -28,6 +28,9 @@ from us_sim.tracking.camera.markers import dictionary
 __all__ = ["Board", "BoardView"]
 
 _SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
+_Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""(N, 3) m on the board and (N, 2) pixels, as of a `BoardView`."""
+_NOTHING: _Corners = np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
 _FEWEST_CORNERS = 6  # of a view: fewer do not determine the board's pose and an error
 
 
@@ -100,19 +103,15 @@ class Board:
 
         None where it shows fewer than six, or they are all in one row.
         """
-        if self.kind == "chessboard":
-            points, pixels = self._find_chessboard(image)
-        else:
-            points, pixels = self._find_markers(image)
+        find = self._find_chessboard if self.kind == "chessboard" else self._find_markers
+        points, pixels = find(image)
         if len(points) < _FEWEST_CORNERS:
             return None
         if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
             return None
         return BoardView(points, pixels)
 
-    def _find_chessboard(
-        self, image: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _find_chessboard(self, image: NDArray[np.uint8]) -> _Corners:
         size = (self.columns - 1, self.rows - 1)
         # A large photo is searched at a smaller size, since that takes its pixels' time.
         shrink = min(1.0, _SEARCHED / max(image.shape))
@@ -123,7 +122,7 @@ class Board:
             flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY,
         )
         if not found:
-            return np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
+            return _NOTHING
         if shrink < 1.0:
             window = 2 + round(2.0 / shrink)
             pixels = cv2.cornerSubPix(
@@ -137,9 +136,7 @@ class Board:
         points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
         return np.float32(self.square) * points.astype(np.float32), _pixels(pixels)
 
-    def _find_markers(
-        self, image: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _find_markers(self, image: NDArray[np.uint8]) -> _Corners:
         corners: Any
         if self.kind == "charuco":
             corners, ids, _, _ = self._charuco_detector.detectBoard(image)
@@ -149,10 +146,10 @@ class Board:
                 image, self._printed, *seen
             )
         if ids is None or not len(ids):
-            return np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
+            return _NOTHING
         points, pixels = self._printed.matchImagePoints(corners, ids)
         if points is None:
-            return np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
+            return _NOTHING
         return points.reshape(-1, 3), _pixels(pixels)
 
     @cached_property

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import cv2
@@ -114,23 +115,17 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
     off = found.residuals > max(_FAR_OFF * float(np.median(found.residuals)), _GOOD_RMS)
     if off.any() and off.sum() <= min(_MOST_LEFT_OUT * len(views), len(views) - _FEWEST_VIEWS):
         used = ~off
-        found = _solve([view for view, use in zip(views, used, strict=True) if use], width, height)
+        found = _solve(list(compress(views, used)), width, height)
     if found.rms > _LARGEST_RMS * _scale(width):
         raise CalibrationError(
             f"no camera fits the photos (RMS {found.rms:.1f} pixels): check the board's kind, size "
             f"and lengths"
         )
-    deviations, tilt = found.deviations, _largest_tilt(found.rotations)
-    _check(found.matrix, deviations, tilt)
-    return CameraCalibration(
-        CameraModel(width, height, found.matrix, found.lens),
-        found.rms,
-        found.residuals,
-        used,
-        deviations,
-        tilt,
-        reach,
-    )
+    tilt = _largest_tilt(found.rotations)
+    _check(found.matrix, found.deviations, tilt)
+    camera = CameraModel(width, height, found.matrix, found.lens)
+    fit = (found.rms, found.residuals, used, found.deviations)
+    return CameraCalibration(camera, *fit, tilt, reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +143,9 @@ class _Solution:
 def _solve(views: Sequence[BoardView], width: int, height: int) -> _Solution:
     start: Any = None  # no camera to start from, which OpenCV's type hints do not know
     try:
+        points, pixels = [view.points for view in views], [view.pixels for view in views]
         rms, matrix, lens, turns, _, deviations, _, residuals = cv2.calibrateCameraExtended(
-            [view.points for view in views],
-            [view.pixels for view in views],
-            (width, height),
-            start,
-            start,
+            points, pixels, (width, height), start, start
         )
     except cv2.error as error:
         raise CalibrationError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Sequence
+from itertools import compress
 from pathlib import Path
 
 import cv2
@@ -35,19 +36,11 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
             write exists.
     """
-    out = settings.out
-    picture = out.with_suffix(".png")
-    if picture.exists():
-        raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-    board = Board(
-        settings.board,
-        *columns_and_rows(settings.size),
-        settings.square,
-        settings.marker,
-        settings.separation,
-        settings.dictionary or ("" if settings.board == "chessboard" else "4X4_50"),
-        settings.legacy,
-    )
+    out, picture = settings.out, settings.picture
+    lengths = (settings.square, settings.marker, settings.separation)
+    markers = settings.dictionary or ("" if settings.board == "chessboard" else "4X4_50")
+    shape = columns_and_rows(settings.size)
+    board = Board(settings.board, *shape, *lengths, markers, settings.legacy)
     photos = find_photos(settings.photos)
     names, views, blank, size = _views(photos, board, progress)
     if not views:
@@ -56,28 +49,23 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
             f"--dictionary, and try --legacy with an old ChArUco board"
         )
     found = calibrate_camera(views, *size)
-    far_off = [name for name, used in zip(names, found.used, strict=True) if not used]
-    names = [name for name, used in zip(names, found.used, strict=True) if used]
-    views = [view for view, used in zip(views, found.used, strict=True) if used]
-    notes = _notes(found, board, names, views) | {
-        "photos_without_board": blank,
-        "photos_left_out": far_off,
-    }
+    far_off = list(compress(names, ~found.used))
+    names, views = list(compress(names, found.used)), list(compress(views, found.used))
+    notes = _notes(found, board, names, views)
+    notes |= {"photos_without_board": blank, "photos_left_out": far_off}
     write_camera_info(out, found.camera, settings.name, notes)
     draw_coverage(picture, found, views, names)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
-    left_out = f"; {len(blank)} without the board: {', '.join(blank)}" if blank else ""
-    left_out += (
-        f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}" if far_off else ""
-    )
-    note = f"; {found.note}" if found.note else ""
-    return (
-        f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {len(views)} photos, coverage in "
-        f"{picture}{left_out}{note}"
-    )
+    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {len(views)} photos, coverage in "
+    said += f"{picture}"
+    if blank:
+        said += f"; {len(blank)} without the board: {', '.join(blank)}"
+    if far_off:
+        said += f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}"
+    return f"{said}; {found.note}" if found.note else said
 
 
 def find_photos(patterns: Sequence[str]) -> list[Path]:
@@ -148,10 +136,7 @@ def _read(photo: Path) -> NDArray[np.uint8]:
 
 
 def _notes(
-    found: CameraCalibration,
-    board: Board,
-    names: Sequence[str],
-    views: Sequence[BoardView],
+    found: CameraCalibration, board: Board, names: Sequence[str], views: Sequence[BoardView]
 ) -> dict[str, object]:
     """What the file says in addition to the camera; ROS' readers ignore it."""
     return {

@@ -15,6 +15,7 @@ import csv
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +38,8 @@ def read_landmarks(path: str | Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         CalibrationError: the file cannot be read, names a landmark twice or has none.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".xml":
-        found = [
-            (element.get("Name", ""), _vector(path, element, "Position"))
-            for element in _document(path).iter("Landmark")
-        ]
-    else:
-        rows = read_table(path, dict.fromkeys(("x", "y", "z"), "length"), label="name")
-        found = [(name, np.array(values)) for name, values in rows]
-    return _named(path, found, "landmark")
+    points = _read(Path(path), "landmark", ("Position",), ("x", "y", "z"))
+    return {name: numbers[0] for name, numbers in points.items()}
 
 
 def read_wires(path: str | Path) -> dict[str, NDArray[np.float64]]:
@@ -59,20 +52,8 @@ def read_wires(path: str | Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         CalibrationError: the file cannot be read, names a wire twice or has none.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".xml":
-        found = [
-            (
-                element.get("Name", ""),
-                np.array([_vector(path, element, f"EndPoint{end}") for end in ("Front", "Back")]),
-            )
-            for element in _document(path).iter("Wire")
-        ]
-    else:
-        ends = ("x1", "y1", "z1", "x2", "y2", "z2")
-        rows = read_table(path, dict.fromkeys(ends, "length"), label="name")
-        found = [(name, np.array(values).reshape(2, 3)) for name, values in rows]
-    return _named(path, found, "wire")
+    columns = ("x1", "y1", "z1", "x2", "y2", "z2")
+    return _read(Path(path), "wire", ("EndPointFront", "EndPointBack"), columns)
 
 
 def read_table(
@@ -119,16 +100,25 @@ def read_table(
     return rows
 
 
-def _named(
-    path: Path, found: Sequence[tuple[str, NDArray[np.float64]]], what: str
+def _read(
+    path: Path, what: str, attributes: Sequence[str], columns: Sequence[str]
 ) -> dict[str, NDArray[np.float64]]:
+    """(K, 3) m by name, from a Plus configuration's attributes or a CSV's columns."""
+    found: list[tuple[str, Any]]
+    if path.suffix.lower() == ".xml":
+        found = [
+            (element.get("Name", ""), [_vector(path, element, key) for key in attributes])
+            for element in _document(path).iter(what.capitalize())
+        ]
+    else:
+        found = read_table(path, dict.fromkeys(columns, "length"), label="name")
     named: dict[str, NDArray[np.float64]] = {}
     for name, value in found:
         if not name:
             raise CalibrationError(f"{path}: a {what} has no name; name all of them")
         if name in named:
             raise CalibrationError(f"{path}: {what} {name} is there twice; name each only once")
-        named[name] = value
+        named[name] = np.array(value).reshape(-1, 3)
     if not named:
         raise CalibrationError(f"{path}: holds no {what}")
     return named

@@ -28,6 +28,8 @@ from us_sim.geometry.pose import Pose
 
 __all__ = ["LandmarkRegistration", "register_landmarks"]
 
+Array = NDArray[np.float64]
+
 _FLATTEST = 0.02  # width of the landmarks' spread over its length, below which they are in line
 _WORST_FIT = 0.1  # FRE over the landmarks' spread, above which they are not the same points
 
@@ -38,10 +40,10 @@ class LandmarkRegistration:
 
     pose: Pose  # of the measured points' frame in that of the known ones
     names: tuple[str, ...]
-    residuals: NDArray[np.float64]  # (N,) m, distance of each after the transform
+    residuals: Array  # (N,) m, distance of each after the transform
     fre: float  # m, root mean square of these
-    left_out: NDArray[np.float64]  # (N,) m, of each when the others make the transform; nan of 3
-    deviations: NDArray[np.float64]  # (6,) m and rad, of position and rotation, to's axes
+    left_out: Array  # (N,) m, of each when the others make the transform; nan of 3
+    deviations: Array  # (6,) m and rad, of position and rotation, to's axes
 
     @property
     def tre(self) -> float:
@@ -50,7 +52,7 @@ class LandmarkRegistration:
 
 
 def register_landmarks(
-    measured: NDArray[np.float64], known: NDArray[np.float64], names: Sequence[str] = ()
+    measured: Array, known: Array, names: Sequence[str] = ()
 ) -> LandmarkRegistration:
     """The rigid transform that lays the measured points on the known ones.
 
@@ -70,17 +72,12 @@ def register_landmarks(
     residuals = np.linalg.norm(pose.apply(measured) - known, axis=1)
     fre = math.sqrt(float((residuals**2).mean()))
     _check_fit(measured, known, residuals, names)
-    return LandmarkRegistration(
-        pose,
-        names,
-        residuals,
-        fre,
-        _leave_one_out(measured, known),
-        _deviations(known, pose.position, residuals),
-    )
+    left_out = _leave_one_out(measured, known)
+    deviations = _deviations(known, pose.position, residuals)
+    return LandmarkRegistration(pose, names, residuals, fre, left_out, deviations)
 
 
-def _check(measured: NDArray[np.float64], known: NDArray[np.float64], names: Sequence[str]) -> None:
+def _check(measured: Array, known: Array, names: Sequence[str]) -> None:
     if measured.shape != known.shape or known.ndim != 2 or known.shape[1] != 3:
         raise CalibrationError(
             f"a registration needs as many measured as known landmarks of 3 coordinates, not "
@@ -94,23 +91,15 @@ def _check(measured: NDArray[np.float64], known: NDArray[np.float64], names: Seq
             raise CalibrationError(f"landmark {bad}: its {what} coordinates are not finite")
         length, width, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if width <= _FLATTEST * length or length == 0.0:
+            # A tenth of the landmarks' extent; 10 mm where they have none.
+            advised = max(1e2 * 2.0 * length / math.sqrt(len(points)), 10.0)
             raise CalibrationError(
                 f"the {what} landmarks lie on a line, about which the registration may turn: add "
-                f"one at least {_advised(length, len(points)):.0f} mm beside it"
+                f"one at least {advised:.0f} mm beside it"
             )
 
 
-def _advised(length: float, count: int) -> float:
-    """mm, a tenth of the landmarks' extent; 10 where they have none."""
-    return max(1e2 * 2.0 * length / math.sqrt(count), 10.0)
-
-
-def _check_fit(
-    measured: NDArray[np.float64],
-    known: NDArray[np.float64],
-    residuals: NDArray[np.float64],
-    names: Sequence[str],
-) -> None:
+def _check_fit(measured: Array, known: Array, residuals: Array, names: Sequence[str]) -> None:
     spread, theirs = (
         math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for points in (known, measured)
@@ -129,7 +118,7 @@ def _check_fit(
         )
 
 
-def _fit(measured: NDArray[np.float64], known: NDArray[np.float64]) -> Pose:
+def _fit(measured: Array, known: Array) -> Pose:
     from_middle, to_middle = measured.mean(axis=0), known.mean(axis=0)
     left, _, right = np.linalg.svd((known - to_middle).T @ (measured - from_middle))
     proper = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
@@ -139,9 +128,7 @@ def _fit(measured: NDArray[np.float64], known: NDArray[np.float64]) -> Pose:
     return Pose.from_matrix(matrix)
 
 
-def _leave_one_out(
-    measured: NDArray[np.float64], known: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _leave_one_out(measured: Array, known: Array) -> Array:
     errors = np.full(len(known), np.nan)
     if len(known) > 3:
         for k in range(len(known)):
@@ -151,9 +138,7 @@ def _leave_one_out(
     return errors
 
 
-def _deviations(
-    known: NDArray[np.float64], origin: NDArray[np.float64], residuals: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _deviations(known: Array, origin: Array, residuals: Array) -> Array:
     """(6,) standard deviations of the transform, for equal errors of all coordinates.
 
     Of the position of the measured frame's origin, and of the rotation about the axes.
@@ -169,7 +154,7 @@ def _deviations(
     return np.sqrt(np.concatenate([np.diag(position), np.diag(rotation)]))
 
 
-def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(vector: Array) -> Array:
     """(3, 3) matrix whose product is the cross product with a vector."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -27,6 +27,8 @@ from us_sim.geometry.pose import Pose
 
 __all__ = ["PivotCalibration", "calibrate_pivot"]
 
+Array = NDArray[np.float64]
+
 _FEWEST = 10  # poses
 _SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square
 _LARGEST_RMS = 5e-3  # m, above which the tip did not stay in one place
@@ -41,10 +43,10 @@ _LARGEST_SQUARE = 16.27  # its 99.9th percentile
 class PivotCalibration:
     """A tip and how well the poses determine it."""
 
-    tip: NDArray[np.float64]  # (3,) m, in the body's frame
-    pivot: NDArray[np.float64]  # (3,) m, the fixed point in the device's frame
+    tip: Array  # (3,) m, in the body's frame
+    pivot: Array  # (3,) m, the fixed point in the device's frame
     rms: float  # m, root mean square distance of the poses' tips from the fixed point
-    deviations: NDArray[np.float64]  # (3,) m, standard deviations of the tip's coordinates
+    deviations: Array  # (3,) m, standard deviations of the tip's coordinates
     swing: float  # rad, how far the direction turns that turns least, root mean square
     inliers: NDArray[np.bool_]  # (K,) poses that were used
 
@@ -88,7 +90,7 @@ def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
     )
 
 
-def _check_swing(rotations: NDArray[np.float64]) -> float:
+def _check_swing(rotations: Array) -> float:
     """How far the direction turns that turns least, rad.
 
     Raises:
@@ -107,9 +109,7 @@ def _check_swing(rotations: NDArray[np.float64]) -> float:
     return swing
 
 
-def _least_squares(
-    rotations: NDArray[np.float64], positions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _least_squares(rotations: Array, positions: Array) -> tuple[Array, Array, float]:
     """Tip and fixed point (6,), their covariance (6, 6), and the root mean square distance."""
     count = len(rotations)
     rows = np.empty((count, 3, 6))
@@ -122,9 +122,7 @@ def _least_squares(
     return solution, covariance, math.sqrt(squares / count)
 
 
-def _consistent(
-    rotations: NDArray[np.float64], positions: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _consistent(rotations: Array, positions: Array) -> NDArray[np.bool_]:
     """(K,) which poses agree with most others on a fixed point."""
     rng = np.random.default_rng(0)  # the same poses, the same answer
     # Every so many poses judge as well as all, in less memory.
@@ -149,9 +147,7 @@ def _consistent(
     return inliers
 
 
-def _solve(
-    means: NDArray[np.float64], rotations: NDArray[np.float64], positions: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _solve(means: Array, rotations: Array, positions: Array) -> Array:
     """(T, 6) tip and fixed point of T samples: rotations (T, S, 3, 3), positions (T, S, 3).
 
     By the normal equations without the fixed point c = mean(R) t + mean(p):
@@ -165,17 +161,11 @@ def _solve(
     return np.concatenate([tips, means @ tips + middles[..., None]], axis=1)[..., 0]
 
 
-def _squared_distances(
-    rotations: NDArray[np.float64], positions: NDArray[np.float64], solution: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    squares: NDArray[np.float64] = ((rotations @ solution[:3] + positions - solution[3:]) ** 2).sum(
-        axis=1
-    )
-    return squares
+def _squared_distances(rotations: Array, positions: Array, solution: Array) -> Array:
+    return np.asarray(((rotations @ solution[:3] + positions - solution[3:]) ** 2).sum(axis=1))
 
 
-def _near(squares: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _near(squares: Array) -> NDArray[np.bool_]:
     """Distances that a normal error of the median's size would have; at least rounding errors."""
     variance = float(np.median(squares)) / _MEDIAN_SQUARE
-    near: NDArray[np.bool_] = squares <= max(variance * _LARGEST_SQUARE, 1e-18)
-    return near
+    return np.asarray(squares <= max(variance * _LARGEST_SQUARE, 1e-18))

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,12 +71,7 @@ class ProbeCalibration:
     points: Mapping[str, NDArray[np.float64]]  # (3,) m, where features were found to be
 
     def probe_pose(self, column: float, row: float) -> Pose:
-        """The pose of ``probe`` in the body's frame.
-
-        Args:
-            column: of the pixel at the middle of the transducer's face.
-            row: of the same.
-        """
+        """The pose of ``probe`` in the body's frame, from the pixel at the face's middle."""
         matrix = np.eye(4)
         x, z = (self.image_to_body[:3, k] / self.spacing[k] for k in range(2))
         matrix[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
@@ -212,16 +207,8 @@ class _Sightings:
 
     def only(self, which: NDArray[np.bool_]) -> _Sightings:
         """The sightings that a mask selects."""
-        return _Sightings(
-            self.pixels[which],
-            self.rotations[which],
-            self.positions[which],
-            self.targets[which],
-            self.across[which],
-            self.unknown[which],
-            self.unknowns,
-            self.spacing,
-        )
+        arrays = ("pixels", "rotations", "positions", "targets", "across", "unknown")
+        return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
     def distances(self, image: _Image) -> NDArray[np.float64]:
         """(N, 3) m from the features to their pixels, across wires."""
@@ -230,8 +217,7 @@ class _Sightings:
         targets = self.targets.copy()
         rows = self.unknown >= 0
         targets[rows] = image.points[self.unknown[rows]]
-        away: NDArray[np.float64] = np.einsum("nij,nj->ni", self.across, found - targets)
-        return away
+        return np.asarray(np.einsum("nij,nj->ni", self.across, found - targets))
 
 
 def _start(seen: _Sightings) -> _Image:

@@ -14,11 +14,7 @@ from us_sim.tracking.calibration.dwell import find_dwells
 from us_sim.tracking.calibration.landmark_file import read_landmarks
 from us_sim.tracking.calibration.landmarks import register_landmarks
 from us_sim.tracking.calibration.pivot import calibrate_pivot
-from us_sim.tracking.calibration.recorded_motion import (
-    read_motion,
-    read_signal,
-    seconds_of,
-)
+from us_sim.tracking.calibration.recorded_motion import read_motion, read_signal, seconds_of
 from us_sim.tracking.calibration.report_picture import draw_offset
 from us_sim.tracking.calibration.settings import (
     ClockSettings,
@@ -96,6 +92,7 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     found = register_landmarks(theirs, ours, names)
     if settings.invert:
         found, frame, to = register_landmarks(ours, theirs, names), to, frame
+    moved, turned = found.deviations[:3], found.deviations[3:]  # m and rad
     left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
     write_transform(
         out,
@@ -109,12 +106,7 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
             "landmarks": dict(zip(names, found.residuals, strict=True)),  # m
             "left_out": dict(zip(names, left_out, strict=True)),  # m
         },
-        more={
-            "standard_deviations": {
-                "position": found.deviations[:3],  # m
-                "rotation": found.deviations[3:],  # rad
-            }
-        },
+        more={"standard_deviations": {"position": moved, "rotation": turned}},
     )
     worst = int(found.residuals.argmax())
     tre = "" if math.isnan(found.tre) else f", leave-one-out TRE {1e3 * found.tre:.2f} mm"
@@ -134,10 +126,7 @@ def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
     """
-    out = settings.out
-    picture = out.with_suffix(".png")
-    if picture.exists():
-        raise CalibrationError(f"{picture}: exists already; choose another name for --out")
+    out, picture = settings.out, settings.picture
     moving = read_signal(settings.moving, settings.pose, progress=progress)
     name = settings.fixed_pose or settings.pose
     fixed = read_signal(settings.fixed, name, images=settings.images, progress=progress)
@@ -173,13 +162,10 @@ def _touched(
             f"as `us-sim calibrate pivot` writes it"
         )
     motion = read_motion(recording, name)
-    poses = motion.poses
     offset = read_transform(tip).position
-    dwells = find_dwells(
-        seconds_of(motion),
-        np.array([pose.apply(offset) for pose in poses]),
-        np.array([pose.rotation for pose in poses]),
-    )
+    tips = np.array([pose.apply(offset) for pose in motion.poses])
+    rotations = np.array([pose.rotation for pose in motion.poses])
+    dwells = find_dwells(seconds_of(motion), tips, rotations)
     if len(dwells) != len(names):
         start = seconds_of(motion)[0]
         at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells) or "none"

@@ -45,13 +45,8 @@ def draw_coverage(
     for view in views:
         image.plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=2)
     image.plot(*camera.matrix[:2, 2], "k+", markersize=12)
-    image.set(
-        xlim=extent[:2],
-        ylim=extent[2:],
-        xlabel="column",
-        ylabel="row",
-        title=f"corners of {len(views)} photos; + is the principal point",
-    )
+    image.set(xlim=extent[:2], ylim=extent[2:], xlabel="column", ylabel="row")
+    image.set_title(f"corners of {len(views)} photos; + is the principal point")
     order = np.arange(len(views))
     bars.bar(order, calibration.residuals)
     bars.axhline(calibration.rms, color="k", linewidth=0.8)
@@ -76,11 +71,8 @@ def draw_offset(
         moving.times + found.offset - start, sign * _normal(moving.values), label="moving, shifted"
     )
     signals.plot(fixed.times - start, _normal(fixed.values), ".-", markersize=3, label="fixed")
-    signals.set(
-        xlabel="s",
-        ylabel="position (standard deviations)",
-        title=f"offset {1e3 * found.offset:.1f} ± {1e3 * found.deviation:.1f} ms",
-    )
+    signals.set(xlabel="s", ylabel="position (standard deviations)")
+    signals.set_title(f"offset {1e3 * found.offset:.1f} ± {1e3 * found.deviation:.1f} ms")
     signals.set_xlim(0.0, float(np.ptp(fixed.times)))
     signals.legend(loc="upper right")
     correlations.plot(1e3 * found.tried, found.correlations)
@@ -90,8 +82,7 @@ def draw_offset(
 
 
 def _normal(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    scaled: NDArray[np.float64] = (values - values.mean()) / values.std()
-    return scaled
+    return np.asarray((values - values.mean()) / values.std())
 
 
 def _save(figure: Figure, path: Path) -> None:

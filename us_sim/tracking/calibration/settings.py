@@ -42,13 +42,19 @@ _POSE = (
 )
 
 
+def _out(what: str, name: str) -> Path:
+    """The setting of the file that a calibration writes."""
+    file: Path = setting(description=f"file to write{what}", default=Path(name), kw_only=True)
+    return file
+
+
 @dataclass(frozen=True)
 class CalibrationSettings(Settings):
     """Base of the settings of a calibration, each of which has a file ``out`` to write."""
 
     error = CalibrationError
 
-    out: Path = setting(description="file to write", default=Path("calibration.yaml"), kw_only=True)
+    out: Path = _out("", "calibration.yaml")
 
     def check(self) -> None:
         """Refuse to write over a file, which is worth knowing before the work."""
@@ -58,6 +64,18 @@ class CalibrationSettings(Settings):
             raise self.refused("out", f"{self.out}: exists already; choose another name")
         if not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+
+    @property
+    def picture(self) -> Path:
+        """The picture that goes beside the file.
+
+        Raises:
+            CalibrationError: it exists already.
+        """
+        picture = self.out.with_suffix(".png")
+        if picture.exists():
+            raise CalibrationError(f"{picture}: exists already; choose another name for --out")
+        return picture
 
 
 @dataclass(frozen=True)
@@ -79,11 +97,7 @@ class CameraSettings(CalibrationSettings):
         description="the ChArUco board is as OpenCV before 4.6 drew it", default=False
     )
     name: str = setting(description="the camera's name in the file", default="camera")
-    out: Path = setting(
-        description="file to write: camera info; a picture of the coverage goes beside it",
-        default=Path("camera.yaml"),
-        kw_only=True,
-    )
+    out: Path = _out(": camera info; a picture of the coverage goes beside it", "camera.yaml")
 
 
 @dataclass(frozen=True)
@@ -92,11 +106,7 @@ class PivotSettings(CalibrationSettings):
 
     recording: Path = setting(description="bag, or tracker recording of Plus")
     pose: str | None = setting(description=_POSE, default=None)
-    out: Path = setting(
-        description="file to write: the tip in the stylus' frame",
-        default=Path("tip.yaml"),
-        kw_only=True,
-    )
+    out: Path = _out(": the tip in the stylus' frame", "tip.yaml")
 
 
 @dataclass(frozen=True)
@@ -118,11 +128,7 @@ class LandmarkSettings(CalibrationSettings):
         default=False,
     )
     pose: str | None = setting(description=_POSE, default=None)
-    out: Path = setting(
-        description="file to write: the registration",
-        default=Path("registration.yaml"),
-        kw_only=True,
-    )
+    out: Path = _out(": the registration", "registration.yaml")
 
 
 @dataclass(frozen=True)
@@ -149,9 +155,7 @@ class ProbeSettings(CalibrationSettings):
         _PIXEL, "width and height of a pixel, where known: '0.2 mm' '0.2 mm'", default=None
     )
     pose: str | None = setting(description=_POSE, default=None)
-    out: Path = setting(
-        description="file to write: the calibration", default=Path("calibration.yaml"), kw_only=True
-    )
+    out: Path = _out(": the calibration", "calibration.yaml")
 
 
 @dataclass(frozen=True)
@@ -168,8 +172,4 @@ class ClockSettings(CalibrationSettings):
     fixed_pose: str | None = setting(
         description="the same of the fixed recording, where it differs", default=None
     )
-    out: Path = setting(
-        description="file to write: the offset; a picture of both signals goes beside it",
-        default=Path("time.yaml"),
-        kw_only=True,
-    )
+    out: Path = _out(": the offset; a picture of both signals goes beside it", "time.yaml")

@@ -86,17 +86,13 @@ def find_time_offset(
     _check(sign * tried, correlations, best, largest)
     shift = match.refined(tried[best], step)
     correlation = match.correlation(shift)
-    without = [match.without(block).refined(shift, 10 * step) for block in _blocks(len(times))]
+    blocks = np.array_split(np.arange(len(times)), _BLOCKS)
+    without = [match.without(block).refined(shift, 10 * step) for block in blocks]
     spread = np.asarray(without) - np.mean(without)
-    return TimeOffset(
-        sign * shift,
-        float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum())),
-        correlation,
-        float(np.sqrt(max(1.0 - correlation**2, 0.0))),
-        float(np.ptp(times)),
-        sign * tried,
-        correlations,
-    )
+    deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum()))
+    residual = float(np.sqrt(max(1.0 - correlation**2, 0.0)))
+    fit = (sign * shift, deviation, correlation, residual)
+    return TimeOffset(*fit, float(np.ptp(times)), sign * tried, correlations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,17 +140,12 @@ def _gaps(signal: PositionSignal) -> NDArray[np.float64]:
     return np.stack([signal.times[before], signal.times[before + 1]], axis=1)
 
 
-def _blocks(count: int) -> list[NDArray[np.intp]]:
-    return np.array_split(np.arange(count), _BLOCKS)
-
-
 def _compared(
     dense: PositionSignal, sparse: PositionSignal, furthest: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The sparse signal's samples that the dense one covers at every offset."""
-    inside = (sparse.times - furthest >= dense.times[0]) & (
-        sparse.times + furthest <= dense.times[-1]
-    )
+    first, last = dense.times[0], dense.times[-1]
+    inside = (sparse.times - furthest >= first) & (sparse.times + furthest <= last)
     times, values = sparse.times[inside], sparse.values[inside]
     if len(times) < _FEWEST_SAMPLES or np.ptp(times) < _SHORTEST:
         raise CalibrationError(

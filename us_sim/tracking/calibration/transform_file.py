@@ -95,15 +95,10 @@ def read_transform_file(path: str | Path) -> TransformFile:
     except PoseError as error:
         raise CalibrationError(f"{path}: {error}") from error
     known = {*_KEYS, "method", "date", "residuals"}
-    return TransformFile(
-        pose,
-        str(document.get("from", "")),
-        str(document.get("to", "")),
-        str(document.get("method", "")),
-        str(document.get("date", "")),
-        residuals,
-        {key: value for key, value in document.items() if key not in known},
-    )
+    keys = ("from", "to", "method", "date")
+    from_frame, to_frame, method, date = (str(document.get(key, "")) for key in keys)
+    more = {key: value for key, value in document.items() if key not in known}
+    return TransformFile(pose, from_frame, to_frame, method, date, residuals, more)
 
 
 def write_transform(
@@ -130,18 +125,9 @@ def write_transform(
     Raises:
         CalibrationError: the file exists already or cannot be written.
     """
-    write_calibration(
-        path,
-        {
-            "from": from_frame,
-            "to": to_frame,
-            "position": pose.position,  # m
-            "orientation": pose.orientation,  # x, y, z, w
-            "method": method,
-            "residuals": residuals or {},
-            **(more or {}),
-        },
-    )
+    place = {"position": pose.position, "orientation": pose.orientation}  # m; x, y, z, w
+    content = {"from": from_frame, "to": to_frame, **place, "method": method}
+    write_calibration(path, {**content, "residuals": residuals or {}, **(more or {})})
 
 
 def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
