@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from us_sim.errors import MeshError
 from us_sim.tissue.elasticity.cell_lanes import (
@@ -57,7 +57,7 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     volume_change,
     volume_slope,
 )
-from us_sim.tissue.elasticity.nodal_sums import NodalSums
+from us_sim.tissue.elasticity.nodal_sums import Kernels, NodalSums
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -96,37 +96,9 @@ class CellSums(NodalSums):
         rows[number, _NODAL:] = (mesh.volumes * split.nodal / 4).reshape(-1, 5)
         self._constants = in_lanes(rows).astype(dtype)
         # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
-        self._grid = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
+        self._nodes = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
         self._tangent = np.zeros((len(self._constants), _TANGENT * LANES), dtype=dtype)
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
-
-    def energy(self, displacement: NDArray) -> float:
-        return _energy(displacement, self._grid, self._constants, self._lanes)
-
-    def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        return _volume_ratios(displacement, self._grid, self._constants, self._lanes)
-
-    def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        _volume_changes(displacement, self._grid, self._constants, self._lanes, nodal)
-
-    def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        _forces(displacement, nodal, self._grid, self._constants, self._lanes, out)
-
-    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        _linearise(
-            displacement, nodal, self._grid, self._constants, self._lanes, self._tangent, loosest
-        )
-
-    def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        _volume_slopes(change, self._grid, self._constants, self._tangent, self._lanes, nodal)
-
-    def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        _tangent_product(
-            change, nodal, self._grid, self._constants, self._tangent, self._lanes, out
-        )
-
-    def diagonal_blocks(self, out: NDArray) -> None:
-        _diagonal_blocks(self._grid, self._constants, self._tangent, self._lanes, out)
 
 
 @njit(**LOOP)
@@ -389,3 +361,15 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
             put_sum(block((i, j, k), c, shear[4], bulk), qz, ry, sx, lanes, 7, w)
         for entry in range(6):
             add_out(lanes, OUT + entry, 6, grid, chunk * LANES, rows, blocks[entry])
+
+
+CellSums._kernels = Kernels(
+    _energy,
+    _volume_ratios,
+    _volume_changes,
+    _forces,
+    _linearise,
+    _volume_slopes,
+    _tangent_product,
+    _diagonal_blocks,
+)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
@@ -40,7 +40,7 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     volume_change,
     volume_slope,
 )
-from us_sim.tissue.elasticity.nodal_sums import NodalSums
+from us_sim.tissue.elasticity.nodal_sums import Kernels, NodalSums
 from us_sim.tissue.elasticity.tetrahedron_lanes import (
     OUT,
     ROWS,
@@ -82,34 +82,6 @@ class TetrahedraSums(NodalSums):
         self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
         self._tangent = np.zeros((len(self._nodes), _TANGENT * LANES), dtype=dtype)
         self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
-
-    def energy(self, displacement: NDArray) -> float:
-        return _energy(displacement, self._nodes, self._constants, self._lanes)
-
-    def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        return _volume_ratios(displacement, self._nodes, self._constants, self._lanes)
-
-    def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        _volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
-
-    def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        _forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
-
-    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        _linearise(
-            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
-        )
-
-    def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        _volume_slopes(change, self._nodes, self._constants, self._tangent, self._lanes, nodal)
-
-    def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        _tangent_product(
-            change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
-        )
-
-    def diagonal_blocks(self, out: NDArray) -> None:
-        _diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
 
 
 @njit(**INLINED)
@@ -262,3 +234,15 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
                 added = lanes[(OUT + 6 * corner + entry) * LANES :]
                 for w in range(LANES):
                     values[at[w]] += added[w]
+
+
+TetrahedraSums._kernels = Kernels(
+    _energy,
+    _volume_ratios,
+    _volume_changes,
+    _forces,
+    _linearise,
+    _volume_slopes,
+    _tangent_product,
+    _diagonal_blocks,
+)

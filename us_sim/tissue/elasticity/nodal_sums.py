@@ -1,7 +1,7 @@
-"""The interface of sums over tetrahedra, at their nodes, that a neo-Hookean tissue needs.
+"""Sums over tetrahedra, at their nodes, that a neo-Hookean tissue needs.
 
 `NeoHookean` adds the nodal averages. One class does the sums for the cells of a box mesh, another
-for any tetrahedra.
+for any tetrahedra; they differ in their kernels and in how these find a tetrahedron's nodes.
 
 >>> from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 >>> from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
@@ -12,37 +12,64 @@ for any tetrahedra.
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NodalSums"]
+__all__ = ["Kernels", "NodalSums"]
+
+_Kernel = Callable[..., Any]
 
 
-@runtime_checkable
-class NodalSums(Protocol):
+class Kernels(NamedTuple):
+    """The compiled functions behind the methods of `NodalSums`, by the methods' names."""
+
+    energy: _Kernel
+    volume_ratios: _Kernel
+    volume_changes: _Kernel
+    forces: _Kernel
+    linearise: _Kernel
+    volume_slopes: _Kernel
+    tangent_product: _Kernel
+    diagonal_blocks: _Kernel
+
+
+class NodalSums:
     """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
 
     Displacements and their changes are (3, N) m. ``nodal`` is (N,) and belongs to the nodal part
     of the bulk stiffness; it is empty where there is none.
     """
 
+    _kernels: ClassVar[Kernels]
+    _nodes: NDArray[Any]  # how kernels find the nodes of a tetrahedron
+    _constants: NDArray[Any]  # of each block of tetrahedra
+    _tangent: NDArray[Any]  # what `linearise` stores of each block
+    _lanes: NDArray[Any]  # what kernels work in
+
     def energy(self, displacement: NDArray) -> float:
         """J, of each tetrahedron by itself, without the nodal part."""
-        ...
+        energy: float = self._kernels.energy(
+            displacement, self._nodes, self._constants, self._lanes
+        )
+        return energy
 
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
         """The smallest volume over rest volume, and how many are not above zero."""
-        ...
+        ratios: tuple[float, int] = self._kernels.volume_ratios(
+            displacement, self._nodes, self._constants, self._lanes
+        )
+        return ratios
 
     def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
         """Fill nodal, J: at each node the sum over its tetrahedra of their weight times J - 1."""
-        ...
+        self._kernels.volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
 
     def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
         """(3, N) N, the energy's slope, where nodal is the nodes' mean volume change."""
-        ...
+        self._kernels.forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
 
     def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
         """Store what the slopes at this displacement need.
@@ -52,16 +79,22 @@ class NodalSums(Protocol):
             nodal: the nodes' mean volume change.
             loosest: as in `us_sim.tissue.elasticity.neo_hookean_point.limited`.
         """
-        ...
+        self._kernels.linearise(
+            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
+        )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
         """Fill nodal, J: how much `volume_changes` changes with the displacement."""
-        ...
+        self._kernels.volume_slopes(
+            change, self._nodes, self._constants, self._tangent, self._lanes, nodal
+        )
 
     def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
         """(3, N) N, how much the forces change, where nodal is the change of the nodes' mean."""
-        ...
+        self._kernels.tangent_product(
+            change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
+        )
 
     def diagonal_blocks(self, out: NDArray) -> None:
         """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' averages."""
-        ...
+        self._kernels.diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
