@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from us_sim.errors import SettingsError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
@@ -46,8 +46,7 @@ class LiveTissue:
         assert tissue is not None
         self._node = node
         groups = {OWN: Group(TissueDeformerSettings(solver=tissue.solver))}
-        self._solvers = [name for name in SOLVERS.names if self._is_there(name, tissue.solver)]
-        for name in self._solvers:
+        for name in SOLVERS.importable:
             given = tissue.settings.get(name) or SOLVERS.settings(name)()
             groups[name] = Group(given, prefix=f"{name}.")
         for label, material in tissue.materials.items():
@@ -64,7 +63,7 @@ class LiveTissue:
             f"{len(model.mesh.tetrahedra)} tetrahedra"
         )
         self.tissue = SwitchableTissue(
-            model, values[OWN].solver, self._settings(values), late_progress("preparing the tissue")
+            model, values[OWN].solver, _settings(values), late_progress("preparing the tissue")
         )
         if values[OWN].compare_with:
             self.tissue.compare_with(values[OWN].compare_with)
@@ -120,25 +119,10 @@ class LiveTissue:
         return Plan(
             own.solver,
             own.compare_with or "",
-            self._settings(values),
+            _settings(values),
             with_materials if other else None,
             ", ".join(reasons),
         )
-
-    def _is_there(self, name: str, chosen: str) -> bool:
-        """Whether a solver can be imported; one that another package adds and breaks is said."""
-        try:
-            SOLVERS.load(name)
-        except SettingsError as error:
-            if name == chosen:
-                raise
-            self._node.get_logger().warning(f"{error}; there is no solver {name} here")
-            return False
-        return True
-
-    def _settings(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Those of the solvers, by their names."""
-        return {name: values[name] for name in self._solvers}
 
     def _made(self, plan: Plan) -> Prepared | Failed:
         try:
@@ -175,6 +159,11 @@ class LiveTissue:
         if self.tissue.compared != compared and self.tissue.compared:
             log.info(f"comparing with {self.tissue.compared}")
         log.info(f"{outcome.plan.reason}: in use from now on")
+
+
+def _settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the solvers, by their names."""
+    return {name: values[name] for name in SOLVERS.importable}
 
 
 def _materials(values: Mapping[str, Any]) -> dict[str, Material]:

@@ -282,7 +282,7 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
     if node == "slice_interpolator":
         yield "", type(probe_of(scene))
     if node == "tissue_deformer" and scene.tissue is not None:
-        for solver in SOLVERS.names:
+        for solver in SOLVERS.importable:
             yield f"{solver}.", SOLVERS.settings(solver)
         for label, material in scene.tissue.materials.items():
             yield f"materials.{label}.", type(material)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from us_sim.settings.setting import Settings
 
 __all__ = ["Choice", "Chosen", "Option"]
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class Choice:
     ) -> None:
         self.what, self.key, self.group, self.needs = what, key, group, needs
         self._error = error
+        self._broken: set[Option] = set()
         self._own = {
             name: option if isinstance(option, Option) else Option(option)
             for name, option in options.items()
@@ -112,12 +116,29 @@ class Choice:
             point.name: Option(point.value, package=point.dist.name if point.dist else point.value)
             for point in importlib.metadata.entry_points(group=self.group)
         }
-        return self._own | {name: o for name, o in added.items() if name not in self._own}
+        for name in added.keys() & self._own.keys():
+            package = added.pop(name).package
+            _logger.warning(
+                "%s %s of the package %s is not used: the name is taken", self.what, name, package
+            )
+        return self._own | added
 
     @property
     def names(self) -> tuple[str, ...]:
         """What can be chosen."""
         return tuple(self.options)
+
+    @property
+    def importable(self) -> tuple[str, ...]:
+        """What can be chosen and imported; what another package adds and breaks is told once."""
+        for name, option in self.options.items():
+            if option.package is not None and option not in self._broken:
+                try:
+                    option.load_settings()
+                except SettingsError as error:
+                    self._broken.add(option)
+                    _logger.warning("%s; there is no %s %s here", error, self.what, name)
+        return tuple(name for name, option in self.options.items() if option not in self._broken)
 
     def option(self, name: str) -> Option:
         """Where the option of that name is.

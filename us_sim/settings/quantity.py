@@ -11,7 +11,8 @@ import math
 import re
 from dataclasses import dataclass
 
-from us_sim.settings.spelling import shown
+from us_sim.errors import SettingsError
+from us_sim.settings.spelling import shown, unknown
 
 __all__ = ["Quantity"]
 
@@ -46,6 +47,10 @@ class Quantity:
     dimension: str
     minimum: float = -math.inf
     maximum: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.dimension not in _UNITS:
+            raise SettingsError(f"dimension {unknown(self.dimension, _UNITS)}")
 
     @property
     def unit(self) -> str:

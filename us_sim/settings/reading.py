@@ -197,7 +197,7 @@ class Reader:
         rules = rules_of(own)
         for key in mapping:
             if key not in rules:
-                others = [o for o in choice.names if key in rules_of(choice.settings(o))]
+                others = [o for o in choice.importable if key in rules_of(choice.settings(o))]
                 if not others:
                     raise self._unknown_key(key, {*rules, choice.key, *beside}, path)
                 has = f"it has {', '.join(rules)}" if rules else "it has no settings"
@@ -232,6 +232,7 @@ class Reader:
     def _unknown_key(self, key: object, known: set[str], path: str) -> UsSimError:
         like = nearest(key, known)
         hint = f"did you mean `{like}`?" if like else f"known keys: {', '.join(sorted(known))}"
+        hint = hint if known else "there is nothing to set here"
         key = str(key) if str(key).isprintable() else shown(key)
         return self._refused(joined(path, key), f"unknown key; {hint}")
 

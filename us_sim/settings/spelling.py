@@ -13,6 +13,8 @@ from collections.abc import Iterable
 
 __all__ = ["nearest", "shown", "unknown"]
 
+_MANY = 25
+"""Names that are too many to list beside the one that was probably meant."""
 _repr = reprlib.Repr()
 _repr.maxstring = _repr.maxother = _LONGEST = 60
 
@@ -33,5 +35,7 @@ def unknown(name: object, known: Iterable[str]) -> str:
     """That a name is not one of those known, and which was probably meant."""
     known = list(known)
     like = nearest(name, known)
+    if like and len(known) > _MANY:
+        return f"{shown(name)} is not known; did you mean '{like}'?"
     hint = f"; did you mean '{like}'?" if like else ""
     return f"{shown(name)} is not one of {', '.join(known)}{hint}"

@@ -138,13 +138,13 @@ def _option_sections(
     """What there is to choose from, then the settings of each that has some."""
     choice = options.choice
     rows = []
-    for name in choice.names:
+    for name in choice.importable:
         has = bool(rules_of(choice.settings(name)))
         keys = f"[keys](#{anchor(options.title(name))})" if has else "none"
         rows.append((f"`{name}`", first_sentence(choice.load(name)), keys))
     head = (choice.what if options.by_name else f"`{choice.key}`", "what it is", "its own")
     yield Section(options.at, options.at, _markdown(head, rows))
-    for name in choice.names:
+    for name in choice.importable:
         own = choice.settings(name)
         if rules_of(own):
             text = _joined([first_sentence(own), table(own, path, shared)])
