@@ -7,23 +7,6 @@ import pytest
 
 import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 
-WORKERS = 2
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_cmdline_main(config: pytest.Config) -> None:
-    """All tests run in two processes, where pytest-xdist is installed and nothing else is asked.
-
-    Nearly all of their time is that of one thread: compiling, and small meshes.
-    """
-    asked, is_worker = config.option, "PYTEST_XDIST_WORKER" in os.environ
-    everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not asked.keyword
-    free = getattr(asked, "numprocesses", 0) is None and not asked.usepdb
-    if everything and free and not is_worker:
-        asked.numprocesses = WORKERS
-        asked.dist = "loadfile"  # what a file's tests share is made once
-
-
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
