@@ -5,6 +5,7 @@ import re
 import sys
 import textwrap
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,14 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 
 from us_sim.command.main import main
+from us_sim.evaluation.independent_residual import SpringSettings
+from us_sim.evaluation.tissue_methods import TissueMethod
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.settings.quantity import _UNITS
 from us_sim.settings.registry import SOLVERS, TRACKERS
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import create_solver
 
 TEXT = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
@@ -88,23 +95,42 @@ def test_the_solvers_test_holds():
         test(depth)
 
 
+@pytest.mark.usefixtures("installed")
+def test_the_solvers_equations_hold_and_its_entry_can_be_made():
+    residual = names_of(file("foundation_residual.py"))["foundation_residual"]
+    (entry,) = (code for code in blocks("python") if code.startswith("TissueMethod("))
+    known = {"TissueMethod": TissueMethod, "foundation_residual": residual}
+    (method,) = eval(f"({entry})", known)
+    for setting in method.settings:
+        solver = create_solver(method.name, TissueModel.block(nodes=(21, 21, 6)), **setting)
+        check = method.residual(solver.model, SpringSettings())
+        for depth in (0.004, 0.008):
+            pose = Pose(position=[0.003, 0.0, depth])
+            deformation = solver.deform(pose)
+            assert len(deformation.contact_nodes) > 3
+            assert check.check(deformation, pose)[0] < 1e-9
+        pushed = deformation.nodes.copy()
+        pushed[deformation.contact_nodes, 0] += 0.004
+        assert check.check(replace(deformation, nodes=pushed), pose)[0] > 0.1
+
+
 def test_a_scene_runs_with_the_solver_and_it_is_set_by_a_parameter(installed, capsys):
     scene = str(installed / "winkler.yaml")
-    given = "tissue_deformer.winkler.stiffness=40 N/m"
+    given = "tissue_deformer.winkler.spring=40 N/m"
     assert main(["run", scene, "--dry-run", "--param", given]) == 0
     assert "runs      tissue_deformer" in capsys.readouterr().out
     assert main(["run", scene, "--dry-run", "--param", given.replace("N/m", "mm")]) == 1
-    assert "winkler.stiffness: '40 mm' is not a stiffness" in capsys.readouterr().err
+    assert "winkler.spring: '40 mm' is not a stiffness" in capsys.readouterr().err
     assert main(["reference", "tissue.settings"]) == 0
     assert "### tissue.settings.winkler" in capsys.readouterr().out
 
 
 def test_a_scene_with_a_wrong_setting_of_the_solver_is_refused(installed, capsys):
     scene = installed / "winkler.yaml"
-    scene.write_text(scene.read_text().replace("stiffness", "stifness"))
+    scene.write_text(scene.read_text().replace("spring:", "sprnig:"))
     assert main(["run", str(scene), "--dry-run"]) == 1
     error = capsys.readouterr().err
-    assert "tissue.settings.winkler.stifness: unknown key; did you mean `stiffness`?" in error
+    assert "tissue.settings.winkler.sprnig: unknown key; did you mean `spring`?" in error
 
 
 def test_the_tissue_node_deforms_with_the_solver_and_changes_its_stiffness(installed, bench):
@@ -114,12 +140,18 @@ def test_the_tissue_node_deforms_with_the_solver_and_changes_its_stiffness(insta
     publisher = bench.publisher(PoseStamped, "probe/pose")
     bench.spin_until(lambda: bench.peer.count_publishers("probe/wrench") > 0)
     for second, stiffness in ((1, 30.0), (2, 60.0)):
-        assert node.set_parameters([Parameter("winkler.stiffness", value=stiffness)])[0].successful
+        assert node.set_parameters([Parameter("winkler.spring", value=stiffness)])[0].successful
         publisher.publish(pose_at(0.005, second))
         bench.spin_until(lambda count=second: len(wrenches) == count)
     first, second = (message.wrench.force.z for message in wrenches)
     assert first < -1.0
     assert second == pytest.approx(2 * first)
+
+
+def test_every_dimension_is_named_with_its_unit():
+    for dimension, units in _UNITS.items():
+        unit = next(iter(units), None)
+        assert f"`{dimension}` ({unit})" in TEXT if unit else f"`{dimension}`" in TEXT
 
 
 def test_a_scene_runs_with_the_source(installed, capsys):
