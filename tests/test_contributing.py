@@ -100,7 +100,7 @@ def test_the_solvers_equations_hold_and_its_entry_can_be_made():
     residual = names_of(file("foundation_residual.py"))["foundation_residual"]
     (entry,) = (code for code in blocks("python") if code.startswith("TissueMethod("))
     known = {"TissueMethod": TissueMethod, "foundation_residual": residual}
-    (method,) = eval(f"({entry})", known)
+    method = eval(entry, known)
     for setting in method.settings:
         solver = create_solver(method.name, TissueModel.block(nodes=(21, 21, 6)), **setting)
         check = method.residual(solver.model, SpringSettings())

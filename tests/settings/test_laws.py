@@ -7,8 +7,8 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, strategies as st
 
 import us_sim.nodes.settings  # noqa: F401 - its settings are some of all
 from us_sim.errors import UsSimError
@@ -110,7 +110,7 @@ def test_the_laws_are_tried_on_nearly_all_settings():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(data=st.data())
 def test_what_is_written_is_read_back_and_a_copy_is_the_same(kind, data):
     try:

@@ -21,6 +21,8 @@ from us_sim.errors import UsSimError
 
 __all__ = ["main"]
 
+_ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
@@ -33,8 +35,7 @@ def main(args: Sequence[str] | None = None) -> int:
         add(commands)
     for add in (add_calibrate, add_print_marker, add_evaluate, add_reference):
         add(commands)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
+    before = {number: signal.signal(number, _interrupt) for number in _ENDINGS}
     try:
         parsed = parser.parse_args(args)
         return int(parsed.command(parsed) or 0)
@@ -51,6 +52,9 @@ def main(args: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)
         return 1
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _interrupt(*_: object) -> None:
