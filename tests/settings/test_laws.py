@@ -8,7 +8,7 @@ from typing import Any, Union, get_args, get_origin
 
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import HealthCheck, strategies as st
+from hypothesis import strategies as st
 
 import us_sim.nodes.settings  # noqa: F401 - its settings are some of all
 from us_sim.errors import UsSimError
