@@ -3,11 +3,11 @@
 import json
 import logging
 import multiprocessing
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from phantom_asker import ask
 
 from us_sim.errors import VolumeError
 from us_sim.volume.phantom import cached_phantom, upper_arm
@@ -161,25 +161,13 @@ def test_an_unknown_phantom_is_refused(cache):
     assert not cache.exists()
 
 
-def _ask(cache: str, marks: str, start, answers) -> None:
-    os.environ["US_SIM_CACHE"] = cache
-
-    def make() -> Volume:
-        Path(marks, str(os.getpid())).touch()
-        return upper_arm(1, 1.5e-3)
-
-    start.wait()
-    volume = kept_volume("arm", make)
-    answers.put(int(volume.intensities.sum(dtype=np.int64)))
-
-
 def test_processes_that_ask_at_once_make_it_once(cache, tmp_path):
     marks = tmp_path / "marks"
     marks.mkdir()
     spawn = multiprocessing.get_context("spawn")
     start, answers = spawn.Barrier(3), spawn.Queue()
     processes = [
-        spawn.Process(target=_ask, args=(str(cache), str(marks), start, answers)) for _ in range(3)
+        spawn.Process(target=ask, args=(str(cache), str(marks), start, answers)) for _ in range(3)
     ]
     for process in processes:
         process.start()

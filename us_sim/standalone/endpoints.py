@@ -74,6 +74,7 @@ class Endpoint:
         self._on_incompatible = on_incompatible
         self._mask = self._incompatible[0] | _DATA_AVAILABLE * isinstance(self, Reader)
         self._token = dispatcher.attach(handle, self._mask, self._status_changed)
+        self._status_changed()  # what happened before it was attached is not told again
 
     def matched_count(self) -> int:
         """How many endpoints are connected to this one."""
