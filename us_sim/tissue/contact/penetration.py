@@ -54,6 +54,7 @@ def push_out(
     points: NDArray[np.float64],
     spacing: float,
     skirt: NDArray[np.float64] | None = None,
+    flanks: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
@@ -71,6 +72,9 @@ def push_out(
         spacing: m, between neighbouring points.
         skirt: (N,) m, how far beside the probe each point still counts as under its rim, for a
             probe that pushes along +z only; zero by default.
+        flanks: whether a probe that pushes along +z only also pushes aside, square to its flanks,
+            what is nearer to leaving it there, and what is beside it. Without, whatever comes in
+            from the side is thrown before the face at once, however deep that is.
 
     Returns:
         (N,) m, negative inside, infinite where the probe cannot push, and (N, 3) unit directions in
@@ -82,6 +86,7 @@ def push_out(
     _pushing_gaps(
         collider.offset_box,
         only_forward(collider, spacing),
+        flanks,
         pose.rotation,
         np.array(pose.position),
         points,
@@ -179,7 +184,32 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
+def _or_aside(box, gap, nx, ny, nz, x, y, z):
+    """A forward push, or the one of a flank where that moves the point less."""
+    sx = 1.0 if x >= 0 else -1.0
+    sy = 1.0 if y >= 0 else -1.0
+    ox = max(abs(x) - box[0], 0.0)
+    oy = max(abs(y) - box[1], 0.0)
+    beside = math.sqrt(ox * ox + oy * oy)
+    rounding = box[3]
+    if z + rounding + 2 * box[2] + _GRIP <= 0.0:
+        return math.inf, 0.0, 0.0, 1.0  # behind the grip
+    if beside > 0.0:
+        out, ex, ey = beside - rounding, sx * ox / beside, sy * oy / beside
+    elif box[0] - abs(x) < box[1] - abs(y):
+        out, ex, ey = abs(x) - box[0] - rounding, sx, 0.0
+    else:
+        out, ex, ey = abs(y) - box[1] - rounding, 0.0, sy
+    if gap < math.inf and gap >= out:
+        return gap, nx, ny, nz
+    inner, _, _, slope = pushing_gap(box, True, 0.0, x - sx * ox, y - sy * oy, z)
+    if inner + rounding * slope >= 0.0:  # before the front of the core
+        return gap, nx, ny, nz
+    return out, ex, ey, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pushing_gaps(box, forward, flanks, rotation, origin, points, skirt, gap, normal):
     """Fills gap (N,), normal (N, 3) for points (N, 3) of the probe's parent frame, skirt (N,)."""
     r = rotation
     for i in range(len(points)):
@@ -190,6 +220,8 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
+        if forward and flanks:
+            g, nx, ny, nz = _or_aside(box, g, nx, ny, nz, x, y, z)
         gap[i] = g
         normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
         normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz

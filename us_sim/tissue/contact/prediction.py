@@ -6,9 +6,10 @@
 >>> down = np.array([[0.0, 0.0, 1.0]] * 2)
 >>> gap = np.array([-0.5, 0.2])  # the probe has come down onto the first, and off the second
 >>> held = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
->>> change, touched = predict_forces(compliance, gap, down, held, np.array([True, True]), 1.0)
->>> change[:, 2], touched
-(array([ 0.5, -0.2]), array([ True,  True]))
+>>> predict_forces(compliance, gap, down, held, np.zeros(2), 1.0)[:, 2]
+array([ 0.5, -0.2])
+>>> predict_forces(compliance, gap, down, held, np.ones(2), 1.0)[:, 2]  # as soft itself
+array([ 0.2 , -0.25])
 """
 
 from __future__ import annotations
@@ -27,32 +28,31 @@ def predict_forces(
     gap: NDArray[np.float64],
     normal: NDArray[np.float64],
     held: NDArray[np.float64],
-    touched: NDArray[np.bool_],
+    softness: NDArray[np.float64],
     reach: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> NDArray[np.float64]:
     """How the contact forces change, so that linear tissue obeys the law of contact again.
 
     Args:
         compliance: (3C, 3C) m/N of the nodes that the probe can touch.
         gap: (C,) m, to the probe where it is now; infinite where it cannot push.
         normal: (C, 3), in which it pushes.
-        held: (C, 3) N, forces that hold the touched nodes; all of them are replaced.
-        touched: (C,), which nodes were touched before.
+        held: (C, 3) N, contact forces so far; all of them are replaced.
+        softness: (C,) m/N, how far the probe sinks into a node that it pushes.
         reach: m, nodes with wider gaps stay untouched.
 
     Returns:
-        (C, 3) N, the change of the forces, and (C,) which nodes are touched.
+        (C, 3) N, the change of the forces.
     """
+    touched = held.any(axis=1)
     near = np.flatnonzero((touched | (gap < reach)) & np.isfinite(gap))
-    load = np.where(touched[:, None], held, 0.0)
     loaded = np.flatnonzero(touched)
-    delassus, opened = _normal_problem(compliance, near, loaded, normal, gap, load)
-    push, active = unilateral(delassus, opened, touched[near] | (gap[near] < 0))
-    change = -load
+    delassus, opened = _normal_problem(compliance, near, loaded, normal, gap, held)
+    delassus[np.diag_indices(len(near))] += softness[near]
+    push, _ = unilateral(delassus, opened, touched[near] | (gap[near] < 0))
+    change = -held
     change[near] += push[:, None] * normal[near]
-    after = np.zeros_like(touched)
-    after[near[active]] = True
-    return change, after
+    return change
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

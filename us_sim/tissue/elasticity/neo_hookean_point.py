@@ -70,9 +70,10 @@ ONE, HALF = np.float32(1.0), np.float32(0.5)
 _TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
 """Numbers that are exact in any precision. Literals would turn single precision into double."""
 
-_CROWDED, _CRUSHED = np.float32(0.25), np.float32(1 / 64)
+_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.05)
 """Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed."""
 
+_FIRM = np.float32(5.0)
 _LESS = np.float32(0.7)  # just below 1 / √2
 
 _TINY = np.float32(1e-30)  # keeps quotients finite where nothing is strained
@@ -152,7 +153,7 @@ def crowding(change):
     missing = _CROWDED - held
     missing = missing if missing > 0 else ONE - ONE
     per = ONE / held
-    scale = missing / (_THREE * _CROWDED)
+    scale = _FIRM * missing / (_THREE * _CROWDED)
     value = scale * missing * missing * per
     slope = -scale * missing * (held + held + _CROWDED) * per * per
     both = held * (held + _CROWDED) + _CROWDED * _CROWDED

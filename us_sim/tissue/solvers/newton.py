@@ -1,23 +1,24 @@
-"""Newton's method for tissue held on the probe: no step is taken that makes matters worse.
+"""Newton's method for the energy of tissue and contact together: every step lowers it.
+
+The energy is that of `neo_hookean` and of `penalty_contact`. A step minimises its quadratic model,
+in which nodes come to touch and are let go as the displacement says, by conjugate gradients with
+the exact tangent; then a line search takes as much of it as lowers the energy itself. Where the
+tangent is indefinite or a step had to be cut, the model is made stiffer (K. Levenberg, A method for
+the solution of certain non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer
+again as steps succeed. The iterates may be inside out, which the energy allows for; whoever shows
+them has to wait.
 
 >>> import numpy as np
->>> from us_sim.geometry.collider import RoundedBox
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.newton import Newton
->>> mesh = box_mesh(*[uniform_planes(0.0, 0.1, 4)] * 3)
->>> top, bottom = np.flatnonzero(mesh.nodes[:, 2] == 0), mesh.nodes[:, 2] == 0.1
->>> materials = uniform_material(mesh, Material(10e3, 0.3, 1000.0))
->>> newton = Newton(TissueModel(mesh, materials, bottom, RoundedBox(0.5, 0.5, 0.1, 0.01), top))
->>> newton.settle_on(Pose(position=[0.0, 0.0, 0.005]), 0.0)
->>> unbalanced = newton.imbalance
->>> for _ in range(4):
-...     used, better = newton.step(Pose(position=[0.0, 0.0, 0.005]), 0.0, 20)
->>> newton.imbalance < 1e-3 * unbalanced
+>>> newton = Newton(TissueModel.block(nodes=(4, 4, 4)))
+>>> newton.aim(Pose(position=[0.0, 0.0, 0.005]))
+>>> unbalanced, energy = newton.imbalance, newton.energy
+>>> all(newton.step(20) for _ in range(6))
 True
+>>> newton.imbalance < 1e-3 * unbalanced, newton.energy < energy
+(True, True)
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.sliding_contact import SlidingContact
+from us_sim.tissue.contact.penalty_contact import PenaltyContact
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
-from us_sim.tissue.linear_algebra.projected_conjugate_gradients import (
-    Constraints,
+from us_sim.tissue.linear_algebra.two_level import (
+    TwoLevel,
     apply_blocks,
-    inverse_blocks,
-    project,
-    projected_conjugate_gradients,
+    conjugate_gradients,
 )
 from us_sim.tissue.model import TissueModel
 
@@ -48,16 +49,32 @@ _SINGLE_CONTRAST = 1e4
 _SINGLE_BULK = 1e3
 """Bulk over shear modulus beyond which rounding in single precision hides the shear's forces."""
 
-_BACKTRACKS = 6
+_FIRMNESS = 8.0
+"""Stiffness of a contact spring, over the tissue's own at that node: the probe sinks in by a
+thirtieth of what one node alone would give way. More makes the equations worse conditioned."""
+
+_GREATEST_PUSH = 30.0
+"""Greatest contact force of a node, over shear modulus times area there. It is less than what a
+crushed tetrahedron resists, so that a probe cannot turn one inside out."""
+
+_AUGMENTED = 0.3
+"""Fraction of that up to which the probe does not sink in at all."""
+
+_BACKTRACKS = 8
 """Step lengths that are tried, each half the last."""
 
-_CROWDED = 0.2
-"""Volume ratio of the most compressed tetrahedron below which steps use a tangent without negative
-eigenvalues, since those of the exact tangent overshoot; above it those of the former fall short."""
+_FORCING, _AIM = 0.1, 0.3
+"""A step ends when its model's unbalanced forces have fallen to this fraction, or to this fraction
+of the goal. Lower is no use: the next step has a new tangent."""
 
-_FORCING = 1e-2
-"""Fraction to which a step lowers the preconditioned residual. Lower is no use: the next step has a
-new tangent."""
+_SEGMENT = 8
+"""Iterations after which the model looks anew which nodes touch."""
+
+_ROUNDING = 1e-12
+"""Fraction of the energy by which rounding may seem to raise it."""
+
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.01, 1e3
+"""Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
 
 _LOCAL_WEIGHT = 4.0
 """Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
@@ -67,20 +84,11 @@ _POWER = 20
 """Power iterations towards the largest eigenvalue of the locally preconditioned stiffness."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Snapshot:
-    displacement: NDArray[np.float64]
-    force: NDArray[np.float64]
-    contact: SlidingContact
-    imbalance: float
-    load: float
-
-
 class Newton:
     """A state of the tissue, the forces in it, and steps towards their balance.
 
     Args:
-        model: with at least one movable contact node.
+        model: of the tissue and the probe.
     """
 
     def __init__(self, model: TissueModel) -> None:
@@ -94,166 +102,197 @@ class Newton:
         self._fixed = np.flatnonzero(model.fixed)
         self._surface = model.movable_contact_nodes
         self._surface_rest = mesh.nodes[self._surface]
-        self._grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
-        # As they are at rest: the deformed ones, computed anew at each step, save no iterations.
-        self._blocks: NDArray[np.floating] = self.tissue.diagonal_blocks().astype(self._dtype)
-        self._local_scale = self._local_weight()
+        grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
+        rest = self.tissue.diagonal_blocks()
+        self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
+        self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
+        own = (rest[0] + rest[3] + rest[5])[self._surface] / 3
+        self.contact = PenaltyContact(
+            model.collider,
+            model.contact_spacing,
+            _FIRMNESS * own,
+            _GREATEST_PUSH * _shear_times_area(model)[self._surface],
+        )
         shape = (3, len(mesh.nodes))
-        self._solution = np.empty(shape, self._dtype)
-        self._balance = np.empty(shape)
-        self.contact = SlidingContact(model.collider, model.contact_spacing)
         self.displacement = np.zeros(shape)  # m
-        self.force = np.zeros(shape)  # N, what holds each node where it is
+        self._force = np.zeros(shape)  # N, the slope of the tissue's energy
         self.rest()
 
     def rest(self) -> None:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
-        self.force = np.zeros_like(self.force)
-        self.contact.clear(len(self._surface))
-        self.imbalance = 0.0  # N, norm of the unbalanced forces
-        self.load = 0.0  # N, norm of the contact forces
-
-    def snapshot(self) -> _Snapshot:
-        """A copy of the state for `restore`."""
-        return _Snapshot(
-            self.displacement.copy(),
-            self.force.copy(),
-            self.contact.copy(),
-            self.imbalance,
-            self.load,
-        )
-
-    def restore(self, snapshot: _Snapshot) -> None:
-        """Go back to a snapshot."""
-        self.displacement = snapshot.displacement.copy()
-        self.force = snapshot.force.copy()
-        self.contact = snapshot.contact.copy()
-        self.imbalance, self.load = snapshot.imbalance, snapshot.load
+        self.contact.clear()
+        self._damping = 0.0
+        self._weigh()
 
     @property
     def surface(self) -> NDArray[np.float64]:
         """(C, 3) m, where the nodes are that the probe can touch."""
         return self._surface_rest + self.displacement[:, self._surface].T
 
-    def settle_on(self, pose: Pose, retreat: float) -> None:
-        """Move nodes that touch or have entered the probe onto it, and weigh the forces."""
-        self.contact.aim(pose, retreat, self.surface)
-        self._hold(pose, retreat)
+    def aim(self, pose: Pose) -> None:
+        """Put the probe at a pose, and weigh the forces; nothing moves."""
+        self.contact.aim(pose, self.surface)
+        self._damping = 0.0
         self._weigh()
 
-    def weigh_on(self, pose: Pose) -> None:
-        """Weigh the same forces against another pose's normals, moving nothing."""
-        self.contact.aim(pose, 0.0, self.surface)
-        self._weigh_contact()
+    def augment(self) -> float:
+        """Push the tissue out of the probe further; returns by how much at most, m."""
+        change = self.contact.augment(_AUGMENTED)
+        self._weigh()
+        return change
 
-    def step(self, pose: Pose, retreat: float, iterations: int) -> tuple[int, bool]:
+    def put(self, displacement: NDArray[np.float64]) -> None:
+        """Put the tissue elsewhere: (3, N) m."""
+        self.displacement = displacement
+        self.contact.look(self.surface)
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """The energy and its slope at the displacement."""
+        contact, tissue = self.contact, self.tissue
+        tissue.forces(self.displacement, self._force)
+        self.energy = tissue.energy(self.displacement) + contact.energy  # J
+        self._slope = self._force.copy()
+        self._slope[:, self._surface] -= (contact.push[:, None] * contact.normal).T
+        self._slope[:, self._fixed] = 0.0
+        self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
+        self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
+
+    @property
+    def unbalanced(self) -> NDArray[np.float64]:
+        """(3, N) N, the energy's slope."""
+        return self._slope
+
+    def step(
+        self, iterations: int, goal: float = 0.0, start: NDArray[np.float64] | None = None
+    ) -> bool:
         """One Newton step with a line search.
 
         Args:
-            pose: of the probe, the one of the last `settle_on` or step.
-            retreat: m, added to the gaps.
             iterations: the most of the conjugate gradients.
+            goal: N, imbalance below which there is no need to go.
+            start: (3, N) m, a guess of the step.
 
         Returns:
-            The iterations used, and whether the step was taken; if not, nothing has changed.
+            Whether a step was taken; if not, the next will be shorter.
         """
-        contact = self.contact
-        contact.release()
-        touched = self._surface[contact.touched]
-        normal = contact.normal[contact.touched]
-        constraints = Constraints(self._fixed, touched, normal.astype(self._dtype))
-        residual = (self.force * (-1.0 / (self.imbalance or 1.0))).astype(self._dtype)
-        project(residual, constraints)
-        crowded = not self.tissue.smallest_volume_ratio(self.displacement) > _CROWDED
-        self._tangent.linearise(self.displacement.astype(self._dtype), positive=crowded)
-        blocks = self._blocks
-        turn = contact.curvature(pose, self.surface)
-        turn = (turn * contact.push[contact.touched][:, None, None]).astype(self._dtype)
+        change, curved = self._minimise_model(iterations, goal, start)
+        length = self._search(change)
+        if length < 1.0 or curved:
+            self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
+        else:
+            self._damping = self._damping / 4 if self._damping > _LEAST_DAMPING else 0.0
+        return length > 0.0
 
-        def product(change: NDArray, image: NDArray) -> None:
-            self._tangent.tangent_product(change, image)
-            image[:, touched] -= np.einsum("kij,jk->ik", turn, change[:, touched])
+    @property
+    def is_stuck(self) -> bool:
+        """Whether even the shortest steps lead no further."""
+        return self._damping >= _MOST_DAMPING
 
-        self._grid.touch(touched, normal, _along(blocks[:, touched], normal))
-        inverse = inverse_blocks(blocks, self._local_scale, constraints)
-        used, _ = projected_conjugate_gradients(
-            product,
-            inverse,
-            self._grid.add_correction,
-            constraints,
-            residual,
-            self._solution,
-            iterations,
-            _FORCING,
-        )
-        if self._search(pose, retreat, self._solution * np.float64(self.imbalance)):
-            return used, True
-        # Where its neighbours' move drives a released node back, its own force still leads on.
-        own = -self.force
-        project(own, constraints)
-        return used, self._search(pose, retreat, apply_blocks(inverse, own))
+    def _minimise_model(
+        self, iterations: int, goal: float, start: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], bool]:
+        """The step (3, N) m, and whether the tangent was found to be indefinite."""
+        self.used = 0  # iterations
+        contact, nodes, tangent = self.contact, self._surface, self._tangent
+        tangent.linearise(self.displacement.astype(self._dtype))
+        blocks = tangent.diagonal_blocks()
+        damped = None
+        if self._damping > 0.0:
+            damped = self._dtype(self._damping) * self._rest_blocks
+            blocks += damped
+        pushed = np.flatnonzero(contact.push > 0.0)
+        turn = np.zeros((0, 3, 3))
+        if not contact.forward and len(pushed):
+            turn = contact.push[pushed, None, None] * contact.curvature(self.surface, pushed)
+        turned = nodes[pushed] if len(turn) else nodes[:0]
+        gap, normal = contact.gap, contact.normal
 
-    def _search(self, pose: Pose, retreat: float, change: NDArray[np.float64]) -> bool:
-        """Move by the largest fraction of the change that lowers imbalance or energy."""
-        before = self.snapshot()
-        inverted = energy = None
+        def elastic(change: NDArray, image: NDArray) -> None:
+            """The tangent without springs, of which there are more or fewer as nodes touch."""
+            tangent.tangent_product(change, image)
+            if damped is not None:
+                image += apply_blocks(damped, change)
+            if len(turned):
+                image[:, turned] -= np.einsum("kij,jk->ik", turn, change[:, turned])
+
+        step = np.zeros_like(self.displacement)
+        image = np.zeros_like(step)  # of the step
+        if start is not None:
+            step = start.copy()
+            scale = float(np.abs(step).max()) or 1.0
+            product = np.empty(step.shape, self._dtype)
+            elastic((step / scale).astype(self._dtype), product)
+            image = scale * product.astype(np.float64)
+            self.used += 1
+        enough = None
+        while True:
+            reached = gap + np.einsum("ij,ji->i", normal, step[:, nodes])
+            slope = contact.slope_at(reached)
+            left = -self._force - image
+            left[:, nodes] += (contact.push_at(reached)[:, None] * normal).T
+            left[:, self._fixed] = 0.0
+            size = float(np.linalg.norm(left))
+            if enough is None:
+                enough = max(_FORCING * max(size, self.imbalance * (start is None)), _AIM * goal)
+            if size <= enough or self.used >= iterations:
+                return step, False
+            active = np.flatnonzero(slope > 0.0)
+            self._two_level.prepare(blocks, nodes[active], normal[active], slope[active])
+            solved = conjugate_gradients(
+                elastic,
+                self._two_level,
+                (left / size).astype(self._dtype),
+                min(iterations - self.used, _SEGMENT),
+                enough / size,
+            )
+            self.used += solved.iterations
+            step += size * solved.solution
+            image += size * solved.image
+            if solved.curved:
+                return (step if step.any() else size * solved.direction), True
+
+    def _search(self, change: NDArray[np.float64]) -> float:
+        """Move by the largest fraction of the change that lowers the energy; returns it."""
+        start, energy, imbalance = self.displacement, self.energy, self.imbalance
+        bound = energy + _ROUNDING * abs(energy)
         length = 1.0
         for _ in range(_BACKTRACKS):
-            self.displacement = before.displacement + length * change
-            self.contact = before.contact.copy()
-            self._hold(pose, retreat)
-            smallest = self.tissue.smallest_volume_ratio(self.displacement)
-            if not smallest > 0.0 and inverted is None:
-                inverted = self.tissue.inverted(before.displacement)
-            if smallest > 0.0 or inverted:
+            self.displacement = start + length * change
+            self.contact.look(self.surface)
+            if self.tissue.energy(self.displacement) + self.contact.energy <= bound:
                 self._weigh()
-                if self.imbalance < before.imbalance:
-                    return True
-                if energy is None:
-                    energy = self.tissue.energy(before.displacement)
-                if self.tissue.energy(self.displacement) < energy:
-                    return True
+                if self.energy < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
+                    return length
             length /= 2
-        self.restore(before)
-        return False
+        self.put(start)
+        return 0.0
 
-    def _hold(self, pose: Pose, retreat: float) -> None:
-        surface = self.surface
-        self.contact.hold(pose, retreat, surface)
-        self.displacement[:, self._surface] = (surface - self._surface_rest).T
-
-    def _weigh(self) -> None:
-        self.tissue.forces(self.displacement, self.force)
-        self._weigh_contact()
-
-    def _weigh_contact(self) -> None:
-        np.copyto(self._balance, self.force)
-        self._balance[:, self._fixed] = 0.0
-        held = self.force[:, self._surface].T
-        self._balance[:, self._surface] = self.contact.weigh(held).T
-        self.imbalance = float(np.linalg.norm(self._balance))
-        self.load = float(np.linalg.norm(np.maximum(self.contact.push, 0.0)))
-
-    def _local_weight(self) -> float:
-        """Weight of the local preconditioner; the coarse one beside it has weight 1."""
-        none = np.zeros(0, np.int64)
-        constraints = Constraints(self._fixed, none, np.zeros((0, 3)))
-        inverse = inverse_blocks(self.tissue.diagonal_blocks(), 1.0, constraints)
-        shape = (3, inverse.shape[1])
-        vector = np.random.default_rng(0).standard_normal(shape)
+    def _largest(self, blocks: NDArray[np.float64]) -> float:
+        """The largest eigenvalue of the stiffness at rest, preconditioned by its blocks."""
+        two_level = TwoLevel(None, self._fixed, 1.0)
+        none = np.zeros(0)
+        two_level.prepare(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), none)
+        vector = np.random.default_rng(0).standard_normal((3, blocks.shape[1]))
+        image = np.empty_like(vector)
         largest = 0.0
         for _ in range(_POWER):
-            project(vector, constraints)
+            vector[:, self._fixed] = 0.0
             largest = float(np.linalg.norm(vector))
             if largest == 0.0:
                 return 1.0
-            vector = apply_blocks(inverse, self.tissue.tangent_product(vector / largest))
-        return _LOCAL_WEIGHT / largest
+            self.tissue.tangent_product(vector / largest, image)
+            image[:, self._fixed] = 0.0
+            two_level.apply(image, vector)
+        return largest
 
 
-def _along(blocks: NDArray[np.floating], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K,) n' D n of symmetric blocks (6, K) and normals (K, 3)."""
-    x, y, z = normal.T
-    xx, xy, xz, yy, yz, zz = blocks.astype(np.float64)
-    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+def _shear_times_area(model: TissueModel) -> NDArray[np.float64]:
+    """(N,) N, at each node the sum of its tetrahedra's shear modulus times a third of a face."""
+    mesh = model.mesh
+    shear = volumetric_split(model.materials).shear
+    pulls = (shear * mesh.volumes)[:, None] * np.linalg.norm(shape_gradients(mesh), axis=2)
+    total = np.zeros(len(mesh.nodes))
+    np.add.at(total, mesh.tetrahedra, pulls)
+    return total

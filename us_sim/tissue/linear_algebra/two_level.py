@@ -1,0 +1,263 @@
+"""Conjugate gradients for tissue on springs, with a local and a coarse preconditioner.
+
+The matrix is a stiffness that is only known by its products, plus springs along given directions at
+some nodes. The preconditioner adds up the answers of each node by itself, its spring included, and
+of a coarse grid (additive Schwarz; B. Smith, P. Bjorstad and W. Gropp, Domain Decomposition, 1996,
+section 2.1). Fields are (3, N).
+
+>>> import numpy as np
+>>> from us_sim.tissue.linear_algebra.two_level import TwoLevel, conjugate_gradients
+>>> blocks = np.array([[2.0, 2.0, 2.0], [0, 0, 0], [0, 0, 0], [2.0, 2.0, 2.0], [0, 0, 0], [2, 2, 2]])
+>>> two_level = TwoLevel(None, fixed=np.array([2]), local_weight=1.0)
+>>> two_level.prepare(blocks, np.array([0]), np.array([[0.0, 0.0, 1.0]]), np.array([8.0]))
+>>> def double(field, image):
+...     np.multiply(field, 2.0, out=image)
+>>> force = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+>>> solved = conjugate_gradients(double, two_level, force, 5, 1e-9)
+>>> solved.iterations, solved.solution[:, 0], solved.solution[:, 1]
+(1, array([0., 0., 1.]), array([2., 0., 0.]))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
+
+__all__ = ["Solved", "TwoLevel", "apply_blocks", "conjugate_gradients"]
+
+Product = Callable[[NDArray[np.floating], NDArray[np.floating]], None]
+
+_LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What conjugate gradients found."""
+
+    solution: NDArray[np.floating]  # (3, N)
+    image: NDArray[np.floating]  # (3, N), the product without springs of the solution
+    direction: NDArray[np.floating]  # (3, N), the last search direction
+    iterations: int
+    curved: bool  # whether that was one of negative curvature; the solution is what came before
+
+
+class TwoLevel:
+    """The preconditioner, and the springs.
+
+    Args:
+        grid: the coarse level, or None.
+        fixed: nodes that do not move.
+        local_weight: of the local level; the coarse one has weight 1.
+    """
+
+    def __init__(
+        self, grid: CoarseGrid | None, fixed: NDArray[np.integer], local_weight: float
+    ) -> None:
+        self._grid = grid
+        self.fixed = fixed
+        self._weight = local_weight
+
+    def prepare(
+        self,
+        blocks: NDArray[np.floating],
+        nodes: NDArray[np.integer],
+        normals: NDArray[np.float64],
+        stiffness: NDArray[np.float64],
+    ) -> None:
+        """Set the matrix.
+
+        Args:
+            blocks: (6, N) N/m, xx, xy, xz, yy, yz, zz of each node's block of the stiffness.
+            nodes: (K,), where there are springs.
+            normals: (K, 3), their directions.
+            stiffness: (K,) N/m.
+        """
+        dtype = blocks.dtype
+        self.nodes = nodes
+        self.normals = normals.astype(dtype)
+        self.springs = stiffness.astype(dtype)
+        own = np.empty(len(nodes))
+        self._inverse = np.empty_like(blocks)
+        _invert_blocks(
+            blocks,
+            self._weight,
+            self.fixed,
+            self.nodes,
+            self.normals,
+            self.springs,
+            own,
+            self._inverse,
+        )
+        if self._grid is not None:
+            self._grid.touch(nodes, normals, own)
+
+    def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
+        """Overwrite ``out`` with the preconditioner times ``residual``."""
+        _apply_blocks(self._inverse, residual, out)
+        if self._grid is not None:
+            self._grid.add_correction(residual, out)
+
+
+def conjugate_gradients(
+    product: Product,
+    two_level: TwoLevel,
+    residual: NDArray[np.floating],
+    iterations: int,
+    tolerance: float,
+) -> Solved:
+    """Solve for a displacement that balances ``residual``, starting from none.
+
+    Args:
+        product: writes the stiffness, without springs, times its first argument into the second.
+        two_level: prepared.
+        residual: (3, N), zero at fixed nodes; overwritten with what is left.
+        iterations: the most products.
+        tolerance: norm of the residual at which to end.
+    """
+    shape, dtype = residual.shape, residual.dtype
+    solution, image, search = np.zeros((3, *shape), dtype)
+    elastic, conditioned, whole = np.empty((3, *shape), dtype)
+    fixed, nodes = two_level.fixed, two_level.nodes
+    slope = 0.0
+    for iteration in range(iterations):
+        two_level.apply(residual, conditioned)
+        before, slope = slope, _dot(residual, conditioned)
+        _renew(conditioned, slope / before if iteration else 0.0, search)
+        product(search, elastic)
+        _add_springs(elastic, search, nodes, two_level.normals, two_level.springs, fixed, whole)
+        curvature = _dot(search, whole)
+        if not curvature > 0.0:
+            return Solved(solution, image, search, iteration + 1, True)
+        left = _advance(slope / curvature, search, elastic, whole, solution, image, residual)
+        if left <= tolerance * tolerance:
+            return Solved(solution, image, search, iteration + 1, False)
+    return Solved(solution, image, search, iterations, False)
+
+
+def apply_blocks(blocks: NDArray[np.floating], field: NDArray[np.floating]) -> NDArray:
+    """(3, N): symmetric 3x3 blocks (6, N) times a field (3, N)."""
+    out = np.empty_like(field)
+    _apply_blocks(blocks, field, out)
+    return out
+
+
+@njit(**_LOOP)
+def _invert_blocks(blocks, scale, fixed, nodes, normals, springs, own, inverse):
+    """Inverse of each block with its spring, times scale; fills own (K,), n' D n of the blocks."""
+    for i in range(blocks.shape[1]):
+        _invert(blocks[:, i], scale, inverse[:, i])
+    one = np.empty(6, blocks.dtype)
+    for k in range(len(nodes)):
+        i = nodes[k]
+        x = normals[k, 0]
+        y = normals[k, 1]
+        z = normals[k, 2]
+        one[:] = blocks[:, i]
+        own[k] = (
+            one[0] * x * x
+            + one[3] * y * y
+            + one[5] * z * z
+            + 2 * (one[1] * x * y + one[2] * x * z + one[4] * y * z)
+        )
+        s = springs[k]
+        one[0] += s * x * x
+        one[1] += s * x * y
+        one[2] += s * x * z
+        one[3] += s * y * y
+        one[4] += s * y * z
+        one[5] += s * z * z
+        _invert(one, scale, inverse[:, i])
+    for k in range(len(fixed)):
+        inverse[:, fixed[k]] = 0
+
+
+@njit(**_LOOP, inline="always")
+def _invert(block, scale, out):
+    a, b, c, d, e, f = block
+    p = d * f - e * e
+    q = c * e - b * f
+    r = b * e - c * d
+    s = scale / (a * p + b * q + c * r)
+    out[0] = s * p
+    out[1] = s * q
+    out[2] = s * r
+    out[3] = s * (a * f - c * c)
+    out[4] = s * (b * c - a * e)
+    out[5] = s * (a * d - b * b)
+
+
+@njit(**_LOOP)
+def _apply_blocks(blocks, field, out):
+    for i in range(field.shape[1]):
+        x = field[0, i]
+        y = field[1, i]
+        z = field[2, i]
+        out[0, i] = blocks[0, i] * x + blocks[1, i] * y + blocks[2, i] * z
+        out[1, i] = blocks[1, i] * x + blocks[3, i] * y + blocks[4, i] * z
+        out[2, i] = blocks[2, i] * x + blocks[4, i] * y + blocks[5, i] * z
+
+
+@njit(**_LOOP)
+def _add_springs(elastic, field, nodes, normals, springs, fixed, out):
+    """out = elastic + springs times field, zero at fixed nodes."""
+    out[:, :] = elastic
+    for k in range(len(nodes)):
+        i = nodes[k]
+        s = field[0, i] * normals[k, 0] + field[1, i] * normals[k, 1] + field[2, i] * normals[k, 2]
+        s *= springs[k]
+        for d in range(3):
+            out[d, i] += s * normals[k, d]
+    for k in range(len(fixed)):
+        for d in range(3):
+            out[d, fixed[k]] = 0
+
+
+@njit(**_LOOP)
+def _dot(a, b):
+    total = 0.0
+    for d in range(3):
+        x = a[d]
+        y = b[d]
+        part = a.dtype.type(0)
+        for i in range(len(x)):
+            part += x[i] * y[i]
+        total += part
+    return total
+
+
+@njit(**_LOOP)
+def _renew(conditioned, beta, search):
+    s = search.dtype.type(beta)
+    for d in range(3):
+        z = conditioned[d]
+        p = search[d]
+        for i in range(len(z)):
+            p[i] = z[i] + s * p[i]
+
+
+@njit(**_LOOP)
+def _advance(length, search, elastic, whole, solution, image, residual):
+    """One step along the search direction; returns the square of the residual that is left."""
+    s = search.dtype.type(length)
+    total = 0.0
+    for d in range(3):
+        p = search[d]
+        e = elastic[d]
+        q = whole[d]
+        x = solution[d]
+        y = image[d]
+        r = residual[d]
+        part = search.dtype.type(0)
+        for i in range(len(p)):
+            x[i] += s * p[i]
+            y[i] += s * e[i]
+            r[i] -= s * q[i]
+            part += r[i] * r[i]
+        total += part
+    return total
