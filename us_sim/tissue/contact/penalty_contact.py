@@ -179,6 +179,7 @@ class PenaltyContact:
         along = axes[:, :, 0]
         return turn / box[3] + bend[:, None, None] * along[:, :, None] * along[:, None, :]
 
+
 def _on_curved_box(
     box: NDArray[np.float64], local: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:

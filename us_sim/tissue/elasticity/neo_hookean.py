@@ -95,16 +95,10 @@ class NeoHookean:
         self._sums.forces(displacement, self._mean_change(displacement), out)
         return out
 
-    def linearise(self, displacement: NDArray, positive: bool = False) -> None:
-        """Let `tangent_product` and `diagonal_blocks` be those at this displacement.
-
-        With ``positive`` the tangent has no negative eigenvalue, as descent needs (unless a
-        Poisson's ratio is negative). A tetrahedron whose exact tangent has none keeps it; in the
-        others the stress counts for less.
-        """
+    def linearise(self, displacement: NDArray) -> None:
+        """Let `tangent_product` and `diagonal_blocks` be those at this displacement."""
         self._require(displacement)
-        loosest = np.float32(0.0 if positive else np.inf)
-        self._sums.linearise(displacement, self._mean_change(displacement), loosest)
+        self._sums.linearise(displacement, self._mean_change(displacement))
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""

@@ -51,7 +51,6 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     cofactor_change,
     crowding,
     energy_density,
-    limited,
     stress,
     stress_rise,
     volume_change,
@@ -59,13 +58,15 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
 )
 from us_sim.tissue.elasticity.nodal_sums import Kernels, NodalSums
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["CellSums"]
 
-_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13, PER_WIDTH + 18
-"""First rows of the constants behind the widths: V mu, V element and V nodal / 4 of each of the
-five tetrahedra; and the number of rows."""
+_SHEAR, _ELEMENT, _NODAL = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13
+_WALL, _CONSTANTS = PER_WIDTH + 18, PER_WIDTH + 23
+"""First rows of the constants behind the widths: V mu, V element, V nodal / 4 and V wall of each of
+the five tetrahedra; and the number of rows."""
 
 _K, _TANGENT = FIELD + 24, FIELD + 29
 """First row of V (p - mu), which the tangent needs, behind the displacement; and the number of
@@ -93,7 +94,9 @@ class CellSums(NodalSums):
         split = volumetric_split(materials)
         rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * split.shear).reshape(-1, 5)
         rows[number, _ELEMENT:_NODAL] = (mesh.volumes * split.element).reshape(-1, 5)
-        rows[number, _NODAL:] = (mesh.volumes * split.nodal / 4).reshape(-1, 5)
+        rows[number, _NODAL:_WALL] = (mesh.volumes * split.nodal / 4).reshape(-1, 5)
+        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
+        rows[number, _WALL:] = (mesh.volumes * walls).reshape(-1, 5)
         self._constants = in_lanes(rows).astype(dtype)
         # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
         self._nodes = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
@@ -121,20 +124,20 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
 
 
 @njit(**INLINED)
-def _pressure(h, shear, element, nodal):
+def _pressure(h, element, wall, nodal):
     """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
     change = volume_change(h)
-    return element * change + nodal + shear * crowding(change)[1]
+    return element * change + nodal + wall * crowding(change)[1]
 
 
 @njit(**INLINED)
-def _tetrahedron_stress(h, shear, element, nodal):
-    return stress(h, shear, _pressure(h, shear, element, nodal))
+def _tetrahedron_stress(h, shear, element, wall, nodal):
+    return stress(h, shear, _pressure(h, element, wall, nodal))
 
 
 @njit(**INLINED)
-def _tetrahedron_k(h, shear, element, nodal, loosest):
-    return limited(h, shear, _pressure(h, shear, element, nodal) - shear, loosest)
+def _tetrahedron_k(h, shear, element, wall, nodal):
+    return _pressure(h, element, wall, nodal) - shear
 
 
 @njit(**LOOP)
@@ -147,14 +150,17 @@ def _energy(displacement, grid, constants, lanes):
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
-            element = five(rows, _ELEMENT, w)
+            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             lanes[OUT * LANES + w] = (
-                (energy_density(p, shear[0], element[0]) + energy_density(q, shear[1], element[1]))
-                + (
-                    energy_density(r, shear[2], element[2])
-                    + energy_density(s, shear[3], element[3])
+                (
+                    energy_density(p, shear[0], element[0], wall[0])
+                    + energy_density(q, shear[1], element[1], wall[1])
                 )
-                + energy_density(t, shear[4], element[4])
+                + (
+                    energy_density(r, shear[2], element[2], wall[2])
+                    + energy_density(s, shear[3], element[3], wall[3])
+                )
+                + energy_density(t, shear[4], element[4], wall[4])
             )
         for w in range(min(LANES, grid[3] - first)):
             total += lanes[OUT * LANES + w]
@@ -227,14 +233,14 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
-            element = five(rows, _ELEMENT, w)
+            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             mean = five(lanes, PRESSURES, w)
             put_forces(
-                _tetrahedron_stress(p, shear[0], element[0], mean[0]),
-                _tetrahedron_stress(q, shear[1], element[1], mean[1]),
-                _tetrahedron_stress(r, shear[2], element[2], mean[2]),
-                _tetrahedron_stress(s, shear[3], element[3], mean[3]),
-                _tetrahedron_stress(t, shear[4], element[4], mean[4]),
+                _tetrahedron_stress(p, shear[0], element[0], wall[0], mean[0]),
+                _tetrahedron_stress(q, shear[1], element[1], wall[1], mean[1]),
+                _tetrahedron_stress(r, shear[2], element[2], wall[2], mean[2]),
+                _tetrahedron_stress(s, shear[3], element[3], wall[3], mean[3]),
+                _tetrahedron_stress(t, shear[4], element[4], wall[4], mean[4]),
                 rows,
                 w,
                 lanes,
@@ -243,7 +249,7 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, grid, constants, lanes, tangent, loosest):
+def _linearise(displacement, nodal, grid, constants, lanes, tangent):
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * LANES
@@ -254,13 +260,13 @@ def _linearise(displacement, nodal, grid, constants, lanes, tangent, loosest):
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
-            element = five(rows, _ELEMENT, w)
+            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             mean = five(lanes, PRESSURES, w)
-            kept[_K * LANES + w] = _tetrahedron_k(p, shear[0], element[0], mean[0], loosest)
-            kept[(_K + 1) * LANES + w] = _tetrahedron_k(q, shear[1], element[1], mean[1], loosest)
-            kept[(_K + 2) * LANES + w] = _tetrahedron_k(r, shear[2], element[2], mean[2], loosest)
-            kept[(_K + 3) * LANES + w] = _tetrahedron_k(s, shear[3], element[3], mean[3], loosest)
-            kept[(_K + 4) * LANES + w] = _tetrahedron_k(t, shear[4], element[4], mean[4], loosest)
+            kept[_K * LANES + w] = _tetrahedron_k(p, shear[0], element[0], wall[0], mean[0])
+            kept[(_K + 1) * LANES + w] = _tetrahedron_k(q, shear[1], element[1], wall[1], mean[1])
+            kept[(_K + 2) * LANES + w] = _tetrahedron_k(r, shear[2], element[2], wall[2], mean[2])
+            kept[(_K + 3) * LANES + w] = _tetrahedron_k(s, shear[3], element[3], wall[3], mean[3])
+            kept[(_K + 4) * LANES + w] = _tetrahedron_k(t, shear[4], element[4], wall[4], mean[4])
 
 
 @njit(**LOOP)
@@ -300,16 +306,16 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
-            element = five(rows, _ELEMENT, w)
+            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             k = five(kept, _K, w)
             mean = five(lanes, PRESSURES, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_forces(
-                stress_rise(p, dp, shear[0], element[0], k[0], mean[0]),
-                stress_rise(q, dq, shear[1], element[1], k[1], mean[1]),
-                stress_rise(r, dr, shear[2], element[2], k[2], mean[2]),
-                stress_rise(s, ds, shear[3], element[3], k[3], mean[3]),
-                stress_rise(t, dt, shear[4], element[4], k[4], mean[4]),
+                stress_rise(p, dp, shear[0], element[0], wall[0], k[0], mean[0]),
+                stress_rise(q, dq, shear[1], element[1], wall[1], k[1], mean[1]),
+                stress_rise(r, dr, shear[2], element[2], wall[2], k[2], mean[2]),
+                stress_rise(s, ds, shear[3], element[3], wall[3], k[3], mean[3]),
+                stress_rise(t, dt, shear[4], element[4], wall[4], k[4], mean[4]),
                 rows,
                 w,
                 lanes,
@@ -318,13 +324,13 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
 
 
 @njit(**INLINED)
-def _corner_blocks(h, i, j, k, shear, element):
+def _corner_blocks(h, i, j, k, shear, element, wall):
     """Blocks of a corner tetrahedron: at its corner, and at the ends of its edges along x, y, z.
 
     i, j and k are the shape gradient of its corner.
     """
     c = cofactor_change(h)
-    bulk = bulk_slope(h, shear, element)
+    bulk = bulk_slope(h, element, wall)
     none = ONE - ONE
     return (
         block((i, j, k), c, shear, bulk),
@@ -343,14 +349,14 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
-            element = five(rows, _ELEMENT, w)
+            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             i, j, k = three(rows, PER_WIDTH, w)
-            p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], element[0])
-            q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], element[1])
-            r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], element[2])
-            s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], element[3])
+            p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], element[0], wall[0])
+            q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], element[1], wall[1])
+            r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], element[2], wall[2])
+            s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], element[3], wall[3])
             i, j, k = HALF * i, HALF * j, HALF * k
-            c, bulk = cofactor_change(t), bulk_slope(t, shear[4], element[4])
+            c, bulk = cofactor_change(t), bulk_slope(t, element[4], wall[4])
             put_six(p0, lanes, OUT, w)
             put_sum(block((-i, -j, k), c, shear[4], bulk), pz, rx, sy, lanes, 1, w)
             put_sum(block((-i, j, -k), c, shear[4], bulk), py, qx, sz, lanes, 2, w)

@@ -10,10 +10,10 @@ It is a polynomial, so it holds for inverted tissue too, and linearised at rest 
 But a finite force can press a tetrahedron to nothing, as where a vein closes. So below a quarter of
 its volume (J0) a term is added that begins with two continuous derivatives and grows without bound,
 
-    mu (J0 - J)^3 / (3 J0 J),
+    wall (J0 - J)^3 / (3 J0 J),
 
-and that goes on below a sixty-fourth as its Taylor polynomial of second order, so that it is
-defined everywhere.
+with the modulus of `us_sim.tissue.elasticity.wall`, and that goes on below a fiftieth as its Taylor
+polynomial of second order, so that it is defined everywhere.
 
 Everything is written in h, not F, so that small strains keep all their digits in single precision.
 
@@ -47,8 +47,6 @@ __all__ = [
     "crowding",
     "energy_density",
     "inner",
-    "largest_stretch",
-    "limited",
     "stress",
     "stress_rise",
     "volume_change",
@@ -67,17 +65,11 @@ INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
 """How the functions that these loops call are compiled."""
 
 ONE, HALF = np.float32(1.0), np.float32(0.5)
-_TWO, _THREE, _TWELVE = np.float32(2.0), np.float32(3.0), np.float32(12.0)
+_THREE = np.float32(3.0)
 """Numbers that are exact in any precision. Literals would turn single precision into double."""
 
-_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.05)
+_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.02)
 """Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed."""
-
-_FIRM = np.float32(5.0)
-_LESS = np.float32(0.7)  # just below 1 / √2
-
-_TINY = np.float32(1e-30)  # keeps quotients finite where nothing is strained
-_SMALL = np.float32(1e-3)  # least cosine from which Newton's method starts
 
 
 @njit(**INLINED)
@@ -146,14 +138,14 @@ def volume_change(h):
 
 @njit(**INLINED)
 def crowding(change):
-    """The term against being crushed, over mu, and its first and second slope by J = change + 1."""
+    """The term against being crushed, over its modulus, and its first and second slope by J = change + 1."""
     ratio = ONE + change
     held = _CRUSHED if ratio < _CRUSHED else ratio
     beyond = ratio - held
     missing = _CROWDED - held
     missing = missing if missing > 0 else ONE - ONE
     per = ONE / held
-    scale = _FIRM * missing / (_THREE * _CROWDED)
+    scale = missing / (_THREE * _CROWDED)
     value = scale * missing * missing * per
     slope = -scale * missing * (held + held + _CROWDED) * per * per
     both = held * (held + _CROWDED) + _CROWDED * _CROWDED
@@ -166,12 +158,12 @@ def crowding(change):
 
 
 @njit(**INLINED)
-def energy_density(h, shear, bulk):
+def energy_density(h, shear, bulk, wall):
     """The energy density above."""
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
     plain = shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
-    return plain + shear * crowding(change)[0]
+    return plain + wall * crowding(change)[0]
 
 
 @njit(**INLINED)
@@ -219,19 +211,19 @@ def volume_slope(h, d):
 
 
 @njit(**INLINED)
-def bulk_slope(h, shear, element):
+def bulk_slope(h, element, wall):
     """How fast the pressure rises with J: element, and the term against being crushed."""
-    return element + shear * crowding(volume_change(h))[2]
+    return element + wall * crowding(volume_change(h))[2]
 
 
 @njit(**INLINED)
-def stress_rise(h, d, shear, element, k, nodal):
+def stress_rise(h, d, shear, element, wall, k, nodal):
     """The change of the stress for a small change d of h and a change nodal of the mean pressure.
 
     k is p - mu.
     """
     c = cofactor_change(h)
-    rise = bulk_slope(h, shear, element) * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
+    rise = bulk_slope(h, element, wall) * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
     return _stress_slope(h, c, d, shear, k, rise)
 
 
@@ -254,56 +246,3 @@ def block(g, c, shear, bulk):
         bulk * y * z,
         plain + bulk * z * z,
     )
-
-
-@njit(**INLINED)
-def largest_stretch(h):
-    """The largest singular value of I + h, to a thousandth, never less than it is.
-
-    A root of the characteristic polynomial of the strain is q + 2 p cos(acos(r) / 3); the cosine
-    is a root c of 4 c^3 - 3 c = r, found by a step of Newton's method from below.
-    """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = h
-    axx = (xx + xx) + (xx * xx + yx * yx + zx * zx)
-    ayy = (yy + yy) + (xy * xy + yy * yy + zy * zy)
-    azz = (zz + zz) + (xz * xz + yz * yz + zz * zz)
-    axy = (xy + yx) + (xx * xy + yx * yy + zx * zy)
-    axz = (xz + zx) + (xx * xz + yx * yz + zx * zz)
-    ayz = (yz + zy) + (xy * xz + yy * yz + zy * zz)
-    q = (axx + ayy + azz) / _THREE
-    axx, ayy, azz = axx - q, ayy - q, azz - q
-    square = (axx * axx + ayy * ayy + azz * azz) + _TWO * (axy * axy + axz * axz + ayz * ayz)
-    p = np.sqrt(square / (_THREE + _THREE))
-    per = ONE / (p + _TINY)
-    axx, ayy, azz, axy, axz, ayz = axx * per, ayy * per, azz * per, axy * per, axz * per, ayz * per
-    r = HALF * (
-        axx * (ayy * azz - ayz * ayz)
-        - axy * (axy * azz - ayz * axz)
-        + axz * (axy * ayz - ayy * axz)
-    )
-    r = -ONE if r < -ONE else r
-    r = ONE if r > ONE else r
-    below = np.sqrt(HALF + HALF * r)
-    below = _SMALL if below < _SMALL else below
-    c = HALF + HALF * below
-    c -= ((_TWO + _TWO) * c * c * c - _THREE * c - r) / (_TWELVE * c * c - _THREE)
-    stretch = ONE + q + _TWO * p * c
-    return np.sqrt(_TINY if stretch < _TINY else stretch)
-
-
-@njit(**INLINED)
-def limited(h, shear, k, loosest):
-    """k = p - mu, held within bounds where the stress's slope has no negative eigenvalue.
-
-    The slope's eigenvalues are mu + k s and mu - k s with s each singular value of F (Smith et al.,
-    section 4), and three more. All are positive or zero if |k| s <= mu, k has the sign opposite to
-    J's, |k| <= mu and bulk >= mu (Poisson's ratio is not negative); or if |k| s root 2 <= mu. The
-    bounds are never below ``loosest``.
-    """
-    s = largest_stretch(h)
-    usual = shear / (ONE if s < ONE else s)
-    other = _LESS * shear / s
-    bound = other if k * (ONE + volume_change(h)) > 0 else usual
-    bound = loosest if loosest > bound else bound
-    k = bound if k > bound else k
-    return -bound if k < -bound else k

@@ -34,7 +34,6 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     cofactor_change,
     crowding,
     energy_density,
-    limited,
     stress,
     stress_rise,
     volume_change,
@@ -54,11 +53,18 @@ from us_sim.tissue.elasticity.tetrahedron_lanes import (
     scatter_scalar,
 )
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TetrahedraSums"]
 
-_SHEAR, _ELEMENT, _NODAL, _CONSTANTS = SHAPE + 9, SHAPE + 10, SHAPE + 11, SHAPE + 12
+_SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
+    SHAPE + 9,
+    SHAPE + 10,
+    SHAPE + 11,
+    SHAPE + 12,
+    SHAPE + 13,
+)
 """Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
 number."""
 
@@ -77,6 +83,8 @@ class TetrahedraSums(NodalSums):
         rows[:, _SHEAR] = mesh.volumes * split.shear
         rows[:, _ELEMENT] = mesh.volumes * split.element
         rows[:, _NODAL] = mesh.volumes * split.nodal / 4
+        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
+        rows[:, _WALL] = mesh.volumes * walls
         self._constants = in_lanes(rows).astype(dtype)
         # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
         self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
@@ -93,10 +101,10 @@ def _nodal_pressure(lanes, constants, w):
 
 
 @njit(**INLINED)
-def _pressure(h, shear, lanes, rows, w):
+def _pressure(h, lanes, rows, w):
     """V times the slope by J of all energy but the shear's."""
     change = volume_change(h)
-    own = rows[_ELEMENT * LANES + w] * change + shear * crowding(change)[1]
+    own = rows[_ELEMENT * LANES + w] * change + rows[_WALL * LANES + w] * crowding(change)[1]
     return own + _nodal_pressure(lanes, rows, w)
 
 
@@ -109,7 +117,7 @@ def _energy(displacement, nodes, constants, lanes):
         for w in range(LANES):
             h = gradient(lanes, rows, w)
             lanes[OUT * LANES + w] = energy_density(
-                h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w]
+                h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
             )
         for w in range(LANES):
             total += lanes[OUT * LANES + w]
@@ -158,12 +166,12 @@ def _forces(displacement, nodal, nodes, constants, lanes, forces):
         for w in range(LANES):
             h = gradient(lanes, rows, w)
             shear = rows[_SHEAR * LANES + w]
-            put_forces(stress(h, shear, _pressure(h, shear, lanes, rows, w)), rows, w, lanes)
+            put_forces(stress(h, shear, _pressure(h, lanes, rows, w)), rows, w, lanes)
         scatter(lanes, nodes[chunk], forces)
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, nodes, constants, lanes, tangent, loosest):
+def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
     for chunk in range(len(nodes)):
         gather(displacement, nodes[chunk], lanes)
         if len(nodal):
@@ -173,9 +181,7 @@ def _linearise(displacement, nodal, nodes, constants, lanes, tangent, loosest):
         for w in range(LANES):
             h = gradient(lanes, rows, w)
             put_nine(h, kept, _GRADIENT, w)
-            shear = rows[_SHEAR * LANES + w]
-            pressure = _pressure(h, shear, lanes, rows, w)
-            kept[_K * LANES + w] = limited(h, shear, pressure - shear, loosest)
+            kept[_K * LANES + w] = _pressure(h, lanes, rows, w) - rows[_SHEAR * LANES + w]
 
 
 @njit(**LOOP)
@@ -205,8 +211,9 @@ def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
             d = gradient(lanes, rows, w)
             h = nine(kept, _GRADIENT, w)
             shear, element = rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w]
-            k, nodal_rise = kept[_K * LANES + w], _nodal_pressure(lanes, rows, w)
-            put_forces(stress_rise(h, d, shear, element, k, nodal_rise), rows, w, lanes)
+            wall, k = rows[_WALL * LANES + w], kept[_K * LANES + w]
+            nodal_rise = _nodal_pressure(lanes, rows, w)
+            put_forces(stress_rise(h, d, shear, element, wall, k, nodal_rise), rows, w, lanes)
         scatter(lanes, nodes[chunk], product)
 
 
@@ -220,7 +227,7 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
             h = nine(kept, _GRADIENT, w)
             c = cofactor_change(h)
             shear = rows[_SHEAR * LANES + w]
-            bulk = bulk_slope(h, shear, rows[_ELEMENT * LANES + w])
+            bulk = bulk_slope(h, rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w])
             x, y, z = three(rows, SHAPE, w), three(rows, SHAPE + 3, w), three(rows, SHAPE + 6, w)
             o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
             put_six(block(o, c, shear, bulk), lanes, OUT, w)

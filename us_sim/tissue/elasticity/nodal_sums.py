@@ -71,16 +71,10 @@ class NodalSums:
         """(3, N) N, the energy's slope, where nodal is the nodes' mean volume change."""
         self._kernels.forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
 
-    def linearise(self, displacement: NDArray, nodal: NDArray, loosest: np.float32) -> None:
-        """Store what the slopes at this displacement need.
-
-        Args:
-            displacement: (3, N) m.
-            nodal: the nodes' mean volume change.
-            loosest: as in `us_sim.tissue.elasticity.neo_hookean_point.limited`.
-        """
+    def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
+        """Store what the slopes at this displacement need; nodal is the nodes' mean change."""
         self._kernels.linearise(
-            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent, loosest
+            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent
         )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:

@@ -49,11 +49,11 @@ from us_sim.tissue.solvers.solver import (
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
-_NEWTON = 12
-"""Iterations of one Newton step: solved further, a step after a large change overshoots."""
-
 _TOUCHING = 0.1
 """Gap up to which a node may come to touch in one frame, over the tissue's smallest extent."""
+
+_SMALL = 500
+"""Free nodes up to which there is time to factor the stiffness while the probe moves."""
 
 _SUNK = 1e-6
 """Depth of the probe in the tissue, m, that does not matter."""
@@ -118,6 +118,7 @@ class FemNonlinear(TissueSolver):
         self._surface = model.movable_contact_nodes
         self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
         self._newton = Newton(model)
+        self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
         self._restore(self.state)
@@ -165,15 +166,17 @@ class FemNonlinear(TissueSolver):
         goal = self._own.frame_tolerance if moved else self._own.tolerance
         shifted = newton.augment() if self._balanced else 0.0
         start = self._predicted(pose) if moved else None
+        newton.may_factor = not moved or self._small
         self.cg = self.steps = 0
         left = self._own.most_iterations
         stuck = False
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough = goal * newton.load if start is None else 0.0
-            if not newton.step(min(left, _NEWTON), enough, start):
+            if not newton.step(min(left, newton.patience), enough, start):
                 stuck = newton.is_stuck
             left -= newton.used
-            self.cg += newton.used; self.steps += 1
+            self.cg += newton.used
+            self.steps += 1
             start = None
             budget = self._own.frame_budget
             if budget is not None and time.perf_counter() - began > budget:

@@ -23,8 +23,6 @@ True
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +32,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
+from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
     TwoLevel,
     apply_blocks,
@@ -60,6 +59,16 @@ crushed tetrahedron resists, so that a probe cannot turn one inside out."""
 _AUGMENTED = 0.3
 """Fraction of that up to which the probe does not sink in at all."""
 
+_LEAST_PATIENCE = 12
+"""Iterations of the first step: solved further, a step after a large change overshoots. Those after
+it may take twice as many as long as steps need not be cut."""
+
+_MOST_PATIENCE = 50
+"""Iterations beyond which a factor of the stiffness takes less time."""
+
+_KEPT = -1e9
+"""Fraction of the smallest volume ratio that a step keeps at least."""
+
 _BACKTRACKS = 8
 """Step lengths that are tried, each half the last."""
 
@@ -68,7 +77,7 @@ _FORCING, _AIM = 0.1, 0.3
 of the goal. Lower is no use: the next step has a new tangent."""
 
 _SEGMENT = 8
-"""Iterations after which the model looks anew which nodes touch."""
+"""Iterations after which the model looks anew which nodes touch; then twice as many."""
 
 _ROUNDING = 1e-12
 """Fraction of the energy by which rounding may seem to raise it."""
@@ -92,6 +101,10 @@ class Newton:
     """
 
     def __init__(self, model: TissueModel) -> None:
+        self._model = model
+        self._factored: FactoredStiffness | None = None  # made where it is needed
+        #: Whether a step may take the time to factor the stiffness.
+        self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
         bulk = 1 / (1 - 2 * model.materials.poisson_ratio.max())  # lambda + mu over mu
         single = modulus.max() <= _SINGLE_CONTRAST * modulus.min() and bulk <= _SINGLE_BULK
@@ -123,6 +136,7 @@ class Newton:
         self.displacement = np.zeros_like(self.displacement)
         self.contact.clear()
         self._damping = 0.0
+        self.patience = _LEAST_PATIENCE  # iterations that the next step may take
         self._weigh()
 
     @property
@@ -134,6 +148,7 @@ class Newton:
         """Put the probe at a pose, and weigh the forces; nothing moves."""
         self.contact.aim(pose, self.surface)
         self._damping = 0.0
+        self.patience = _LEAST_PATIENCE
         self._weigh()
 
     def augment(self) -> float:
@@ -179,6 +194,12 @@ class Newton:
         """
         change, curved = self._minimise_model(iterations, goal, start)
         length = self._search(change)
+        if length < 1.0:
+            self.patience = _LEAST_PATIENCE
+        elif self.used >= iterations:
+            self.patience *= 2
+            if self.patience > _MOST_PATIENCE and self.may_factor and self._factored is None:
+                self._factored = FactoredStiffness(self._model)
         if length < 1.0 or curved:
             self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
         else:
@@ -226,7 +247,7 @@ class Newton:
             elastic((step / scale).astype(self._dtype), product)
             image = scale * product.astype(np.float64)
             self.used += 1
-        enough = None
+        enough, segment = None, _SEGMENT
         while True:
             reached = gap + np.einsum("ij,ji->i", normal, step[:, nodes])
             slope = contact.slope_at(reached)
@@ -239,15 +260,23 @@ class Newton:
             if size <= enough or self.used >= iterations:
                 return step, False
             active = np.flatnonzero(slope > 0.0)
-            self._two_level.prepare(blocks, nodes[active], normal[active], slope[active])
+            springs = nodes[active], normal[active], slope[active]
+            preconditioner: TwoLevel | FactoredStiffness
+            if self._factored is not None and self.may_factor:
+                preconditioner = self._factored
+                preconditioner.prepare(self.displacement, *springs)
+            else:
+                preconditioner = self._two_level
+                preconditioner.prepare(blocks, *springs)
             solved = conjugate_gradients(
                 elastic,
-                self._two_level,
+                preconditioner,
                 (left / size).astype(self._dtype),
-                min(iterations - self.used, _SEGMENT),
+                min(iterations - self.used, segment),
                 enough / size,
             )
             self.used += solved.iterations
+            segment *= 2
             step += size * solved.solution
             image += size * solved.image
             if solved.curved:
@@ -258,8 +287,13 @@ class Newton:
         start, energy, imbalance = self.displacement, self.energy, self.imbalance
         bound = energy + _ROUNDING * abs(energy)
         length = 1.0
+        smallest = self.tissue.smallest_volume_ratio(start)
+        least = _KEPT * smallest if smallest > 0.0 else -np.inf
         for _ in range(_BACKTRACKS):
             self.displacement = start + length * change
+            if not self.tissue.smallest_volume_ratio(self.displacement) > least:
+                length /= 2
+                continue
             self.contact.look(self.surface)
             if self.tissue.energy(self.displacement) + self.contact.energy <= bound:
                 self._weigh()

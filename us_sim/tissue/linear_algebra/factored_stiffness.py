@@ -1,0 +1,122 @@
+"""A sparse factor of the tissue's stiffness, as a preconditioner where a local one is too weak.
+
+Thin layers of very different moduli, nearly incompressible, make conjugate gradients with local and
+coarse corrections stall. A factor does not mind, but takes longer to make. What is factored has no
+negative eigenvalue: of the tangent of `neo_hookean` it leaves out the geometric part, and gives the
+elements the nodes' share of the bulk stiffness.
+
+>>> import numpy as np
+>>> from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
+>>> from us_sim.tissue.model import TissueModel
+>>> model = TissueModel.block(nodes=(4, 4, 4))
+>>> factored = FactoredStiffness(model)
+>>> none = np.zeros(0)
+>>> factored.prepare(np.zeros((3, 64)), np.zeros(0, np.int64), np.zeros((0, 3)), none)
+>>> force, moved = np.zeros((3, 64)), np.empty((3, 64))
+>>> force[2, model.contact_nodes] = 1.0
+>>> factored.apply(force, moved)
+>>> bool((moved[2, model.contact_nodes] > 0).all()), bool(moved[:, model.fixed].any())
+(True, False)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import splu
+
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.neo_hookean_point import crowding
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.wall import wall_modulus
+from us_sim.tissue.model import TissueModel
+
+__all__ = ["FactoredStiffness"]
+
+
+class FactoredStiffness:
+    """Solves with a stiffness near the tangent at a displacement, springs included.
+
+    Args:
+        model: with enough fixed nodes to hold it.
+    """
+
+    def __init__(self, model: TissueModel) -> None:
+        mesh = model.mesh
+        split = volumetric_split(model.materials)
+        self._tetrahedra = mesh.tetrahedra
+        self._gradients = shape_gradients(mesh)  # (M, 4, 3)
+        self._shear = mesh.volumes * split.shear
+        self._bulk = mesh.volumes * (split.element + split.nodal)
+        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
+        self._wall = mesh.volumes * walls
+        self.fixed = np.flatnonzero(model.fixed)
+        number = np.where(model.fixed, -1, np.cumsum(~model.fixed) - 1)
+        self._free = np.flatnonzero(~model.fixed)
+        self._number = number
+        rows = 3 * number[mesh.tetrahedra][:, :, None] + np.arange(3)  # (M, 4, 3)
+        rows[number[mesh.tetrahedra] < 0] = -1
+        shape = (len(rows), 12, 12)
+        row = np.broadcast_to(rows.reshape(-1, 12, 1), shape).ravel()
+        column = np.broadcast_to(rows.reshape(-1, 1, 12), shape).ravel()
+        self._kept = (row >= 0) & (column >= 0)
+        self._row, self._column = row[self._kept], column[self._kept]
+
+    def prepare(
+        self,
+        displacement: NDArray[np.floating],
+        nodes: NDArray[np.integer],
+        normals: NDArray[np.floating],
+        stiffness: NDArray[np.floating],
+    ) -> None:
+        """Factor the stiffness at a displacement (3, N) m, with springs at ``nodes`` (K,) along
+        ``normals`` (K, 3) of ``stiffness`` (K,) N/m.
+        """
+        self.nodes, self.normals, self.springs = nodes, normals, stiffness
+        matrix = self._assembled(displacement.astype(np.float64))
+        unknown = 3 * self._number[nodes][:, None] + np.arange(3)
+        blocks = stiffness[:, None, None] * normals[:, :, None] * normals[:, None, :]
+        row = np.broadcast_to(unknown[:, :, None], blocks.shape).ravel()
+        column = np.broadcast_to(unknown[:, None, :], blocks.shape).ravel()
+        springs = coo_array((blocks.ravel(), (row, column)), shape=matrix.shape)
+        self._factor = splu(
+            csc_array(matrix + springs),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+
+    def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
+        """Overwrite ``out`` with the displacement that balances ``residual``, both (3, N)."""
+        out[:] = 0.0
+        moved = self._factor.solve(residual[:, self._free].T.astype(np.float64).ravel())
+        out[:, self._free] = moved.reshape(-1, 3).T
+
+    def _assembled(self, displacement: NDArray[np.float64]) -> csc_array:
+        gradients = self._gradients
+        corners = displacement.T[self._tetrahedra]  # (M, 4, 3)
+        deformed = np.einsum("eai,eaj->eij", corners, gradients) + np.eye(3)
+        first, second, third = deformed[:, :, 0], deformed[:, :, 1], deformed[:, :, 2]
+        cofactor = np.stack(
+            [np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=2
+        )
+        ratio = np.einsum("ei,ei->e", first, cofactor[:, :, 0])
+        pull = np.einsum("eij,eaj->eai", cofactor, gradients).reshape(-1, 12)
+        bulk = self._bulk + _wall_slopes(ratio - 1.0, self._wall)
+        values = bulk[:, None, None] * pull[:, :, None] * pull[:, None, :]
+        alike = self._shear[:, None, None] * np.einsum("eai,ebi->eab", gradients, gradients)
+        values += np.einsum("eab,ij->eaibj", alike, np.eye(3)).reshape(-1, 12, 12)
+        size = 3 * len(self._free)
+        entries = (values.ravel()[self._kept], (self._row, self._column))
+        return coo_array(entries, shape=(size, size)).tocsc()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _wall_slopes(change, modulus):
+    """(M,) how fast the walls' pressures rise with the volume ratio 1 + change."""
+    slopes = np.empty_like(change)
+    for e in range(len(change)):
+        slopes[e] = modulus[e] * crowding(change[e])[2]
+    return slopes
