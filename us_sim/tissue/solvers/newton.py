@@ -76,7 +76,7 @@ _FORCING, _AIM = 0.1, 0.3
 """A step ends when its model's unbalanced forces have fallen to this fraction, or to this fraction
 of the goal. Lower is no use: the next step has a new tangent."""
 
-_SEGMENT = 8
+_SEGMENT = 12
 """Iterations after which the model looks anew which nodes touch; then twice as many."""
 
 _ROUNDING = 1e-12
