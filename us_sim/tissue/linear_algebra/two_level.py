@@ -7,7 +7,7 @@ section 2.1). Fields are (3, N).
 
 >>> import numpy as np
 >>> from us_sim.tissue.linear_algebra.two_level import TwoLevel, conjugate_gradients
->>> blocks = np.array([[2.0, 2.0, 2.0], [0, 0, 0], [0, 0, 0], [2.0, 2.0, 2.0], [0, 0, 0], [2, 2, 2]])
+>>> blocks = np.outer([2.0, 0.0, 0.0, 2.0, 0.0, 2.0], [1.0, 1.0, 1.0])
 >>> two_level = TwoLevel(None, fixed=np.array([2]), local_weight=1.0)
 >>> two_level.prepare(blocks, np.array([0]), np.array([[0.0, 0.0, 1.0]]), np.array([8.0]))
 >>> def double(field, image):
