@@ -164,7 +164,7 @@ class FemNonlinear(TissueSolver):
             return self._resting()
         moved = not same_pose(pose, self._aimed)
         goal = self._own.frame_tolerance if moved else self._own.tolerance
-        shifted = newton.augment() if self._balanced else 0.0
+        shifted = newton.augment() if self._balanced else np.inf
         start = self._predicted(pose) if moved else None
         newton.may_factor = not moved or self._small
         self.cg = self.steps = 0
@@ -181,7 +181,7 @@ class FemNonlinear(TissueSolver):
             budget = self._own.frame_budget
             if budget is not None and time.perf_counter() - began > budget:
                 break
-        self._balanced = newton.imbalance <= self._own.frame_tolerance * newton.load
+        self._balanced = newton.imbalance <= self._own.frame_tolerance * self._reference()
         return self._outcome(pose, stuck, shifted)
 
     def _reference(self) -> float:
