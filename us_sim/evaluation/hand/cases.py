@@ -36,9 +36,10 @@ _SIDE_KINDS = 4.0  # s, of a motion that is not free
 _QUICK_MOTIONS = (
     (MAIN_TISSUE, "free", "brisk", 2.0),
     (MAIN_TISSUE, "free", "violent", 0.7),
-    ("block", "stabbing", "brisk", 1.0),
+    (MAIN_TISSUE, "rocking", "careful", 0.7),
+    ("liver", "fanning", "brisk", 0.5),
     ("block", "sliding", "brisk", 0.7),
-    ("liver", "fanning", "careful", 0.7),
+    ("block", "stabbing", "violent", 0.7),
 )
 
 
@@ -141,15 +142,15 @@ def motions(quick: bool, seed: int) -> list[Motion]:
     every haste, elsewhere every kind in the middle one.
     """
     if quick:
-        rows = _QUICK_MOTIONS
+        rows = list(_QUICK_MOTIONS)
     else:
-        rows = tuple(
+        rows = [
             (tissue, kind, haste, _seconds(tissue, kind))
             for tissue in TISSUES
             for kind in KINDS
             for haste in HASTES
             if tissue == MAIN_TISSUE or kind == "free" or haste == "brisk"
-        )
+        ]
     order = list(TISSUES)
     found = [Motion(tissue, kind, haste, seed, length) for tissue, kind, haste, length in rows]
     return sorted(found, key=lambda motion: order.index(motion.tissue))

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
+from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import create_solver
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-__all__ = ["CONVERGED", "METHOD", "TRUSTED", "Converged", "converged"]
+__all__ = ["CONVERGED", "METHOD", "TRUSTED", "Converged", "converged", "patient_solver", "settled"]
 
 METHOD = "fem_nonlinear"
 CONVERGED = 1e-5
@@ -40,11 +42,13 @@ class Converged:
     nodes: NDArray[np.float64]  # (K, N, 3) m
     residual: NDArray[np.float64]  # (K,) as the solver said in the end
     pressed: NDArray[np.bool_]  # (K,) whether the probe touches the tissue
+    smallest: NDArray[np.float64]  # (K,) volume ratio of the tetrahedron most crushed
 
     @classmethod
     def of_no_frame(cls, count: int) -> Converged:
         """In place of what failed: there is nothing to compare with."""
-        return cls(np.empty((count, 0, 3)), np.full(count, np.inf), np.zeros(count, dtype=np.bool_))
+        never = np.zeros(count, dtype=np.bool_)
+        return cls(np.empty((count, 0, 3)), np.full(count, np.inf), never, np.full(count, np.nan))
 
     @property
     def trusted(self) -> NDArray[np.bool_]:
@@ -71,24 +75,42 @@ def converged(
     Raises:
         UsSimError: the method does not take the tissue.
     """
-    solver = create_solver(METHOD, model, **(TISSUE_METHODS[METHOD].patient or {}))
+    solver = patient_solver(model)
     nodes = np.empty((len(poses), *model.mesh.nodes.shape))
     residual, pressed = np.empty(len(poses)), np.zeros(len(poses), dtype=np.bool_)
+    smallest = np.empty(len(poses))
     for k, pose in enumerate(poses):
-        found = solver.deform(pose)
-        best = [found]
-        for _ in range(_MOST_CALLS - 1):
-            stalled = len(best) > _PATIENCE and (
-                best[-1].residual > _PROGRESS * best[-1 - _PATIENCE].residual
-            )
-            if best[-1].residual <= CONVERGED or stalled:
-                break
-            before, found = found, solver.deform(pose)
-            if found is before:  # settled
-                break
-            best.append(min(best[-1], found, key=lambda each: each.residual))
-        nodes[k], residual[k] = best[-1].nodes, best[-1].residual
-        pressed[k] = len(best[-1].contact_nodes) > 0
+        found = settled(solver, pose)
+        nodes[k], residual[k] = found.nodes, found.residual
+        pressed[k] = len(found.contact_nodes) > 0
+        volumes = signed_volumes(found.nodes, model.mesh.tetrahedra)
+        smallest[k] = (volumes / model.mesh.volumes).min()
         if progress is not None:
             progress(k + 1)
-    return Converged(nodes, residual, pressed)
+    return Converged(nodes, residual, pressed, smallest)
+
+
+def patient_solver(model: TissueModel) -> TissueSolver:
+    """The method with the settings with which it converges.
+
+    Raises:
+        UsSimError: it does not take the tissue.
+    """
+    return create_solver(METHOD, model, **(TISSUE_METHODS[METHOD].patient or {}))
+
+
+def settled(solver: TissueSolver, pose: Pose) -> Deformation:
+    """The best of many frames at one pose: until it has converged, or goes no further."""
+    found = solver.deform(pose)
+    best = [found]
+    for _ in range(_MOST_CALLS - 1):
+        stalled = len(best) > _PATIENCE and (
+            best[-1].residual > _PROGRESS * best[-1 - _PATIENCE].residual
+        )
+        if best[-1].residual <= CONVERGED or stalled:
+            break
+        before, found = found, solver.deform(pose)
+        if found is before:  # it will not change any more
+            break
+        best.append(min(best[-1], found, key=lambda each: each.residual))
+    return best[-1]

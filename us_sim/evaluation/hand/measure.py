@@ -14,7 +14,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from us_sim.evaluation.hand.cases import TISSUES, Motion, motions
-from us_sim.evaluation.hand.converged import METHOD, Converged, converged
+from us_sim.evaluation.hand.converged import METHOD, Converged, converged, patient_solver
 from us_sim.evaluation.hand.points import Point, measure
 from us_sim.evaluation.hand.report import table, write_report
 from us_sim.evaluation.hand.settings import HandSettings
@@ -73,6 +73,7 @@ class _Bench:
     def __init__(self) -> None:
         self._tissue = ""
         self._solvers: dict[str, TissueSolver] = {}
+        self._patient: TissueSolver | None = None
         self._broken: dict[Motion, str] = {}
 
     def answer(self, motion: Motion, progress: Callable[[int], None]) -> Converged:
@@ -91,16 +92,25 @@ class _Bench:
         if motion in self._broken:
             return Point(motion, method, failure=self._broken[motion])
         try:
-            return measure(self._solver(motion.tissue, method), motion, answer, progress)
+            solver = self._solver(motion.tissue, method)
+            return measure(solver, motion, answer, self._balance(method), progress)
         except Exception as error:
             self._solvers.pop(method, None)
             return Point(motion, method, failure=words_of(error))
 
     def _solver(self, tissue: str, method: str) -> TissueSolver:
         if tissue != self._tissue:
-            self._tissue, self._solvers = tissue, {}
+            self._tissue, self._solvers, self._patient = tissue, {}, None
         if method not in self._solvers:
             solver = create_solver(method, TISSUES[tissue].model)
             solver.warm_up()
             self._solvers[method] = solver
         return self._solvers[method]
+
+    def _balance(self, method: str) -> TissueSolver | None:
+        """What converges a method's frames; None where it solves other equations."""
+        if method != METHOD:
+            return None
+        if self._patient is None:
+            self._patient = patient_solver(TISSUES[self._tissue].model)
+        return self._patient

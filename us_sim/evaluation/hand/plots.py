@@ -54,16 +54,19 @@ def plot_time(
             look = TISSUE_METHODS[point.method]
             shown = np.maximum(point.frames.error, _LOWEST)
             error.plot(time, shown, color=look.colour, lw=1.3, label=point.method)
+            if not np.isnan(point.frames.own).all():
+                own = np.maximum(point.frames.own, _LOWEST)
+                error.plot(time, own, color=look.colour, lw=1, ls=":", label="to its own balance")
+        error.set_yscale("log")
         _draw_motion(depth, speed, motion, answers[motion])
         speed.set_xlabel("time, s")
         speed.set_xlim(0, min(_SHOWN, motion.duration))
         for panel in (error, depth, speed):
             plain(panel)
-    panels[0, 0].set_yscale("log")
     panels[0, 0].set_ylim(bottom=_LOWEST)
     panels[0, 0].set_ylabel("error of the worst node, mm")
-    panels[1, 0].set_ylabel("depth of the probe, mm")
-    panels[2, 0].set_ylabel("speed")
+    panels[1, 0].set_ylabel("depth, mm")
+    panels[2, 0].set_ylabel("speed", labelpad=8)
     panels[1, 0].invert_yaxis()
     key_beside(panels[0, -1])
     key_beside(panels[1, -1])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.hand.cases import RATE, Motion
-from us_sim.evaluation.hand.converged import Converged
+from us_sim.evaluation.hand.converged import TRUSTED, Converged, settled
 from us_sim.evaluation.row import Row
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
@@ -44,8 +44,10 @@ class Frames:
     number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))  # of the pose
     error: _Array = field(default_factory=_nothing)  # mm, of the node that is farthest off
     rms: _Array = field(default_factory=_nothing)  # mm, root mean square over all nodes
+    own: _Array = field(default_factory=_nothing)  # mm, as `error`, to its own balance
     residual: _Array = field(default_factory=_nothing)  # as reported
     inverted: _Array = field(default_factory=_nothing)  # tetrahedra
+    slipped: _Array = field(default_factory=_nothing)  # mm, of the fixed node that moved most
     cpu: _Array = field(default_factory=_nothing)  # ms, processor time of all threads
     wall: _Array = field(default_factory=_nothing)  # ms
 
@@ -68,7 +70,7 @@ class Live:
 class Held:
     """Frames after the probe has stopped."""
 
-    residual: _Array = field(default_factory=_nothing)  # (K,), that when it stopped first
+    residual: _Array = field(default_factory=_nothing)  # (K,), of the last frame before them first
     inverted: int = 0  # tetrahedra in the last of them
 
     def frames_to(self, residual: float) -> float:
@@ -114,13 +116,18 @@ class Point(Row):
             **_percentiles("error_mm", frames.error, (50, 95, 99, 100)),
             **_percentiles("rms_mm", frames.rms, (50, 95, 99, 100)),
             "not_compared": int(np.isnan(frames.error).sum()),
+            **_percentiles("own_error_mm", frames.own, (50, 95, 99, 100)),
             **_percentiles("residual", frames.residual, (50, 99, 100)),
             **over,
             "frames_inverted": int((frames.inverted > 0).sum()),
+            "fixed_nodes_moved_mm": float(frames.slipped.max())
+            if len(frames.slipped)
+            else math.nan,
             **_percentiles("cpu_ms", frames.cpu, (50, 99, 100)),
             **_percentiles("wall_ms", frames.wall, (50, 99, 100)),
             "live_skipped": live.skipped,
             **_percentiles("live_error_mm", live.frames.error, (50, 99, 100)),
+            **_percentiles("live_own_error_mm", live.frames.own, (50, 99, 100)),
             **_percentiles("live_latency_ms", live.latency, (50, 99, 100)),
             "live_frames_inverted": int((live.frames.inverted > 0).sum()),
             "hold_frames_to_1e-2": held.frames_to(1e-2),
@@ -163,14 +170,22 @@ def measure(
     solver: TissueSolver,
     motion: Motion,
     answer: Converged,
+    balance: TissueSolver | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Point:
     """Follow a motion twice from rest, once with every pose and once live, and hold the probe.
 
+    Args:
+        solver: of the method.
+        motion: of the probe.
+        answer: the converged one at each of its poses.
+        balance: a solver of the same equations, with which each frame is converged at its own pose.
+        progress: told how many poses have been fed.
+
     Raises:
         FloatingPointError: a number that the solver returned is not finite.
     """
-    bench = _Bench(solver, motion, answer)
+    bench = _Bench(solver, motion, answer, balance)
     frames = bench.every_pose(progress)
     held = bench.held()
     live = bench.live()
@@ -189,9 +204,17 @@ def frames_until(residual: Sequence[float] | _Array, small: float) -> int | None
 class _Bench:
     """One solver and one motion."""
 
-    def __init__(self, solver: TissueSolver, motion: Motion, answer: Converged) -> None:
+    def __init__(
+        self,
+        solver: TissueSolver,
+        motion: Motion,
+        answer: Converged,
+        balance: TissueSolver | None,
+    ) -> None:
         self._solver, self._motion, self._answer = solver, motion, answer
-        self._mesh = solver.model.mesh
+        self._balance, self._mesh = balance, solver.model.mesh
+        self._fixed = solver.model.fixed
+        self._last = solver.deform(None)
 
     def every_pose(self, progress: Callable[[int], None] | None) -> Frames:
         """No pose is left out, however long a frame takes; up to the last one that presses."""
@@ -207,8 +230,7 @@ class _Bench:
 
     def held(self) -> Held:
         """The probe stays where the motion above ended."""
-        pose = self._motion.poses[self._answer.last_pressed]
-        found = self._solver.deform(pose)
+        pose, found = self._motion.poses[self._answer.last_pressed], self._last
         residual = [found.residual]
         for _ in range(HOLD):
             before, found = found, self._solver.deform(pose)
@@ -245,15 +267,31 @@ class _Bench:
         begun, processor = time.perf_counter(), time.process_time()
         found = self._solver.deform(pose)
         processor, wall = time.process_time() - processor, time.perf_counter() - begun
+        self._last = found
         numbers = (found.nodes, found.force, found.torque, found.residual)
         if not all(np.isfinite(number).all() for number in numbers):
             raise FloatingPointError(f"frame {k} is not finite")
-        error = rms = math.nan
+        error = rms = own = math.nan
+        if self._balance is not None:
+            own = self._to_own_balance(pose, found)
         if self._answer.trusted[k]:
             off = np.linalg.norm(found.nodes - self._answer.nodes[k], axis=1)
             error, rms = float(off.max()), float(np.sqrt((off**2).mean()))
         times = (1e3 * processor, 1e3 * wall)
-        return (k, 1e3 * error, 1e3 * rms, found.residual, self._inverted(found), *times)
+        errors = (1e3 * error, 1e3 * rms, 1e3 * own)
+        slipped = np.abs(found.nodes - self._mesh.nodes)[self._fixed].max(initial=0.0)
+        return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
+
+    def _to_own_balance(self, pose: Pose, found: Deformation) -> float:
+        """m, from the frame to what it converges to where the probe is; NaN where to nothing."""
+        assert self._balance is not None
+        state = self._solver.state
+        state.displacement[self._fixed] = 0.0  # a solver that moves them has its own column
+        self._balance.take_over(state)
+        there = settled(self._balance, pose)
+        if there.residual > TRUSTED:
+            return math.nan
+        return float(np.linalg.norm(found.nodes - there.nodes, axis=1).max())
 
     def _inverted(self, found: Deformation) -> int:
         """Tetrahedra that are inside out or flat."""
