@@ -55,8 +55,10 @@ def plot_time(
             shown = np.maximum(point.frames.error, _LOWEST)
             error.plot(time, shown, color=look.colour, lw=1.3, label=point.method)
             if not np.isnan(point.frames.own).all():
-                own = np.maximum(point.frames.own, _LOWEST)
-                error.plot(time, own, color=look.colour, lw=1, ls=":", label="to its own balance")
+                some = ~np.isnan(point.frames.own)
+                own = np.maximum(point.frames.own[some], _LOWEST)
+                label = f"{point.method}, to its own balance"
+                error.plot(time[some], own, ".", color=look.colour, ms=5, label=label)
         error.set_yscale("log")
         _draw_motion(depth, speed, motion, answers[motion])
         speed.set_xlabel("time, s")
