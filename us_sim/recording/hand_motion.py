@@ -41,7 +41,7 @@ _SLOWEST, _FASTEST = 1e-4, 1e4  # of those units in a second
 _HALVINGS = 60  # of the interval that a tempo is in: to a double's last digits
 _BEYOND = 1.25  # of the way from the middle to the edge, where a probe that slides off turns back
 
-_SHIPPED_SEED, _SHIPPED_MOTION = 7, 7.0  # s
+_SHIPPED_SEED, _SHIPPED_MOTION = 9, 7.0  # s
 _APPROACH, _EASE, _LIFT, _HOVER = 1.2, 0.5, 0.8, np.array([0.0, 0.0, -0.010])  # s, s, s, m
 
 _Array = NDArray[np.float64]
