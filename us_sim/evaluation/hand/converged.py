@@ -30,6 +30,8 @@ CONVERGED = 1e-5
 """Residual at which a pose is left for the next."""
 TRUSTED = 1e-3
 """Residual above which nothing is compared with what was reached."""
+HELD = 1e-6
+"""m that a fixed node may move before nothing is compared with it either."""
 
 _MOST_CALLS = 40  # at one pose
 _PATIENCE, _PROGRESS = 6, 0.7  # calls, in which the least residual must fall by that factor
@@ -43,17 +45,19 @@ class Converged:
     residual: NDArray[np.float64]  # (K,) as the solver said in the end
     pressed: NDArray[np.bool_]  # (K,) whether the probe touches the tissue
     smallest: NDArray[np.float64]  # (K,) volume ratio of the tetrahedron most crushed
+    slipped: NDArray[np.float64]  # (K,) m, of the fixed node that moved most
 
     @classmethod
     def of_no_frame(cls, count: int) -> Converged:
         """In place of what failed: there is nothing to compare with."""
         never = np.zeros(count, dtype=np.bool_)
-        return cls(np.empty((count, 0, 3)), np.full(count, np.inf), never, np.full(count, np.nan))
+        unknown = np.full(count, np.nan)
+        return cls(np.empty((count, 0, 3)), np.full(count, np.inf), never, unknown, unknown)
 
     @property
     def trusted(self) -> NDArray[np.bool_]:
         """(K,) whether something may be compared with it."""
-        return self.residual <= TRUSTED
+        return (self.residual <= TRUSTED) & (self.slipped <= HELD)
 
     @property
     def last_pressed(self) -> int:
@@ -78,16 +82,22 @@ def converged(
     solver = patient_solver(model)
     nodes = np.empty((len(poses), *model.mesh.nodes.shape))
     residual, pressed = np.empty(len(poses)), np.zeros(len(poses), dtype=np.bool_)
-    smallest = np.empty(len(poses))
+    smallest, slipped = np.empty(len(poses)), np.empty(len(poses))
     for k, pose in enumerate(poses):
         found = settled(solver, pose)
         nodes[k], residual[k] = found.nodes, found.residual
         pressed[k] = len(found.contact_nodes) > 0
         volumes = signed_volumes(found.nodes, model.mesh.tetrahedra)
         smallest[k] = (volumes / model.mesh.volumes).min()
+        slipped[k] = moved_fixed(model, found)
         if progress is not None:
             progress(k + 1)
-    return Converged(nodes, residual, pressed, smallest)
+    return Converged(nodes, residual, pressed, smallest, slipped)
+
+
+def moved_fixed(model: TissueModel, found: Deformation) -> float:
+    """m, of the fixed node that moved most: none should."""
+    return float(np.abs(found.nodes - model.mesh.nodes)[model.fixed].max(initial=0.0))
 
 
 def patient_solver(model: TissueModel) -> TissueSolver:

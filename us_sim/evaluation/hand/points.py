@@ -1,8 +1,9 @@
 """What came of a motion with one method: every pose fed, then as live, then the probe held still.
 
->>> from us_sim.evaluation.hand.points import frames_until
->>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
-(3, None)
+>>> from us_sim.evaluation.hand.points import Held
+>>> held = Held(np.array([0.3, 0.02, 5e-4, 1e-6]))
+>>> held.frames_to(1e-2), held.frames_to(1e-8)
+(2.0, nan)
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.hand.cases import RATE, Motion
-from us_sim.evaluation.hand.converged import TRUSTED, Converged, settled
+from us_sim.evaluation.hand.converged import HELD, TRUSTED, Converged, moved_fixed, settled
 from us_sim.evaluation.row import Row
+from us_sim.evaluation.settling import frames_until
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
@@ -30,7 +32,6 @@ __all__ = [
     "Held",
     "Live",
     "Point",
-    "frames_until",
     "measure",
     "those",
 ]
@@ -203,13 +204,6 @@ def measure(
     return Point(motion, solver.name, speed, turning, frames, live, held)
 
 
-def frames_until(residual: Sequence[float] | _Array, small: float) -> int | None:
-    """After how many frames a residual is as small as asked and stays so; None where it is not."""
-    large = np.flatnonzero(~(np.asarray(residual) <= small))
-    after = int(large[-1]) + 1 if len(large) else 0
-    return after if after < len(residual) else None
-
-
 class _Bench:
     """One solver and one motion."""
 
@@ -222,7 +216,6 @@ class _Bench:
     ) -> None:
         self._solver, self._motion, self._answer = solver, motion, answer
         self._balance, self._mesh = balance, solver.model.mesh
-        self._fixed = solver.model.fixed
         self._last = solver.deform(None)
 
     def every_pose(self, progress: Callable[[int], None] | None) -> Frames:
@@ -288,17 +281,17 @@ class _Bench:
             error, rms = float(off.max()), float(np.sqrt((off**2).mean()))
         times = (1e3 * processor, 1e3 * wall)
         errors = (1e3 * error, 1e3 * rms, 1e3 * own)
-        slipped = np.abs(found.nodes - self._mesh.nodes)[self._fixed].max(initial=0.0)
+        slipped = moved_fixed(self._solver.model, found)
         return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
 
     def _to_own_balance(self, pose: Pose, found: Deformation) -> float:
         """m, from the frame to what it converges to where the probe is; NaN where to nothing."""
         assert self._balance is not None
         state = self._solver.state
-        state.displacement[self._fixed] = 0.0  # a solver that moves them has its own column
+        state.displacement[self._solver.model.fixed] = 0.0  # what moved is in its own column
         self._balance.take_over(state)
         there = settled(self._balance, pose)
-        if there.residual > TRUSTED:
+        if there.residual > TRUSTED or moved_fixed(self._solver.model, there) > HELD:
             return math.nan
         return float(np.linalg.norm(found.nodes - there.nodes, axis=1).max())
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from us_sim.evaluation.hand.cases import APPROACH, MAIN_TISSUE, RATE, TISSUES, Motion
-from us_sim.evaluation.hand.converged import CONVERGED, TRUSTED, Converged
+from us_sim.evaluation.hand.converged import CONVERGED, HELD, TRUSTED, Converged
 from us_sim.evaluation.hand.plots import plot_errors, plot_faults, plot_hold, plot_time
 from us_sim.evaluation.hand.points import HOLD, OWN_EVERY, Point, those
 from us_sim.evaluation.hand.targets import JUDGED, targets
@@ -101,8 +101,8 @@ def _parts(
         "It is that of `fem_nonlinear` with the greatest patience "
         "(`us_sim/evaluation/tissue_methods.py`), which follows the same poses and is called "
         f"again at each until its residual is {CONVERGED:g}, it has settled, or it goes no "
-        f"further. Frames at whose pose it is above {TRUSTED:g} are not compared (`not_compared` "
-        "in the CSV).",
+        f"further. Frames at whose pose it is above {TRUSTED:g}, or at which a fixed node has "
+        f"moved by more than {1e3 * HELD:g} mm, are not compared (`not_compared` in the CSV).",
         "Tissue under an edge that digs in may be in balance in more than one way, as a crease "
         "that stays or smooths out, and what follows the same poses less patiently may end in "
         f"another. So one in {OWN_EVERY} frames of `fem_nonlinear` is also compared with what it "
@@ -164,11 +164,12 @@ def _answers(answers: Mapping[Motion, Converged]) -> str:
             _percent(float((answer.residual <= CONVERGED).mean())),
             _percent(float(answer.trusted.mean())),
             *(_number(float(x)) for x in (answer.residual.max(), answer.smallest.min())),
+            _number(1e3 * float(answer.slipped.max())),
         )
         for motion, answer in answers.items()
     ]
     head = ("motion", "poses", f"residual ≤ {CONVERGED:g}", f"≤ {TRUSTED:g}", "largest residual")
-    return markdown_table((*head, "smallest volume ratio"), rows)
+    return markdown_table((*head, "smallest volume ratio", "mm a fixed node moved"), rows)
 
 
 def _name(method: str) -> str:
