@@ -104,4 +104,6 @@ def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type:
     press.plot(areas.time, areas.depth * 1e3, color="0.5", ls="--", label="probe depth")
     press.set_ylabel("probe depth, mm")
     lines = axes.get_lines()[: len(areas.area)] + press.get_lines()
-    axes.legend(lines, [line.get_label() for line in lines], loc="lower left")
+    names = [line.get_label() for line in lines]
+    place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(lines)}
+    axes.legend(lines, names, frameon=False, **place)
