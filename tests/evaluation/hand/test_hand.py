@@ -232,6 +232,15 @@ def test_a_missed_target_says_no(wrong, missed):
     assert sum(target.met is False for target in targets(done(**wrong))) == missed
 
 
+def test_errors_of_few_frames_are_not_told_of():
+    points = done()
+    for point in points:
+        point.live.frames.error[1:] = np.nan
+    (seen,) = {target.seen for target in targets(points) if "no converged answer" in target.seen}
+    assert seen == "no converged answer for 67 % of the frames"
+    assert {target.met for target in targets(points)} == {True, None}
+
+
 def test_a_residual_that_never_falls_is_named():
     seen = {target.what: target.seen for target in targets(done(held=[1.0, 1.0]))}
     assert "never in 3 of 3 motions" in seen.values()

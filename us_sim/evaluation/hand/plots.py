@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from us_sim.evaluation.figure import key_beside, new_figure, plain, save
 from us_sim.evaluation.hand.cases import RATE, TISSUES, Motion
 from us_sim.evaluation.hand.converged import Converged
-from us_sim.evaluation.hand.points import HOLD, Point, those
+from us_sim.evaluation.hand.points import ENOUGH, HOLD, Point, those
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.recording.hand_motion import HASTES
 
@@ -178,7 +178,7 @@ def _draw_motion(depth: Axes, speed: Axes, motion: Motion, answer: Converged) ->
 
 def _draw_point(panel: Axes, point: Point) -> None:
     frames, look = point.frames, TISSUE_METHODS[point.method]
-    if np.isnan(frames.error).all():
+    if frames.compared < ENOUGH:
         return
     x = [float(np.percentile(frames.cpu, percent)) for percent in (50, 99)]
     y = [max(float(np.nanpercentile(frames.error, percent)), _LOWEST) for percent in (50, 99)]

@@ -26,6 +26,7 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.solvers.solver import TissueSolver
 
 __all__ = [
+    "ENOUGH",
     "HOLD",
     "OWN_EVERY",
     "Frames",
@@ -36,6 +37,8 @@ __all__ = [
     "those",
 ]
 
+ENOUGH = 0.9
+"""Fraction of the frames that must be compared before their errors are told of."""
 HOLD = 60
 """Frames in which the probe stays where it is."""
 OWN_EVERY = 5
@@ -63,6 +66,11 @@ class Frames:
     slipped: _Array = field(default_factory=_nothing)  # mm, of the fixed node that moved most
     cpu: _Array = field(default_factory=_nothing)  # ms, processor time of all threads
     wall: _Array = field(default_factory=_nothing)  # ms
+
+    @property
+    def compared(self) -> float:
+        """Fraction of the frames that have an error; what there is of few says nothing of all."""
+        return float(np.isfinite(self.error).mean()) if len(self.error) else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 from us_sim.evaluation.hand.cases import APPROACH, MAIN_TISSUE, RATE, TISSUES, Motion
 from us_sim.evaluation.hand.converged import CONVERGED, HELD, TRUSTED, Converged
 from us_sim.evaluation.hand.plots import plot_errors, plot_faults, plot_hold, plot_time
-from us_sim.evaluation.hand.points import HOLD, OWN_EVERY, Point, those
+from us_sim.evaluation.hand.points import ENOUGH, HOLD, OWN_EVERY, Point, those
 from us_sim.evaluation.hand.targets import JUDGED, targets
 from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.report_folder import ReportFolder
@@ -102,7 +102,8 @@ def _parts(
         "(`us_sim/evaluation/tissue_methods.py`), which follows the same poses and is called "
         f"again at each until its residual is {CONVERGED:g}, it has settled, or it goes no "
         f"further. Frames at whose pose it is above {TRUSTED:g}, or at which a fixed node has "
-        f"moved by more than {1e3 * HELD:g} mm, are not compared (`not_compared` in the CSV).",
+        f"moved by more than {1e3 * HELD:g} mm, are not compared (`not_compared` in the CSV); "
+        f"where these are more than {100 * (1 - ENOUGH):.0f} % no errors are told of.",
         "Tissue under an edge that digs in may be in balance in more than one way, as a crease "
         "that stays or smooths out, and what follows the same poses less patiently may end in "
         f"another. So one in {OWN_EVERY} frames of `fem_nonlinear` is also compared with what it "
@@ -120,8 +121,9 @@ def _by_motion(points: Sequence[Point], *, free_only: bool) -> str:
     rows = []
     for p in those(points, kind="free" if free_only else None):
         values = p.values
+        told = p.frames.compared >= ENOUGH
         numbers = [
-            *(values[f"error_mm_{which}"] for which in ("p50", "p95", "p99", "worst")),
+            *(values[f"error_mm_{w}"] if told else np.nan for w in ("p50", "p95", "p99", "worst")),
             *(values[f"own_error_mm_{which}"] for which in ("p50", "worst")),
             *(values[f"residual_{which}"] for which in ("p50", "p99")),
         ]
@@ -141,12 +143,15 @@ def _by_motion(points: Sequence[Point], *, free_only: bool) -> str:
 def _live(points: Sequence[Point]) -> str:
     rows = []
     for p in those(points):
-        values = p.values
+        values, told = p.values, p.live.frames.compared >= ENOUGH
         rows.append(
             (
                 *(str(p.motion), _name(p.method), f"{p.live.poses}"),
                 _percent(values["live_skipped"]),
-                *(_number(values[f"live_error_mm_{which}"]) for which in ("p50", "p99", "worst")),
+                *(
+                    _number(values[f"live_error_mm_{which}"]) if told else ""
+                    for which in ("p50", "p99", "worst")
+                ),
                 *(_number(values[f"live_latency_ms_{which}"]) for which in ("p50", "p99")),
                 f"{values['live_frames_inverted']}",
                 *(_frames(values[f"hold_frames_to_{small}"]) for small in ("1e-2", "1e-3")),
