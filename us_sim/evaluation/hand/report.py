@@ -44,7 +44,9 @@ def write_report(
     free = [motion for motion in answers if motion.kind == "free"]
     others = [motion for motion in answers if motion.kind != "free"]
     main = [motion for motion in free if motion.tissue == MAIN_TISSUE]
-    overtime = [*main, *(motion for motion in [*free, *others] if motion not in main)][:_COLUMNS]
+    rest = [motion for motion in (*free, *others) if motion not in main]
+    rest.sort(key=lambda motion: motion.tissue == MAIN_TISSUE)  # one of another tissue first
+    overtime = [*main, *rest][:_COLUMNS]
     plot_time(points, overtime, answers, folder.picture("time"))
     plot_errors(points, list(answers) if folder.quick else free, folder.picture("error"))
     plot_faults(points, folder.picture("faults"))
