@@ -33,8 +33,8 @@ TRUSTED = 1e-3
 HELD = 1e-6
 """m that a fixed node may move before nothing is compared with it either."""
 
-_MOST_CALLS = 40  # at one pose
-_PATIENCE, _PROGRESS = 6, 0.7  # calls, in which the least residual must fall by that factor
+_MOST_CALLS = 20  # at one pose
+_PATIENCE, _PROGRESS = 4, 0.7  # calls, in which the least residual must fall by that factor
 
 
 @dataclass(frozen=True, eq=False)
