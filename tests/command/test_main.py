@@ -28,6 +28,10 @@ from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
         (["run", "upper_arm", "--path", "nowhere.mcap"], "nowhere.mcap"),
         (["bag", "info", "nowhere.mcap"], "nowhere.mcap"),
         (["play", "nowhere.mcap"], "nowhere.mcap"),
+        (["evaluate", "hand", "--seed", "-1"], "--seed: -1 is outside 0 to"),
+        (["evaluate", "hand", "--seed", "two"], "--seed: "),
+        (["demo", "--path", "nowhere.mcap"], "there is no bag at nowhere.mcap"),
+        (["demo", "--path", __file__], "is not a bag: it is neither MCAP nor SQLite"),
         (["demo", "upper_arm", "--volume", "nowhere.mha"], "there is no file"),
     ],
 )

@@ -40,10 +40,10 @@ def played_scene(small_scene: Path, short_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def demo(played_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that `us-sim demo` leaves."""
+def demo(small_scene: Path, short_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `us-sim demo` leaves, of a scene without a path of its own."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    result = us_sim("demo", played_scene, "--out", out)
+    result = us_sim("demo", small_scene, "--path", short_path, "--out", out)
     assert result.returncode == 0, result.stderr
     assert "images out" in result.stdout
     return out

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.command.scene_options import add_network_option, add_scene_options, node_parameters
+from us_sim.share import find_bag
 
 __all__ = ["add_demo"]
 
@@ -24,6 +25,12 @@ def add_demo(commands: Any) -> None:
         choices=("path", "camera"),
         help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
         "default: camera where the scene's tracker is one",
+    )
+    demo.add_argument(
+        "--path",
+        type=find_bag,
+        metavar="BAG",
+        help="play this probe path, such as hand.mcap, a brisk hand; default: the scene's own",
     )
     demo.add_argument(
         "--out",
@@ -46,4 +53,5 @@ def _demo(args: argparse.Namespace) -> int:
         node_parameters(args.param),
         network=args.network,
         source=args.source,
+        path=args.path,
     )

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
+from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
 
@@ -38,8 +39,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes = figure.add_subplot(grid[divmod(i, 3)])
         extent = (left, right, bottom, top)
         axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
-        press = session.poses[stamp].position[2] * 1e3
-        axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, probe at {press:+.1f} mm")
+        where = _place(session.poses[stamp])
+        axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
         axes.tick_params(labelsize=8)
         if i % 3 == 0:
@@ -51,25 +52,33 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
 
 
 def _moments(session: Session) -> list[tuple[str, int]]:
-    """Six stamps of images that tell the story of the press."""
+    """Six stamps of images that tell the story of a press, be it one of many."""
     stamps = [stamp for stamp in session.images if stamp in session.poses]
     if not stamps:
         raise BagError("the session holds no image with a pose, so there is nothing to show")
     depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
     deepest = depth.max()
     full = int(np.argmax(depth >= deepest - 1e-4))
-    last_full = len(depth) - 1 - int(np.argmax(depth[::-1] >= deepest - 1e-4))
-    half = int(np.argmin(np.abs(depth[: full + 1] - deepest / 2)))
-    touch = int(np.argmin(np.abs(depth[: full + 1])))
+    touch, half = (int(np.argmax(depth >= part * deepest)) for part in (0.0, 0.5))
+    places = np.array([session.poses[stamp].position for stamp in stamps])
+    aside = np.linalg.norm((places - places[full])[:, :2], axis=1)
+    slid = full + int(np.argmax(np.where(depth >= 0.5 * deepest, aside, -1.0)[full:]))
     picked = [
         ("before", 0),
         ("touching", touch),
         ("pressing", half),
         ("full press", full),
-        ("sliding", (full + last_full) // 2 + (last_full - full) // 8),
+        ("slid aside", slid),
         ("after", len(stamps) - 1),
     ]
     return [(title, stamps[i]) for title, i in picked]
+
+
+def _place(pose: Pose) -> str:
+    """How deep the probe is, and how far from upright."""
+    tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
+    tilted = f", tilted {tilt:.0f}°" if tilt >= 0.5 else ""
+    return f"probe at {1e3 * pose.position[2]:+.1f} mm{tilted}"
 
 
 def _caption(areas: LumenAreas | None, time: float) -> str:
@@ -95,4 +104,6 @@ def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type:
     press.plot(areas.time, areas.depth * 1e3, color="0.5", ls="--", label="probe depth")
     press.set_ylabel("probe depth, mm")
     lines = axes.get_lines()[: len(areas.area)] + press.get_lines()
-    axes.legend(lines, [line.get_label() for line in lines], loc="lower left")
+    names = [line.get_label() for line in lines]
+    place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(lines)}
+    axes.legend(lines, names, frameon=False, **place)

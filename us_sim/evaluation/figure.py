@@ -36,7 +36,9 @@ def plain(panel: Axes) -> None:
 
 
 def key_beside(panel: Axes, handles: list | None = None) -> None:  # type: ignore[type-arg]
-    """What colours and marks mean, to the right of a panel."""
+    """What colours and marks mean, to the right of a panel; nothing where it has none."""
+    if handles is None and not panel.get_legend_handles_labels()[0]:
+        return
     panel.legend(
         handles=handles, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5)
     )

@@ -13,7 +13,7 @@ from us_sim.errors import UsSimError, VolumeError
 from us_sim.progress import Progress
 from us_sim.run.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
 from us_sim.run.supervision import Monitored, follow, plan_of
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -79,8 +79,9 @@ def demo(
     *,
     network: bool,
     source: str | None = None,
+    path: Path | None = None,
 ) -> int:
-    """Replay the scene's path through its nodes; recording, contact sheet and summary in ``out``.
+    """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
     Args:
         name: of the scene, or its file.
@@ -90,25 +91,31 @@ def demo(
         network: talk beyond this host.
         source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
             None is the one that the scene's tracker asks for.
+        path: bag or recording that is played in place of the scene's own path.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or a node failed.
     """
     keep_on_this_host(network=network)
     scene = load_scene(name, volume=volume)
-    if scene.path is None:
-        raise UsSimError(f"{scene.origin}: path: is missing, and the demo needs one to play")
+    file = path or (Path(scene.path) if scene.path is not None else None)
+    if file is None:
+        raise UsSimError(
+            f"{scene.origin}: path: is missing, and the demo needs one to play; give one with "
+            f"--path"
+        )
     recording = out / "session.mcap"
     if recording.exists():
         raise UsSimError(f"{recording} exists already; choose another folder with --out")
+    path_of(scene, file)  # before anything is made for what cannot be played
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
     source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
-    video = _prepared_video(scene, Path(scene.path)) if source == "camera" else None
-    path = Path(scene.path) if video is None else None
-    plan = plan_of(scene, parameters, record=recording, path=path, video=video)
+    video = _prepared_video(scene, file) if source == "camera" else None
+    played = file if video is None else None
+    plan = plan_of(scene, parameters, record=recording, path=played, video=video)
     prepare_volume(scene)
     started = time.monotonic()
     startup = follow(plan, log=out / "nodes.log")

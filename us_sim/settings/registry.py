@@ -110,6 +110,10 @@ EVALUATIONS = Choice(
         f"{_EVALUATION}.slice.measure:evaluate_slice",
         f"{_EVALUATION}.slice.recorded_sweep:RecordedSweep",
     ),
+    hand=Option(
+        f"{_EVALUATION}.hand.measure:evaluate_hand",
+        f"{_EVALUATION}.hand.settings:HandSettings",
+    ),
     tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
 )
 

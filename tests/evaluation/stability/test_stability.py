@@ -8,6 +8,7 @@ import pytest
 
 from us_sim.evaluation.stability import measure as stability
 from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
+from us_sim.evaluation.stability.held_cases import HOLD, held_cases
 from us_sim.evaluation.stability.measure import evaluate_stability
 from us_sim.evaluation.stability.meshes import MESHES, SUPPORTS, fixed_nodes, mesh_named, parts
 from us_sim.evaluation.stability.motions import poses_of
@@ -109,6 +110,74 @@ def test_a_solver_that_fails_for_ever_is_caught():
     assert trial.bounded
     assert trial.kept > 40
     assert "in every frame" in trial.failure
+
+
+HELD = StabilityCase("held", depth=0.2, contrast=10.0, held=HOLD)
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """The method that is broken here is one that must come to balance."""
+    method = replace(TISSUE_METHODS["fem_cg"], is_judged_at_rest=True)
+    monkeypatch.setitem(TISSUE_METHODS, "fem_cg", method)
+
+
+class Hesitant(FemCg):
+    """Takes a step in a frame, and so never gets there; what it reports is true."""
+
+    def __init__(self, model):
+        super().__init__(model, FemCg.Settings(iterations=1))
+
+
+@pytest.mark.usefixtures("judged")
+def test_a_good_solver_comes_to_balance_under_a_held_probe():
+    trial = tried(FemCg, HELD)
+    assert trial.passed
+    assert len(trial.held) == HOLD + 1
+    assert trial.frames_to_balance is not None
+    assert trial.held_inverted == 0
+    assert trial.recovered_mm == 0.0
+
+
+@pytest.mark.usefixtures("judged")
+def test_a_solver_that_does_not_come_to_balance_is_caught():
+    trial = tried(Hesitant, replace(HELD, mesh="fine", contrast=1000.0))
+    assert trial.truthful
+    assert trial.frames_to_balance is None
+    assert trial.failure.startswith("held for 30 frames it was left with a residual of")
+
+
+@pytest.mark.usefixtures("judged")
+def test_linear_strain_that_turns_tetrahedra_inside_out_is_caught():
+    trial = tried(FemCg, replace(HELD, collider="pebble", mesh="fine", depth=0.9))
+    assert trial.frames_to_balance is not None
+    assert trial.failure.endswith("tetrahedra inside out")
+
+
+def test_who_is_not_judged_is_only_recorded():
+    trial = tried(FemCg, replace(HELD, collider="pebble", mesh="fine", depth=0.9))
+    assert trial.held_inverted > 0
+    assert trial.passed
+    assert [name for name, m in TISSUE_METHODS.items() if m.is_judged_at_rest] == ["fem_nonlinear"]
+
+
+def test_held_cases_are_what_anatomy_is():
+    cases = held_cases(400, seed=9)
+    assert cases == held_cases(400, seed=9)
+    assert not set(cases) & set(held_cases(400, seed=10))
+    for name, low, high in (
+        ("young_modulus", 1e3, 1e5),
+        ("contrast", 1.0, 1e3),
+        ("poisson_ratio", 0.3, 0.495),
+        ("depth", 0.05, 0.5),
+    ):
+        values = np.array([getattr(case, name) for case in cases])
+        assert low <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high
+    assert {case.support for case in cases} == {"bottom", "walls"}
+    assert {case.held for case in cases} == {HOLD}
+    for name, some in (("mesh", "delaunay"), ("collider", "plate"), ("motion", "tilt")):
+        assert some in {getattr(case, name) for case in cases}
 
 
 @pytest.mark.parametrize(
@@ -227,22 +296,29 @@ def test_the_report_has_a_row_for_each_case_and_a_map_for_each_method(
         monkeypatch.delitem(TISSUE_METHODS, name)
     monkeypatch.setattr(stability, "extreme_cases", lambda **_: named)
     monkeypatch.setattr(stability, "sampled_cases", lambda _: [])
+    monkeypatch.setattr(stability, "held_cases", lambda *_: held_cases(1, seed=3))
     assert evaluate_stability(tmp_path / "out", quick=True) == 0
     with (tmp_path / "out" / "stability.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert list(rows[0])[:3] == ["method", "case", "young_modulus"]
     assert list(rows[0])[-2:] == ["truthful", "action"]
-    assert len(rows) == 2 * (len(REFUSALS) + len(named))
+    assert len(rows) == 2 * (len(REFUSALS) + len(named) + 1)
     ran = {row["method"]: row for row in rows if row["case"] == "press"}
     for row in ran.values():
         assert (row["finite"], row["bounded"], row["truthful"]) == ("true", "true", "true")
         assert row["contrast"] == "10"
+    assert ran["fem_cg"]["held_residual"] == ""
+    held = {row["method"]: row for row in rows if row["case"] == "held 3.0"}
+    assert float(held["fem_cg"]["held_residual"]) < 1e-3
+    assert int(held["fem_cg"]["frames_to_1e-3"]) <= HOLD
+    assert held["fem_cg"]["held_inverted"] in ("true", "false")
     assert ran["fem_cg"]["time_step"] == ""
     assert ran["msds"]["time_step"] == "0.01"
     refused = next(row for row in rows if row["case"] == "free")
     assert refused["finite"] == ""
     assert refused["action"].startswith("refused: the tissue can move as a whole")
     report = (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
+    assert "## A probe that is held" in report
     for method in ("fem_cg", "msds"):
         assert (tmp_path / "out" / f"stability_{method}.png").stat().st_size > 10_000
         assert f"stability_{method}.png" in report

@@ -82,6 +82,7 @@ class StabilityCase:
     release: str = "removed"  # the probe is "removed" or "lifted"
     stabilisation: str = "mass_scaling"  # of explicit methods
     springs: str = "algorithm_1"  # of methods that have some, see `SPRINGS`
+    held: int = 0  # frames that the probe stays where its motion ended, before its release
 
 
 def sampled_cases(count: int) -> list[StabilityCase]:

@@ -2,7 +2,8 @@
 
 Thousands of stiff and extreme cases (see `us_sim.evaluation.stability.cases`) on small meshes, for
 every solver: does it stay finite and bounded, does it come back after release, is its residual
-true, and does it refuse what it must. The cases are the same in every run.
+true, and does it refuse what it must. And a thousand within what anatomy is (`held_cases`): does
+the tissue come to balance when the probe is held still. The cases are the same in every run.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from us_sim.errors import SolverError
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
 from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
+from us_sim.evaluation.stability.held_cases import held_cases
 from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
 from us_sim.evaluation.stability.points import Trial, Tried, try_case
 from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
@@ -37,6 +39,8 @@ __all__ = ["evaluate_stability"]
 _SAMPLES, _QUICK_SAMPLES = 2048, 64
 _STEP_LIMITS, _QUICK_STEP_LIMITS = 200, 24  # sampled cases whose step limit is looked for
 _STEP_LIMIT_ERROR = 0.02  # relative, of predicted step limits
+_HELD, _QUICK_HELD = 1000, 24
+_SEED = 1  # of the held cases
 _CHUNK = 12  # cases that a process is handed at a time
 
 
@@ -53,7 +57,7 @@ def evaluate_stability(out: Path, quick: bool) -> int:
     """Write stability.csv, the maps and stability.md, as `us_sim.evaluation` says.
 
     A quick run has fewer cases. A case has failed that was not finite, bounded or truthful, or was
-    refused for no reason.
+    refused for no reason, or was not in balance in the end though it should be.
     """
     folder = ReportFolder("stability", out, quick)
     tasks = list(_tasks(quick))
@@ -67,6 +71,7 @@ def evaluate_stability(out: Path, quick: bool) -> int:
 def _tasks(quick: bool) -> Iterator[_Task]:
     named = extreme_cases(corners=not quick)
     sampled = sampled_cases(_QUICK_SAMPLES if quick else _SAMPLES)
+    held = held_cases(_QUICK_HELD if quick else _HELD, _SEED)
     limits = _QUICK_STEP_LIMITS if quick else _STEP_LIMITS
     for name_of_method, method in TISSUE_METHODS.items():
         for name in REFUSALS:
@@ -75,6 +80,8 @@ def _tasks(quick: bool) -> Iterator[_Task]:
             yield _Task(name_of_method, case)
         for number, case in enumerate(sampled):
             yield _Task(name_of_method, case, method.is_explicit and number < limits)
+        for case in held:
+            yield _Task(name_of_method, case)
 
 
 def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list[Tried]:

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from us_sim.errors import UsSimError
 from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
 from us_sim.evaluation.row import Row
+from us_sim.evaluation.settling import frames_until
 from us_sim.evaluation.stability.cases import StabilityCase, model_of
+from us_sim.evaluation.stability.held_cases import SMALL
 from us_sim.evaluation.stability.meshes import parts
 from us_sim.evaluation.stability.motions import LIFTED, poses_of
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
@@ -29,6 +31,7 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.springs import springs_of
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
@@ -52,6 +55,9 @@ _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
 _QUASI_STATIC_FRAMES, _DYNAMIC_FRAMES = 40, 150
 """Frames after the release, of methods without masses and of those with them."""
 
+_HELD = ("frames_to_1e-3", "held_residual", "held_inverted")
+"""What only a case has in which the probe was held."""
+
 _RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
 """What only a case that was not refused has."""
 
@@ -71,6 +77,8 @@ class Trial:
     recovery_frames: int | None = None  # until it was near rest; None when it never was
     residual_reported: float = math.nan  # in the last frame with a probe, or the first untrue one
     residual_checked: float = math.nan  # in the same frame
+    held: list[float] = field(default_factory=list)  # residuals, that when the probe stopped first
+    held_inverted: int = 0  # tetrahedra, at the end of the hold
     step_limit_predicted: float = math.nan  # s
     step_limit_observed: float = math.nan  # s
     slowest_ms: float = 0.0
@@ -81,6 +89,11 @@ class Trial:
     def passed(self) -> bool:
         """Whether nothing went wrong."""
         return self.finite and self.bounded and self.truthful and not self.failure
+
+    @property
+    def frames_to_balance(self) -> int | None:
+        """Of the hold, until the residual is small and stays so; None where it never is."""
+        return frames_until(self.held, SMALL)
 
     def say(self, action: str) -> None:
         """Add what a solver said."""
@@ -119,11 +132,19 @@ class Tried(Row):
             "method": self.method,
             **(varied | {"case": self.name}),
             "recovery_frames": ran("recovery_frames"),
+            **dict(zip(_HELD, self._held, strict=True)),
             "dt_limit_predicted": trial.step_limit_predicted,
             "dt_limit_observed": trial.step_limit_observed,
             **{name: ran(name) for name in _RAN},
             "action": " | ".join([*failed, *trial.actions[:3]]),
         }
+
+    @property
+    def _held(self) -> tuple[object, ...]:
+        trial = self.trial
+        if not trial.held:
+            return (None, None, None)
+        return trial.frames_to_balance, trial.held[-1], bool(trial.held_inverted)
 
     @property
     def failure(self) -> str:
@@ -170,6 +191,8 @@ def run_trial(
     model = solver.model
     poses = poses_of(case.motion, model.mesh, case.depth)
     bound = _bound(model, poses)
+    moving = len(poses)
+    poses = [*poses, *poses[-1:] * case.held]
     thickness = float(np.ptp(model.mesh.nodes[:, 2]))
     released = None if case.release == "removed" else LIFTED
     quasi_static = TISSUE_METHODS[solver.name].is_quasi_static
@@ -189,6 +212,10 @@ def run_trial(
         if not _finite(deformation):
             trial.finite = False
             return
+        if case.held and moving <= number + 1 <= len(poses):
+            trial.held.append(float(deformation.residual))
+            volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
+            trial.held_inverted = int((volumes <= 0).sum())
         failed = _FAILED in deformation.action
         kept = _KEPT in deformation.action
         if failed:
@@ -214,11 +241,22 @@ def run_trial(
             elif trial.recovery_frames is None:
                 trial.recovery_frames = free + 1
             if deformation is last:
-                return  # settled
+                break  # settled
         last = deformation
         stuck = stuck + 1 if failed else 0
     if stuck >= frames and _held(model).all():
         trial.failure = "went on failing after the release, in every frame"
+    if trial.held and TISSUE_METHODS[solver.name].is_judged_at_rest and not trial.failure:
+        trial.failure = _unbalanced(trial, case)
+
+
+def _unbalanced(trial: Trial, case: StabilityCase) -> str:
+    """What is wrong under the held probe; nothing where the tissue is in balance and upright."""
+    if trial.frames_to_balance is None:
+        return f"held for {case.held} frames it was left with a residual of {trial.held[-1]:.3g}"
+    if trial.held_inverted:
+        return f"held for {case.held} frames it left {trial.held_inverted} tetrahedra inside out"
+    return ""
 
 
 def agrees(reported: float, checked: float, rounding: float) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from us_sim.evaluation.markdown_table import markdown_table
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
+from us_sim.evaluation.stability.held_cases import HOLD, SMALL
 from us_sim.evaluation.stability.plots import draw_map, draw_step_limits
 from us_sim.evaluation.stability.points import Trial, Tried
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
@@ -21,6 +22,11 @@ __all__ = ["table", "write_report"]
 _HEAD = (
     *("method", "cases", "refused", "failed", "not finite", "not bounded", "not truthful"),
     *("back to rest", "frames", "kept", "slowest ms"),
+)
+
+_HELD_HEAD = (
+    *("method", "judged", "cases", "residual ≤ 0.001", "inverted", "both fine", "frames, median"),
+    *("95th percentile", "worst residual"),
 )
 
 _DEFINITIONS = """\
@@ -41,6 +47,7 @@ Every case is a small tissue (4 to 150 nodes), a collider and a motion of it, an
 - *kept*: frames that failed, after which the solver itself kept the last good state or rest.
 - *refused*: in one sentence, before the run. To be refused for no reason counts as failed, and so
   does not to refuse a tissue that can move as a whole (quasi-static methods) or broken input.
+- *held*: see below; a case of `fem_nonlinear` that does not come to balance counts as failed.
 - critical damping is that of the root mean square of the nodes' frequencies."""
 
 
@@ -61,6 +68,7 @@ def write_report(folder: ReportFolder, tried: Sequence[Tried]) -> None:
         markdown_table(_HEAD, [_numbers(method, tried) for method in _methods(tried)]),
         "" if failed else "No case failed.",
     ]
+    parts += _held(tried)
     for method, said in _step_limits(tried).items():
         limits = _with_step_limit(method, tried)
         predicted = np.array([trial.step_limit_predicted for trial in limits])
@@ -75,6 +83,46 @@ def write_report(folder: ReportFolder, tried: Sequence[Tried]) -> None:
         draw_map(method, mine, picture)
         parts += [f"## {method}", f"![map]({picture.name})", *_worst(mine), *_said(mine)]
     folder.write_report([*parts, *_refusals(tried)], failed)
+
+
+def _held(tried: Sequence[Tried]) -> list[str]:
+    """What came of the cases in which the probe was held, and who is judged by it."""
+    rows = []
+    for method in _methods(tried):
+        held = [one.trial for one in tried if one.method == method and one.trial.held]
+        if not held:
+            continue
+        frames = [n for n in (trial.frames_to_balance for trial in held) if n is not None]
+        upright = [trial for trial in held if not trial.held_inverted]
+        fine = [trial for trial in upright if trial.frames_to_balance is not None]
+        typical = [f"{np.percentile(frames, part):.0f}" if frames else "" for part in (50, 95)]
+        rows.append(
+            (
+                method,
+                "yes" if TISSUE_METHODS[method].is_judged_at_rest else "",
+                f"{len(held)}",
+                f"{100 * len(frames) / len(held):.1f} %",
+                f"{len(held) - len(upright)}",
+                f"{100 * len(fine) / len(held):.1f} %",
+                *typical,
+                f"{max(trial.held[-1] for trial in held):.2g}",
+            )
+        )
+    if not rows:
+        return []
+    judged = [f"`{name}`" for name, method in TISSUE_METHODS.items() if method.is_judged_at_rest]
+    return [
+        "## A probe that is held",
+        "Within what anatomy is (1 to 100 kPa, contrasts up to 1000, Poisson's ratios of 0.3 to "
+        f"0.495, presses of 5 to 50 % of the thickness), the probe then stays for {HOLD} frames, "
+        f"after which the residual must be at most {SMALL:g} and no tetrahedron inside out. "
+        f"{', '.join(judged)} is judged by it: its energy has a minimum under every probe, and a "
+        "case in which it does not come there counts as failed. The others are only recorded. "
+        "Linear strain (`fem`, `fem_cg`) knows no volume, so that deep presses turn tetrahedra "
+        "inside out in the exact solution of its equations; springs have masses that swing on, "
+        "and time steps that a frame has only so many of.",
+        markdown_table(_HELD_HEAD, rows),
+    ]
 
 
 def _methods(tried: Sequence[Tried]) -> list[str]:
@@ -145,10 +193,11 @@ def _described(one: Tried) -> str:
     case = one.case
     if case is None:
         return one.name
+    held = f", then held for {case.held} frames" if case.held else ""
     text = (
         f"{one.name} ({case.young_modulus:.2g} Pa, contrast {case.contrast:.2g}, "
         f"ν = {case.poisson_ratio:.5g}, {case.motion} to {100 * case.depth:.0f} % of the depth, "
-        f"{case.mesh}, {case.collider}, held: {case.support}"
+        f"{case.mesh}, {case.collider}, held: {case.support}{held}"
     )
     if TISSUE_METHODS[one.method].has_springs:
         text += f", {case.time_step:.2g} s steps, damping {case.damping:.2g}, {case.springs}"

@@ -1,0 +1,59 @@
+"""The six moments of a contact sheet tell a press's story in order, be it scripted or a hand's."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from us_sim.demo.contact_sheet import _moments, _place
+from us_sim.errors import BagError
+from us_sim.geometry.pose import Pose
+from us_sim.recording.hand_motion import hand_motion, shipped_hand_path
+from us_sim.recording.press_and_slide import press_and_slide
+
+
+def session(path):
+    """As a recording of it would be, with an image for every pose."""
+    stamps = [int(stamp) for stamp in path.stamps]
+    return SimpleNamespace(images=stamps, poses=dict(zip(stamps, path.poses, strict=True)))
+
+
+def told(path):
+    """Seconds since the begin, by title."""
+    return {title: (stamp - path.stamps[0]) * 1e-9 for title, stamp in _moments(session(path))}
+
+
+def test_the_scripted_press():
+    moments = told(press_and_slide())
+    assert moments["before"] == 0
+    assert moments["touching"] == pytest.approx(1.5, abs=0.02)
+    assert moments["pressing"] == pytest.approx(2.5, abs=0.02)
+    assert moments["full press"] == pytest.approx(3.2, abs=0.3)
+    assert moments["slid aside"] == pytest.approx(6.25, abs=0.02)
+    assert moments["after"] == pytest.approx(9.983, abs=0.001)
+
+
+@pytest.mark.parametrize("path", [shipped_hand_path(), hand_motion("free", "brisk", 2, 4.0)])
+def test_a_hand(path):
+    moments = told(path)
+    assert list(moments.values()) == sorted(moments.values())
+    depth = np.array([pose.position[2] for pose in path.poses])
+    deepest = depth[round(60 * moments["full press"])]
+    assert deepest == pytest.approx(depth.max(), abs=1e-4)
+    assert depth[round(60 * moments["slid aside"])] >= deepest / 2
+
+
+def test_a_path_that_never_touches_has_its_moments_too():
+    path = press_and_slide(depth=0.0)
+    assert len(told(path)) == 6
+
+
+def test_nothing_to_show():
+    with pytest.raises(BagError, match="nothing to show"):
+        _moments(SimpleNamespace(images=[], poses={}))
+
+
+def test_a_tilt_is_said_where_there_is_one():
+    assert _place(Pose([0.0, 0.0, 0.0123])) == "probe at +12.3 mm"
+    tilted = Pose([0.0, 0.0, -0.01], [np.sin(np.radians(10)), 0.0, 0.0, np.cos(np.radians(10))])
+    assert _place(tilted) == "probe at -10.0 mm, tilted 20°"

@@ -1,0 +1,183 @@
+"""A hand's motion: as fast as asked, within its room, the same for a seed; and the bag of one."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from us_sim.errors import BagError
+from us_sim.recording.hand_motion import (
+    HASTES,
+    KINDS,
+    Haste,
+    Room,
+    hand_motion,
+    main,
+    shipped_hand_path,
+)
+from us_sim.recording.path import read_path
+from us_sim.recording.reader import read_bag
+
+BAG = Path(__file__).resolve().parents[2] / "bags/hand.mcap"
+
+motions = st.tuples(
+    st.sampled_from(sorted(KINDS)),
+    st.sampled_from(sorted(HASTES)),
+    st.integers(0, 2**32),
+    st.floats(1.0, 8.0),
+)
+rooms = st.builds(
+    Room,
+    aside=st.floats(0.01, 0.05),
+    across=st.floats(0.01, 0.05),
+    above=st.floats(0.0, 0.02),
+    deepest=st.floats(0.02, 0.05),
+    tilt=st.floats(0.3, 1.0),
+    yaw=st.floats(0.3, 1.5),
+    edge=st.floats(0.03, 0.2),
+)
+
+
+def speeds(path, rate=60):
+    """(K - 1,) m/s and rad/s, from pose to pose."""
+    turns = Rotation.from_quat(path.orientations)
+    moved = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    return rate * moved, rate * (turns[:-1].inv() * turns[1:]).magnitude()
+
+
+@settings(max_examples=40, deadline=None)
+@given(motions, rooms)
+def test_the_median_speed_is_the_one_asked_for(motion, room):
+    kind, haste, *_ = motion
+    moved, turned = speeds(hand_motion(*motion, room))
+    if KINDS[kind].moves:
+        assert np.median(moved) == pytest.approx(HASTES[haste].speed, rel=1e-9)
+    else:
+        assert moved.max() == 0
+    if KINDS[kind].turns:
+        assert np.median(turned) == pytest.approx(HASTES[haste].turning, rel=1e-6)
+    else:
+        assert turned.max() == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(motions, rooms)
+def test_it_stays_in_its_room(motion, room):
+    path = hand_motion(*motion, room)
+    x, y, z = path.positions.T
+    if KINDS[motion[0]].over_the_edge:
+        assert 0.5 * room.edge <= x.min() <= x.max() <= 1.25 * room.edge
+    else:
+        assert np.abs(x).max() <= room.aside
+    assert np.abs(y).max() <= room.across
+    assert -room.above <= z.min() <= z.max() <= room.deepest
+    yaw, *tilts = Rotation.from_quat(path.orientations).as_euler("ZXY").T
+    assert np.abs(yaw).max() <= room.yaw + 1e-9
+    assert np.abs(tilts).max() <= room.tilt + 1e-9
+    np.testing.assert_allclose(np.linalg.norm(path.orientations, axis=1), 1, atol=1e-12)
+
+
+@settings(max_examples=10, deadline=None)
+@given(motions)
+def test_a_seed_gives_one_motion_and_another_another(motion):
+    path, again = hand_motion(*motion), hand_motion(*motion)
+    np.testing.assert_array_equal(path.positions, again.positions)
+    np.testing.assert_array_equal(path.orientations, again.orientations)
+    kind, haste, seed, duration = motion
+    other = hand_motion(kind, haste, seed + 1, duration)
+    assert not np.array_equal(path.positions, other.positions) or not KINDS[kind].moves
+    assert not np.array_equal(path.orientations, other.orientations) or not KINDS[kind].turns
+
+
+def test_a_longer_motion_takes_all_of_its_room():
+    path = hand_motion("free", "brisk", 3, 60.0)
+    for values, low, high in zip(path.positions.T, (-18, -12, -5), (18, 12, 15), strict=True):
+        parts = np.histogram(1e3 * values, bins=4, range=(low, high))[0] / len(values)
+        # Everywhere about equally often.
+        assert parts.min() > 0.15
+        assert parts.max() < 0.4
+
+
+def test_it_is_smooth():
+    # The curves are analytic: at twice the rate accelerations from pose to pose are the same.
+    accelerations = []
+    for rate in (240, 480):
+        path = hand_motion("free", "brisk", 5, 4.0, rate=rate)
+        accelerations.append(np.abs(np.diff(path.positions, 2, axis=0)).max() * rate**2)
+    assert accelerations[1] == pytest.approx(accelerations[0], rel=0.02)
+
+
+def test_the_approach_comes_from_above_and_does_not_count():
+    path = hand_motion("fanning", "brisk", 2, 1.0, approach=0.5)
+    assert len(path) == 90
+    assert path.positions[0] == pytest.approx([0, 0, -0.010])
+    assert path.orientations[0] == pytest.approx([0, 0, 0, 1])
+    alone = hand_motion("fanning", "brisk", 2, 1.0)
+    np.testing.assert_allclose(path.positions[30:], alone.positions, atol=1e-15)
+    np.testing.assert_allclose(path.orientations[30:], alone.orientations, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        ({"kind": "slidign"}, "kind 'slidign' is not one of .*; did you mean 'sliding'?"),
+        ({"haste": "late"}, "haste 'late' is not one of careful, brisk, violent"),
+        ({"duration": 0.1}, "ten poses or more"),
+        ({"rate": math.nan}, "ten poses or more"),
+        ({"seed": -1}, "no negative seed"),
+        ({"approach": -1.0}, "an approach of -1.0 s"),
+        ({"kind": "pressing", "haste": "violent", "rate": 10.0}, "cannot reach 0.3 m/s"),
+    ],
+)
+def test_what_cannot_be_is_said(asked, sentence):
+    with pytest.raises(BagError, match=sentence):
+        hand_motion(**{"kind": "free", "haste": "brisk", "seed": 1} | asked)
+
+
+@pytest.mark.parametrize("wrong", [{"aside": -1.0}, {"deepest": 0.0}, {"tilt": math.inf}])
+def test_a_room_that_cannot_be(wrong):
+    with pytest.raises(BagError, match="no range may be negative"):
+        Room(**wrong)
+
+
+def test_hastes_are_those_of_the_measures():
+    assert HASTES["brisk"] == Haste(0.06, math.pi / 2)
+    assert [round(math.degrees(haste.turning)) for haste in HASTES.values()] == [30, 90, 360]
+
+
+def test_the_shipped_path_begins_and_ends_at_rest_above_the_skin():
+    path = shipped_hand_path()
+    assert len(path) == 600
+    for end in (0, -1):
+        assert path.positions[end] == pytest.approx([0, 0, -0.010], abs=1e-12)
+        assert path.orientations[end] == pytest.approx([0, 0, 0, 1], abs=1e-12)
+    moved, turned = speeds(path)
+    assert max(moved[0], moved[-1]) < 1e-3
+    busy = slice(round(60 * 1.7), round(60 * 8.2))
+    assert 1e3 * np.median(moved[busy]) == pytest.approx(60, rel=0.1)
+    assert np.degrees(np.median(turned[busy])) == pytest.approx(90, rel=0.1)
+    # Nowhere does it leap: an acceleration is at most a fifth of gravity's.
+    assert np.abs(np.diff(path.positions, 2, axis=0)).max() * 60**2 < 2.0
+    assert np.abs(path.positions[:, 0]).max() <= 0.018
+    assert path.positions[:, 2].max() > 0.012
+
+
+def test_the_bag_in_the_repository_is_this_path(tmp_path, capsys, monkeypatch):
+    # It was written without ROS 2, whose installed definitions carry comments.
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    made, kept = shipped_hand_path(), read_path(BAG)
+    assert (kept.topic, kept.frame_id) == ("/tracker/pose", "patient")
+    for array in ("stamps", "log_times"):
+        np.testing.assert_array_equal(getattr(kept, array), getattr(made, array))
+    # The tempo is found by bisection, and sines of different machines differ in their last bit.
+    np.testing.assert_allclose(kept.positions, made.positions, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(kept.orientations, made.orientations, rtol=0, atol=1e-9)
+    assert main([str(tmp_path / "again.mcap")]) == 0
+    assert read_bag(tmp_path / "again.mcap").topics == read_bag(BAG).topics
+    assert main([str(tmp_path / "again.mcap")]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert main([]) == 2

@@ -1,0 +1,339 @@
+"""What came of a motion with one method: every pose fed, then as live, then the probe held still.
+
+>>> from us_sim.evaluation.hand.points import Held
+>>> held = Held(np.array([0.3, 0.02, 5e-4, 1e-6]))
+>>> held.frames_to(1e-2), held.frames_to(1e-8)
+(2.0, nan)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation.hand.cases import RATE, Motion
+from us_sim.evaluation.hand.converged import HELD, TRUSTED, Converged, moved_fixed, settled
+from us_sim.evaluation.row import Row
+from us_sim.evaluation.settling import frames_until
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.solvers.solver import TissueSolver
+
+__all__ = [
+    "ENOUGH",
+    "HOLD",
+    "OWN_EVERY",
+    "Frames",
+    "Held",
+    "Live",
+    "Point",
+    "measure",
+    "those",
+]
+
+ENOUGH = 0.9
+"""Fraction of the frames that must be compared before their errors are told of."""
+HOLD = 60
+"""Frames in which the probe stays where it is."""
+OWN_EVERY = 5
+"""Frames, of which one is converged by itself."""
+_SMALL = 1e-3
+"""Residual that a held probe must come to."""
+
+_Array = NDArray[np.float64]
+
+
+def _nothing() -> _Array:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of a motion, each array (K,); an error is NaN where there is no converged answer."""
+
+    number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))  # of the pose
+    error: _Array = field(default_factory=_nothing)  # mm, of the node that is farthest off
+    rms: _Array = field(default_factory=_nothing)  # mm, root mean square over all nodes
+    own: _Array = field(default_factory=_nothing)  # mm, to its own balance; NaN in most frames
+    residual: _Array = field(default_factory=_nothing)  # as reported
+    inverted: _Array = field(default_factory=_nothing)  # tetrahedra
+    slipped: _Array = field(default_factory=_nothing)  # mm, of the fixed node that moved most
+    cpu: _Array = field(default_factory=_nothing)  # ms, processor time of all threads
+    wall: _Array = field(default_factory=_nothing)  # ms
+
+    @property
+    def compared(self) -> float:
+        """Fraction of the frames that have an error; what there is of few says nothing of all."""
+        return float(np.isfinite(self.error).mean()) if len(self.error) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Live:
+    """A motion of which only those poses are seen for which there is time."""
+
+    poses: int = 0  # that came
+    frames: Frames = field(default_factory=Frames)  # that were made
+    latency: _Array = field(default_factory=_nothing)  # (K,) ms, from a pose to its frame
+
+    @property
+    def skipped(self) -> float:
+        """Fraction of the poses."""
+        return 1.0 - len(self.frames.number) / self.poses if self.poses else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Frames after the probe has stopped."""
+
+    residual: _Array = field(default_factory=_nothing)  # (K,), of the last frame before them first
+    inverted: int = 0  # tetrahedra in the last of them
+
+    def frames_to(self, residual: float) -> float:
+        """Frames until it is as small, and stays so; NaN where it never is."""
+        found = frames_until(self.residual, residual)
+        return math.nan if found is None else float(found)
+
+    @property
+    def last(self) -> float:
+        """The residual in the end."""
+        return float(self.residual[-1]) if len(self.residual) else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Point(Row):
+    """A row of hand.csv."""
+
+    motion: Motion
+    method: str
+    speed: float = math.nan  # m/s, median of the frames that count
+    turning: float = math.nan  # rad/s, likewise
+    frames: Frames = field(default_factory=Frames)
+    live: Live = field(default_factory=Live)
+    held: Held = field(default_factory=Held)
+    failure: str = ""
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What sums up the frames, by column."""
+        frames, live, held, motion = self.frames, self.live, self.held, self.motion
+        over = {
+            f"residual_over_{limit:g}": _mean(frames.residual > limit) for limit in (1e-2, 0.1, 1.0)
+        }
+        return {
+            "tissue": motion.tissue,
+            "kind": motion.kind,
+            "haste": motion.haste,
+            "seed": motion.seed,
+            "method": self.method,
+            "frames": len(frames.number),
+            "speed_mm_s": 1e3 * self.speed,
+            "turning_deg_s": math.degrees(self.turning),
+            **_percentiles("error_mm", frames.error, (50, 95, 99, 100)),
+            **_percentiles("rms_mm", frames.rms, (50, 95, 99, 100)),
+            "not_compared": int(np.isnan(frames.error).sum()),
+            **_percentiles("own_error_mm", frames.own, (50, 100)),
+            **_percentiles("residual", frames.residual, (50, 99, 100)),
+            **over,
+            "frames_inverted": int((frames.inverted > 0).sum()),
+            "fixed_nodes_moved_mm": float(frames.slipped.max(initial=0.0)),
+            **_percentiles("cpu_ms", frames.cpu, (50, 99, 100)),
+            **_percentiles("wall_ms", frames.wall, (50, 99, 100)),
+            "live_skipped": live.skipped,
+            **_percentiles("live_error_mm", live.frames.error, (50, 99, 100)),
+            **_percentiles("live_latency_ms", live.latency, (50, 99, 100)),
+            "live_frames_inverted": int((live.frames.inverted > 0).sum()),
+            "hold_frames_to_1e-2": held.frames_to(1e-2),
+            "hold_frames_to_1e-3": held.frames_to(_SMALL),
+            "hold_residual": held.last,
+            "hold_inverted": bool(held.inverted),
+            "failure": self.failure,
+        }
+
+    @property
+    def title(self) -> str:
+        """What was tried."""
+        return f"{self.method}, {self.motion}"
+
+
+def those(
+    points: Iterable[Point],
+    *,
+    method: str | None = None,
+    tissue: str | None = None,
+    kind: str | None = None,
+    haste: str | None = None,
+) -> list[Point]:
+    """Points that did not fail, of this method, tissue, kind and haste; None is any."""
+    wanted = (method, tissue, kind, haste)
+    return [
+        p
+        for p in points
+        if not p.failure
+        and all(
+            value is None or value == own
+            for value, own in zip(
+                wanted, (p.method, p.motion.tissue, p.motion.kind, p.motion.haste), strict=True
+            )
+        )
+    ]
+
+
+def measure(
+    solver: TissueSolver,
+    motion: Motion,
+    answer: Converged,
+    balance: TissueSolver | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Point:
+    """Follow a motion twice from rest, once with every pose and once live, and hold the probe.
+
+    Args:
+        solver: of the method.
+        motion: of the probe.
+        answer: the converged one at each of its poses.
+        balance: a solver of the same equations, with which frames are converged at their poses.
+        progress: told how many poses have been fed.
+
+    Raises:
+        FloatingPointError: a number that the solver returned is not finite.
+    """
+    bench = _Bench(solver, motion, answer, balance)
+    frames = bench.every_pose(progress)
+    held = bench.held()
+    live = bench.live()
+    poses = motion.poses[motion.begins :]
+    speed, turning = _speeds(poses)
+    return Point(motion, solver.name, speed, turning, frames, live, held)
+
+
+class _Bench:
+    """One solver and one motion."""
+
+    def __init__(
+        self,
+        solver: TissueSolver,
+        motion: Motion,
+        answer: Converged,
+        balance: TissueSolver | None,
+    ) -> None:
+        self._solver, self._motion, self._answer = solver, motion, answer
+        self._balance, self._mesh = balance, solver.model.mesh
+        self._last = solver.deform(None)
+
+    def every_pose(self, progress: Callable[[int], None] | None) -> Frames:
+        """No pose is left out, however long a frame takes; up to the last one that presses."""
+        self._solver.reset()
+        rows = []
+        for k in range(self._answer.last_pressed + 1):
+            row = self._frame(k, own_balance=k % OWN_EVERY == 0 and k >= self._motion.begins)
+            if k >= self._motion.begins:
+                rows.append(row)
+            if progress is not None:
+                progress(k + 1)
+        return _frames(rows)
+
+    def held(self) -> Held:
+        """The probe stays where the motion above ended."""
+        pose, found = self._motion.poses[self._answer.last_pressed], self._last
+        residual = [found.residual]
+        for _ in range(HOLD):
+            before, found = found, self._solver.deform(pose)
+            if found is before:  # settled: it will not change any more
+                break
+            residual.append(found.residual)
+        return Held(np.array(residual), self._inverted(found))
+
+    def live(self) -> Live:
+        """Poses come at their times, and a frame begins with the newest of them.
+
+        The clock is the wall's while a frame is made; waiting for a pose takes no time.
+        """
+        self._solver.reset()
+        poses = self._motion.poses
+        rows, latency = [], []
+        now, done = 0.0, -1
+        while True:
+            newest = int(now * RATE + 1e-9)
+            if newest <= done:
+                newest, now = done + 1, (done + 1) / RATE
+            if newest >= len(poses):
+                break
+            row = self._frame(newest)
+            now += 1e-3 * row[-1]
+            done = newest
+            if newest >= self._motion.begins:
+                rows.append(row)
+                latency.append(1e3 * (now - newest / RATE))
+        return Live(len(poses) - self._motion.begins, _frames(rows), np.array(latency))
+
+    def _frame(self, k: int, *, own_balance: bool = False) -> tuple[float, ...]:
+        pose = self._motion.poses[k]
+        begun, processor = time.perf_counter(), time.process_time()
+        found = self._solver.deform(pose)
+        processor, wall = time.process_time() - processor, time.perf_counter() - begun
+        self._last = found
+        numbers = (found.nodes, found.force, found.torque, found.residual)
+        if not all(np.isfinite(number).all() for number in numbers):
+            raise FloatingPointError(f"frame {k} is not finite")
+        error = rms = own = math.nan
+        if own_balance and self._balance is not None:
+            own = self._to_own_balance(pose, found)
+        if self._answer.trusted[k]:
+            off = np.linalg.norm(found.nodes - self._answer.nodes[k], axis=1)
+            error, rms = float(off.max()), float(np.sqrt((off**2).mean()))
+        times = (1e3 * processor, 1e3 * wall)
+        errors = (1e3 * error, 1e3 * rms, 1e3 * own)
+        slipped = moved_fixed(self._solver.model, found)
+        return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
+
+    def _to_own_balance(self, pose: Pose, found: Deformation) -> float:
+        """m, from the frame to what it converges to where the probe is; NaN where to nothing."""
+        assert self._balance is not None
+        state = self._solver.state
+        state.displacement[self._solver.model.fixed] = 0.0  # what moved is in its own column
+        self._balance.take_over(state)
+        there = settled(self._balance, pose)
+        if there.residual > TRUSTED or moved_fixed(self._solver.model, there) > HELD:
+            return math.nan
+        return float(np.linalg.norm(found.nodes - there.nodes, axis=1).max())
+
+    def _inverted(self, found: Deformation) -> int:
+        """Tetrahedra that are inside out or flat."""
+        return int((signed_volumes(found.nodes, self._mesh.tetrahedra) <= 0).sum())
+
+
+def _frames(rows: Sequence[tuple[float, ...]]) -> Frames:
+    if not rows:
+        return Frames()
+    number, *others = np.array(rows).T
+    return Frames(number.astype(np.intp), *others)
+
+
+def _speeds(poses: Sequence[Pose]) -> tuple[float, float]:
+    """m/s and rad/s, medians from pose to pose."""
+    places = np.array([pose.position for pose in poses])
+    turns = np.array([pose.orientation for pose in poses])
+    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return RATE * float(np.median(moved)), RATE * float(np.median(2 * np.arccos(cosine)))
+
+
+def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str, object]:
+    """By column: ``name_p50``, and ``name_worst`` for 100."""
+    known = values[~np.isnan(values)]
+    return {
+        f"{name}_{'worst' if p == 100 else f'p{p}'}": (
+            float(np.percentile(known, p)) if len(known) else math.nan
+        )
+        for p in percents
+    }
+
+
+def _mean(values: NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else math.nan
