@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
@@ -17,9 +18,11 @@ from us_sim.nodes.conversions import (
     tetrahedra_message,
     wrench_message,
 )
+from us_sim.nodes.frame_time import frame_limit, shortest, usable_cores
 from us_sim.nodes.live_tissue import LiveTissue
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.tissue.deformation import Deformation
 
 if TYPE_CHECKING:
     from us_sim.nodes.contact_model_publisher import ContactModelPublisher
@@ -29,6 +32,10 @@ __all__ = ["TissueDeformer", "main"]
 
 ALWAYS = Time()
 """The stamp of what does not change: zero, which tf takes as the latest."""
+GO_ON_S = 1 / 60
+"""Time without a pose after which an unfinished frame is gone on with."""
+VISIBLE_M = 5e-5
+"""How far a node must have moved for the frame that was gone on with to be sent again."""
 
 
 class TissueDeformer(SceneNode):
@@ -58,17 +65,38 @@ class TissueDeformer(SceneNode):
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
+        if not self.lockstep:
+            sending = shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
+            limit = frame_limit(sending, usable_cores())
+            self._live.tissue.limit_frames(limit)
+            self.get_logger().info(f"a frame may take {1e3 * limit:.1f} ms")
+            self.create_timer(GO_ON_S, self._go_on)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self._structures: StructureMarkers | None = None
         if self.scene.structures:
             from us_sim.nodes.structure_markers import StructureMarkers
 
             self._structures = StructureMarkers(self, mesh)
+        self._last: PoseStamped | None = None
+        self._sent = mesh.nodes  # (N, 3) m
+        self._came = 0  # poses since `_go_on` was last called
         self.newest(PoseStamped, "probe/pose", self._deform)
         self.health.state = f"ready with {self._live.tissue.name}"
         self.get_logger().info(self.health.state)
 
     def _deform(self, message: PoseStamped) -> None:
+        self._came += 1
+        self._last = message
+        self._frame(message)
+
+    def _go_on(self) -> None:
+        """While no pose comes: finish what the last frame had no time for."""
+        idle, self._came = self._came == 0, 0
+        if idle and self._last is not None and not self._live.tissue.is_settled:
+            self._frame(self._last, again=True)
+
+    def _frame(self, message: PoseStamped, again: bool = False) -> None:
+        """Deform the tissue and send what somebody wants; ``again`` only if it is to be seen."""
         wanted = self._nodes.get_subscription_count() > 0
         felt = self._wrench.get_subscription_count() > 0
         touched = self._contact is not None and self._contact.is_wanted
@@ -82,6 +110,10 @@ class TissueDeformer(SceneNode):
         except UsSimError as error:
             self.health.problem("pose", f"{error}; the tissue stays as it was")
             return
+        self._describe(deformation)
+        if again and np.abs(deformation.nodes - self._sent).max() < VISIBLE_M:
+            return
+        self._sent = deformation.nodes
         if wanted:
             self._nodes.publish(self._cloud(deformation.nodes, stamp))
             self.health.published("tissue/nodes", stamp)
@@ -94,6 +126,11 @@ class TissueDeformer(SceneNode):
             self._contact.publish(self._live.tissue, pose, deformation, stamp)
         if self._structures is not None and shown:
             self._structures.publish(deformation.nodes, stamp)
+
+    def _describe(self, deformation: Deformation) -> None:
+        """What diagnostics say of a frame."""
+        if deformation.inverted:
+            self.health.problem("inside out", _inside_out(deformation, self._live.tissue.name))
         self.health.state = self._live.state
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
@@ -118,6 +155,16 @@ class TissueDeformer(SceneNode):
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T
         return cloud_message({"x": x, "y": y, "z": z}, stamp, "patient")
+
+
+def _inside_out(deformation: Deformation, name: str) -> str:
+    sentence = f"{deformation.inverted} tetrahedra are inside out"
+    if name == "fem_nonlinear":
+        return sentence
+    return (
+        f"{sentence}: {name} is not made for a press this deep; fem_nonlinear is (set the "
+        "parameter solver of tissue_deformer, or tissue.solver in the scene)"
+    )
 
 
 def main(args: list[str] | None = None) -> int:

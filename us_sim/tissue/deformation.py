@@ -27,6 +27,7 @@ class Deformation:
     torque: NDArray[np.float64]  # (3,), N m, likewise, about the origin of frame probe
     residual: float  # unbalanced force over contact force, of the solver's own equations
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
+    inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,7 +44,7 @@ def predict_forces(
     Returns:
         (C, 3) N, the change of the forces.
     """
-    touched = held.any(axis=1)
+    touched: NDArray[np.bool_] = np.any(held != 0.0, axis=1)
     near = np.flatnonzero((touched | (gap < reach)) & np.isfinite(gap))
     loaded = np.flatnonzero(touched)
     delassus, opened = _normal_problem(compliance, near, loaded, normal, gap, held)

@@ -52,7 +52,7 @@ class FactoredStiffness:
         self._bulk = mesh.volumes * (split.element + split.nodal)
         walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
         self._wall = mesh.volumes * walls
-        self.fixed = np.flatnonzero(model.fixed)
+        self.fixed: NDArray[np.integer] = np.flatnonzero(model.fixed)
         number = np.where(model.fixed, -1, np.cumsum(~model.fixed) - 1)
         self._free = np.flatnonzero(~model.fixed)
         self._number = number

@@ -7,9 +7,9 @@ section 2.1). Fields are (3, N).
 
 >>> import numpy as np
 >>> from us_sim.tissue.linear_algebra.two_level import TwoLevel, conjugate_gradients
->>> blocks = np.outer([2.0, 0.0, 0.0, 2.0, 0.0, 2.0], [1.0, 1.0, 1.0])
+>>> blocks = np.outer([2.0, 0.0, 0.0, 2.0, 0.0, 2.0], np.ones(3))
 >>> two_level = TwoLevel(None, fixed=np.array([2]), local_weight=1.0)
->>> two_level.prepare(blocks, np.array([0]), np.array([[0.0, 0.0, 1.0]]), np.array([8.0]))
+>>> two_level.prepare(blocks, np.array([0]), np.array([[0.0, 0, 1]]), np.array([8.0]))
 >>> def double(field, image):
 ...     np.multiply(field, 2.0, out=image)
 >>> force = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
@@ -29,11 +30,11 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 
-__all__ = ["Solved", "TwoLevel", "apply_blocks", "conjugate_gradients"]
+__all__ = ["Preconditioner", "Solved", "TwoLevel", "apply_blocks", "conjugate_gradients"]
 
 Product = Callable[[NDArray[np.floating], NDArray[np.floating]], None]
 
-_LOOP = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
+_LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,18 @@ class Solved:
     direction: NDArray[np.floating]  # (3, N), the last search direction
     iterations: int
     curved: bool  # whether that was one of negative curvature; the solution is what came before
+
+
+class Preconditioner(Protocol):
+    """An approximate inverse of a stiffness with springs, and these."""
+
+    fixed: NDArray[np.integer]
+    nodes: NDArray[np.integer]  # (K,), where there are springs
+    normals: NDArray[np.floating]  # (K, 3), their directions
+    springs: NDArray[np.floating]  # (K,) N/m
+
+    def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
+        """Overwrite ``out`` with the preconditioner times ``residual``."""
 
 
 class TwoLevel:
@@ -106,7 +119,7 @@ class TwoLevel:
 
 def conjugate_gradients(
     product: Product,
-    two_level: TwoLevel,
+    preconditioner: Preconditioner,
     residual: NDArray[np.floating],
     iterations: int,
     tolerance: float,
@@ -115,7 +128,7 @@ def conjugate_gradients(
 
     Args:
         product: writes the stiffness, without springs, times its first argument into the second.
-        two_level: prepared.
+        preconditioner: prepared.
         residual: (3, N), zero at fixed nodes; overwritten with what is left.
         iterations: the most products.
         tolerance: norm of the residual at which to end.
@@ -123,14 +136,16 @@ def conjugate_gradients(
     shape, dtype = residual.shape, residual.dtype
     solution, image, search = np.zeros((3, *shape), dtype)
     elastic, conditioned, whole = np.empty((3, *shape), dtype)
-    fixed, nodes = two_level.fixed, two_level.nodes
+    fixed, nodes = preconditioner.fixed, preconditioner.nodes
     slope = 0.0
     for iteration in range(iterations):
-        two_level.apply(residual, conditioned)
+        preconditioner.apply(residual, conditioned)
         before, slope = slope, _dot(residual, conditioned)
         _renew(conditioned, slope / before if iteration else 0.0, search)
         product(search, elastic)
-        _add_springs(elastic, search, nodes, two_level.normals, two_level.springs, fixed, whole)
+        _add_springs(
+            elastic, search, nodes, preconditioner.normals, preconditioner.springs, fixed, whole
+        )
         curvature = _dot(search, whole)
         if not curvature > 0.0:
             return Solved(solution, image, search, iteration + 1, True)

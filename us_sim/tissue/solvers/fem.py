@@ -33,6 +33,7 @@ from us_sim.tissue.contact.penetration import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
@@ -111,6 +112,7 @@ class Fem(TissueSolver):
         imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._displacement = np.zeros_like(model.mesh.nodes)
+        self._watched = watched_tetrahedra(model)
         super().__init__(model, settings, progress)
 
     @property
@@ -170,7 +172,8 @@ class Fem(TissueSolver):
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         load = float(np.linalg.norm(forces))
         residual = math.hypot(contact.sliding_force / load, self._rounding(touched, forces))
-        return Deformation(nodes, touched, force, torque, residual, action)
+        inverted = count_inverted(nodes, self._watched)
+        return Deformation(nodes, touched, force, torque, residual, action, inverted)
 
     def _rounding(self, touched: NDArray[np.int32], forces: NDArray[np.float64]) -> float:
         """Unbalanced force over the norm of the probe's forces (K, 3) N on touched (K,) nodes."""

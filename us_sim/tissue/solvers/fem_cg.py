@@ -30,6 +30,7 @@ from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import free_stiffness, require_held, stiffness
+from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
 from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import (
@@ -91,6 +92,7 @@ class FemCg(TissueSolver):
         require_held(model.mesh, model.fixed)
         settings = settings or FemCgSettings()
         super().__init__(model, settings, progress)
+        self._watched = watched_tetrahedra(model)
         self._tolerance = settings.tolerance
         updates = min(settings.contact_updates, settings.iterations)
         self._rounds = np.diff(np.linspace(0, settings.iterations, updates + 1).round().astype(int))
@@ -214,4 +216,5 @@ class FemCg(TissueSolver):
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[pushed], push[pushing])
-        return Deformation(nodes, pushed, force, torque, residual)
+        inverted = count_inverted(nodes, self._watched)
+        return Deformation(nodes, pushed, force, torque, residual, "", inverted)

@@ -37,6 +37,7 @@ from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffnes
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.newton import Newton
 from us_sim.tissue.solvers.solver import (
@@ -55,10 +56,14 @@ _TOUCHING = 0.1
 _SMALL = 500
 """Free nodes up to which there is time to factor the stiffness while the probe moves."""
 
-_SUNK = 1e-6
-"""Depth of the probe in the tissue, m, that does not matter."""
+_SUNK = 10.0
+"""Depth to which the probe may sink into settled tissue, over the spacing of the nodes that it can
+touch, for a tolerance of 1."""
 
-_PATIENCE = 30
+_SINKS = 3e-4
+"""Depth of the probe in the tissue, m, that is worth saying."""
+
+_PATIENCE = 10
 """Frames in a row that may end inside out before the tissue is begun anew from rest."""
 
 
@@ -73,8 +78,8 @@ class FemNonlinearSettings(SolverSettings):
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
-        "time after which a frame ends with what it has, and the next goes on; not given: none "
-        "but most_iterations, so that results do not depend on the machine",
+        "time after which a frame ends with what it has, and the next goes on; not given: what a "
+        "live simulation leaves, and in lockstep any, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(
@@ -116,8 +121,10 @@ class FemNonlinear(TissueSolver):
         super().__init__(model, settings, progress)
         self._own = settings
         self._surface = model.movable_contact_nodes
+        self._sunk = _SUNK * settings.tolerance * model.contact_spacing
         self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
         self._newton = Newton(model)
+        self._upright = self._newton.displacement  # (3, N) m, the last that was
         self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
@@ -126,7 +133,7 @@ class FemNonlinear(TissueSolver):
     @property
     def state(self) -> TissueState:
         """Where the tissue is; a quasi-static solver has no velocity."""
-        displacement = self._newton.displacement.T.copy()
+        displacement = self._upright.T.copy()
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
@@ -150,39 +157,44 @@ class FemNonlinear(TissueSolver):
         self._aimed: Pose | None = None  # the pose that the tissue is at or on its way to
         self._balanced = False  # whether the last frame's forces were
         self._inverted = 0  # frames in a row that ended inside out
+        self._upright = self._newton.displacement
         if state.displacement.any():
             self._newton.put(np.ascontiguousarray(state.displacement.T))
-        self._upright = self._newton.displacement
 
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
-        newton = self._newton
+        newton, settings = self._newton, self._own
         if pose is None or self._depth(pose, self.model.mesh.nodes[self._surface]) <= GAP_TOLERANCE:
             # Nothing reaches the undeformed tissue: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
             return self._resting()
         moved = not same_pose(pose, self._aimed)
-        goal = self._own.frame_tolerance if moved else self._own.tolerance
+        goal = settings.frame_tolerance if moved else settings.tolerance
+        # Where they did not balance, pushes are still those of being hit.
         shifted = newton.augment() if self._balanced else np.inf
         start = self._predicted(pose) if moved else None
         newton.may_factor = not moved or self._small
-        self.cg = self.steps = 0
-        left = self._own.most_iterations
-        stuck = False
+        left, stuck, actions = settings.most_iterations, False, []
+        budget = settings.frame_budget or self.frame_limit
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough = goal * newton.load if start is None else 0.0
-            if not newton.step(min(left, newton.patience), enough, start):
-                stuck = newton.is_stuck
+            taken = newton.step(min(left, newton.patience), enough, start)
+            stuck = not taken and newton.is_stuck
             left -= newton.used
-            self.cg += newton.used
-            self.steps += 1
-            start = None
-            budget = self._own.frame_budget
-            if budget is not None and time.perf_counter() - began > budget:
+            if budget is not None and (spent := time.perf_counter() - began) > budget:
+                if start is not None and settings.frame_budget is not None:
+                    actions.append(
+                        f"frame_budget is {1e3 * budget:.3g} ms, but one step takes "
+                        f"{1e3 * spent:.2g} ms: give it more"
+                    )
                 break
-        self._balanced = newton.imbalance <= self._own.frame_tolerance * self._reference()
-        return self._outcome(pose, stuck, shifted)
+            start = None
+        self._balanced = newton.imbalance <= settings.frame_tolerance * self._reference()
+        if stuck:
+            actions.append(f"no step led any further: {self._obstacle()}")
+        self._settled = stuck
+        return self._outcome(pose, shifted, actions)
 
     def _reference(self) -> float:
         """N, what unbalanced forces are measured by."""
@@ -213,33 +225,43 @@ class FemNonlinear(TissueSolver):
         self._compliance.add_field(change, field)
         return field.astype(np.float64)
 
-    def _outcome(self, pose: Pose, stuck: bool, shifted: float) -> Deformation:
-        newton, actions = self._newton, []
-        shown = newton.displacement
-        if newton.tissue.smallest_volume_ratio(shown) > 0.0:
-            self._upright, self._inverted = shown, 0
-        elif newton.tissue.smallest_volume_ratio(self._upright) > 0.0:
+    def _obstacle(self) -> str:
+        """What holds up a tissue that cannot be balanced."""
+        newton = self._newton
+        pulled = int(np.argmax(np.linalg.norm(newton.unbalanced, axis=0)))
+        nodes = self.model.mesh.nodes + newton.displacement.T
+        ratios = signed_volumes(nodes, self.model.mesh.tetrahedra) / self.model.mesh.volumes
+        least = int(np.argmin(ratios))
+        return (
+            f"node {pulled} is the least balanced, and tetrahedron {least} has {ratios[least]:.2g} "
+            "of its volume"
+        )
+
+    def _outcome(self, pose: Pose, shifted: float, actions: list[str]) -> Deformation:
+        newton, contact = self._newton, self._newton.contact
+        reached = newton.displacement
+        if newton.tissue.smallest_volume_ratio(reached) > 0.0:
+            self._upright, self._inverted = reached, 0
+        else:
             self._inverted += 1
             actions.append("still inside out, so the last upright state is shown")
             newton.put(self._upright)
         self._heaviest = max(self._heaviest, newton.load)
         reference = self._reference()
         residual = newton.imbalance / reference if reference else 0.0
-        contact = newton.contact
+        sunk = -float(contact.gap.min())
+        if sunk > _SINKS:
+            actions.append(f"the probe is {1e3 * sunk:.2g} mm inside the tissue")
         nodes = self.model.mesh.nodes + newton.displacement.T
         pushed = contact.push > 0
         touched = self._surface[pushed]
         forces = contact.push[pushed, None] * contact.normal[pushed]
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
-        self._settled = stuck or (residual <= self._own.tolerance and shifted < _SUNK)
-        if stuck:
-            actions.append("no step led any further")
-        if newton.displacement is not shown:
-            newton.put(shown)
-            self._settled = False
-            if self._inverted > _PATIENCE:
-                actions.append("began anew from rest")
-                newton.rest()
-                self._aimed = None
-                self._inverted = 0
+        if self._inverted == 0:
+            self._settled |= residual <= self._own.tolerance and shifted <= self._sunk
+        elif self._inverted > _PATIENCE:
+            actions.append("begun anew from rest")
+            self._restore(TissueState.at_rest(len(nodes)))
+        else:
+            newton.put(reached)
         return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))

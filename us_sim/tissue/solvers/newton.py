@@ -34,6 +34,7 @@ from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
+    Preconditioner,
     TwoLevel,
     apply_blocks,
     conjugate_gradients,
@@ -66,13 +67,10 @@ it may take twice as many as long as steps need not be cut."""
 _MOST_PATIENCE = 50
 """Iterations beyond which a factor of the stiffness takes less time."""
 
-_KEPT = -1e9
-"""Fraction of the smallest volume ratio that a step keeps at least."""
-
 _BACKTRACKS = 8
 """Step lengths that are tried, each half the last."""
 
-_FORCING, _AIM = 0.1, 0.3
+_FORCING, _AIM = 0.2, 0.3
 """A step ends when its model's unbalanced forces have fallen to this fraction, or to this fraction
 of the goal. Lower is no use: the next step has a new tangent."""
 
@@ -85,7 +83,7 @@ _ROUNDING = 1e-12
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.01, 1e3
 """Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
 
-_LOCAL_WEIGHT = 4.0
+_LOCAL_WEIGHT = 6.0
 """Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
 stiffness at rest; 1 to 6 were tried."""
 
@@ -164,11 +162,13 @@ class Newton:
         self.contact.look(self.surface)
         self._weigh()
 
-    def _weigh(self) -> None:
-        """The energy and its slope at the displacement."""
+    def _weigh(self, energy: float | None = None) -> None:
+        """The energy, unless it is known, and its slope at the displacement."""
         contact, tissue = self.contact, self.tissue
         tissue.forces(self.displacement, self._force)
-        self.energy = tissue.energy(self.displacement) + contact.energy  # J
+        if energy is None:
+            energy = tissue.energy(self.displacement) + contact.energy
+        self.energy = energy  # J
         self._slope = self._force.copy()
         self._slope[:, self._surface] -= (contact.push[:, None] * contact.normal).T
         self._slope[:, self._fixed] = 0.0
@@ -239,8 +239,8 @@ class Newton:
             if len(turned):
                 image[:, turned] -= np.einsum("kij,jk->ik", turn, change[:, turned])
 
-        step = np.zeros_like(self.displacement)
-        image = np.zeros_like(step)  # of the step
+        step: NDArray[np.float64] = np.zeros_like(self.displacement)
+        image: NDArray[np.float64] = np.zeros_like(step)  # of the step
         if start is not None:
             step = start.copy()
             scale = float(np.abs(step).max()) or 1.0
@@ -248,7 +248,8 @@ class Newton:
             elastic((step / scale).astype(self._dtype), product)
             image = scale * product.astype(np.float64)
             self.used += 1
-        enough, segment = None, _SEGMENT
+        enough: float | None = None
+        segment = _SEGMENT
         while True:
             reached = gap + np.einsum("ij,ji->i", normal, step[:, nodes])
             slope = contact.slope_at(reached)
@@ -262,13 +263,12 @@ class Newton:
                 return step, False
             active = np.flatnonzero(slope > 0.0)
             springs = nodes[active], normal[active], slope[active]
-            preconditioner: TwoLevel | FactoredStiffness
+            preconditioner: Preconditioner = self._two_level
             if self._factored is not None and self.may_factor:
+                self._factored.prepare(self.displacement, *springs)
                 preconditioner = self._factored
-                preconditioner.prepare(self.displacement, *springs)
             else:
-                preconditioner = self._two_level
-                preconditioner.prepare(blocks, *springs)
+                self._two_level.prepare(blocks, *springs)
             solved = conjugate_gradients(
                 elastic,
                 preconditioner,
@@ -278,27 +278,23 @@ class Newton:
             )
             self.used += solved.iterations
             segment *= 2
-            step += size * solved.solution
-            image += size * solved.image
+            step += size * solved.solution.astype(np.float64)
+            image += size * solved.image.astype(np.float64)
             if solved.curved:
-                return (step if step.any() else size * solved.direction), True
+                return (step if step.any() else size * solved.direction.astype(np.float64)), True
 
     def _search(self, change: NDArray[np.float64]) -> float:
         """Move by the largest fraction of the change that lowers the energy; returns it."""
         start, energy, imbalance = self.displacement, self.energy, self.imbalance
         bound = energy + _ROUNDING * abs(energy)
         length = 1.0
-        smallest = self.tissue.smallest_volume_ratio(start)
-        least = _KEPT * smallest if smallest > 0.0 else -np.inf
         for _ in range(_BACKTRACKS):
             self.displacement = start + length * change
-            if not self.tissue.smallest_volume_ratio(self.displacement) > least:
-                length /= 2
-                continue
             self.contact.look(self.surface)
-            if self.tissue.energy(self.displacement) + self.contact.energy <= bound:
-                self._weigh()
-                if self.energy < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
+            tried = self.tissue.energy(self.displacement) + self.contact.energy
+            if tried <= bound:
+                self._weigh(tried)
+                if tried < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
                     return length
             length /= 2
         self.put(start)

@@ -77,6 +77,8 @@ class TissueSolver(ABC):
     ) -> None:
         self.model = model
         self.settings = settings if settings is not None else self.Settings()
+        #: s, of the clock on the wall, that a frame may take where frames must keep up; or None.
+        self.frame_limit: float | None = None
         self._pose: Pose | None = None
         self._settled = True
         self._failures = 0  # frames in a row that failed
@@ -102,6 +104,11 @@ class TissueSolver(ABC):
             deformation = self._recovered(good)
         self._last = deformation
         return deformation
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether another frame at the same pose would change nothing."""
+        return self._settled
 
     def _recovered(self, good: TissueState) -> Deformation:
         """The result in place of a frame that failed; the next one tries again."""

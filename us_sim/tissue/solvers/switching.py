@@ -93,6 +93,7 @@ class SwitchableTissue:
         self._solvers = self.make(self._plan, progress).solvers
         self._solver = self._solvers[name]
         self._beside: TissueSolver | None = None
+        self._frame_limit: float | None = None
         self.difference: Difference | None = None
 
     @property
@@ -109,6 +110,16 @@ class SwitchableTissue:
     def compared(self) -> str:
         """Name of the solver beside it, '' when there is none."""
         return self._beside.name if self._beside else ""
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether another frame at the same pose would change nothing."""
+        return self._solver.is_settled
+
+    def limit_frames(self, duration: float | None) -> None:
+        """Let no frame take longer than this (s) where the method can go on in the next."""
+        self._frame_limit = duration
+        self._solver.frame_limit = duration
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
         """`TissueSolver.contact_stiffness` of the solver in use."""
@@ -149,6 +160,7 @@ class SwitchableTissue:
         solver = prepared.solvers[plan.solver]
         if solver is not self._solver:
             solver.take_over(state)
+            solver.frame_limit = self._frame_limit
             self._solver = solver
         beside = prepared.solvers.get(plan.compared)
         if beside is not self._beside:
