@@ -121,8 +121,9 @@ class FemNonlinear(TissueSolver):
         super().__init__(model, settings, progress)
         self._own = settings
         self._surface = model.movable_contact_nodes
-        self._sunk = _SUNK * settings.tolerance * model.contact_spacing
-        self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
+        smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
+        self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
+        self._touching = _TOUCHING * smallest
         self._newton = Newton(model)
         self._upright = self._newton.displacement  # (3, N) m, the last that was
         self._small = int((~model.fixed).sum()) <= _SMALL
@@ -160,6 +161,9 @@ class FemNonlinear(TissueSolver):
         self._upright = self._newton.displacement
         if state.displacement.any():
             self._newton.put(np.ascontiguousarray(state.displacement.T))
+            if not self._newton.tissue.smallest_volume_ratio(self._newton.displacement) > 0.0:
+                # The way out of it may end in another minimum, of tissue folded over.
+                self._newton.rest()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
