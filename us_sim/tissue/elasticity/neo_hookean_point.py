@@ -138,7 +138,7 @@ def volume_change(h):
 
 @njit(**INLINED)
 def crowding(change):
-    """The term against being crushed, over its modulus, and its first and second slope by J = change + 1."""
+    """The term against being crushed, over its modulus, and its two slopes by J = change + 1."""
     ratio = ONE + change
     held = _CRUSHED if ratio < _CRUSHED else ratio
     beyond = ratio - held
