@@ -112,6 +112,42 @@ def test_push_directions_follow_the_rule_of_contact(collider):
     assert found[np.isfinite(gap)] == pytest.approx(normal[np.isfinite(gap)], abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    "box", [RoundedBox(0.03, 0.02, 0.05, 0.002), RoundedBox(0.02, 0.03, 0.05, 1e-5)]
+)
+def test_push_directions_know_the_flanks_of_a_probe_of_small_rounding(box):
+    pose = Pose([0.002, -0.001, 0.01], [0.2, -0.1, 0.3, 0.9])
+    points = pose.apply(RANDOM.uniform([-0.02, -0.02, -0.03], [0.02, 0.02, 0.0], (400, 3)))
+    gap, normal = push_out(box, pose, points, 0.01, flanks=True)
+    inside = gap < 0
+    aside = np.abs(normal @ pose.rotation[:, 2]) < 0.5
+    assert (inside & aside).sum() > 10
+    assert (inside & ~aside).sum() > 10
+    found = push_directions(box, pose, points, 0.01, flanks=True)
+    assert found[inside] == pytest.approx(normal[inside], abs=1e-12)
+
+
+def test_a_tetrahedron_resists_being_crushed_by_its_stiffest_neighbour():
+    mesh = mesh_named("perturbed")
+    modulus = np.full(len(mesh.tetrahedra), 1e3)
+    stiff = mesh.tetrahedra[0]
+    modulus[0] = 1e7
+    crushed = np.flatnonzero(np.isin(mesh.tetrahedra, stiff).any(axis=1))[1:]
+    materials = TissueMaterials(modulus, np.zeros(len(modulus)), np.full(len(modulus), 1e3))
+    flat = mesh.nodes * [0.0, 0.0, -0.9]  # J = 0.1 everywhere
+    forces = neo_hookean_forces(mesh, materials, flat)
+    # cof F is one along z: the stress there is mu F + p - mu, where p is (lambda + mu) (J - 1),
+    # lambda being zero, and the wall's modulus times -(J0 - J)^2 (2 J + J0) / (3 J0 J^2).
+    slope = -(0.15**2) * 0.45 / (3 * 0.25 * 0.01)
+    shear = modulus / 2
+    wall = 5 * shear
+    wall[crushed] = 5 * np.sqrt(500.0 * 5e6)
+    stress = shear * 0.1 + shear * (0.1 - 1) - shear + wall * slope
+    # The work at a virtual displacement by z along z, whose gradient is one.
+    virtual = (forces[:, 2] * mesh.nodes[:, 2]).sum()
+    assert virtual == pytest.approx((mesh.volumes * stress).sum(), rel=1e-9)
+
+
 def test_the_residual_is_unbalanced_over_contact_force():
     model = model_of(StabilityCase("plain", collider="plate"))
     node = int(model.movable_contact_nodes[5])

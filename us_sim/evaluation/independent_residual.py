@@ -52,8 +52,12 @@ Array = NDArray[np.float64]
 _ELEMENT_BULK = 5.0
 """(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
 
-_CROWDED, _CRUSHED = 1 / 4, 1 / 64
+_CROWDED, _CRUSHED = 1 / 4, 1 / 50
 """Volume ratios below which a nonlinear tetrahedron resists being crushed, and more simply so."""
+
+_WALL = 5.0
+"""Modulus of that resistance, over the geometric mean of a tetrahedron's own shear modulus and the
+largest among the tetrahedra with which it shares a node."""
 
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
@@ -76,14 +80,21 @@ class IndependentResidual:
         model: of the solver.
         forces: (N, 3) N that hold the nodes at displacements (N, 3) m, by the method's equations.
         rounding: N, norm of the forces that the last digit of the nodes' coordinates makes.
+        flanks: whether the method knows flanks, as `push_directions` says.
     """
 
     def __init__(
-        self, model: TissueModel, forces: Callable[[Array], Array], rounding: float
+        self,
+        model: TissueModel,
+        forces: Callable[[Array], Array],
+        rounding: float,
+        *,
+        flanks: bool = False,
     ) -> None:
         self._model = model
         self._forces = forces
         self._rounding = rounding
+        self._flanks = flanks
         self._heaviest = 0.0
         self._scale = math.inf  # N, what the last residual referred to
 
@@ -106,7 +117,11 @@ class IndependentResidual:
             load = 0.0
             if pose is not None and len(touched):
                 normal = push_directions(
-                    model.collider, pose, deformation.nodes[touched], model.contact_spacing
+                    model.collider,
+                    pose,
+                    deformation.nodes[touched],
+                    model.contact_spacing,
+                    flanks=self._flanks,
                 )
                 push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
                 push[model.fixed[touched]] = 0.0
@@ -125,8 +140,13 @@ Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
 """Makes what checks the residuals of one method on a model."""
 
 
-def solid_residual(forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array]) -> Residual:
-    """For a method of finite elements, whose nodes are held by those ``forces``."""
+def solid_residual(
+    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array], *, flanks: bool = False
+) -> Residual:
+    """For a method of finite elements, whose nodes are held by those ``forces``.
+
+    ``flanks`` says whether it knows those of a probe, as `push_directions` says.
+    """
 
     def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
         mesh, materials = model.mesh, model.materials
@@ -136,6 +156,7 @@ def solid_residual(forces: Callable[[TetrahedralMesh, TissueMaterials, Array], A
             model,
             lambda displacement: forces(mesh, materials, displacement),
             rounding_of_forces(mesh, stiffest),
+            flanks=flanks,
         )
 
     return residual
@@ -205,7 +226,7 @@ def neo_hookean_forces(
     swelling = _swelling(slope)
     own, nodal = _bulk_parts(shear, whole)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
-    pressure += shear * _crowding(1 + swelling)
+    pressure += _wall_modulus(mesh, shear) * _crowding(1 + swelling)
     cofactor = _cofactors(slope + np.eye(3))
     # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
     difference = (
@@ -216,6 +237,15 @@ def neo_hookean_forces(
     )
     stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
     return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
+
+
+def _wall_modulus(mesh: TetrahedralMesh, shear: Array) -> Array:
+    """(M,) Pa, how firmly each tetrahedron resists being crushed."""
+    nodes, modulus = mesh.tetrahedra.ravel(), np.repeat(shear, 4)
+    order = np.argsort(modulus, kind="stable")
+    largest = np.zeros(len(mesh.nodes))
+    largest[nodes[order]] = modulus[order]  # of each node's values the last one written stays
+    return np.asarray(_WALL * np.sqrt(shear * largest[mesh.tetrahedra].max(axis=1)))
 
 
 def _crowding(ratio: Array) -> Array:
@@ -281,25 +311,39 @@ def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
     return float(np.linalg.norm(nodal))
 
 
-def push_directions(collider: Collider, pose: Pose, points: Array, spacing: float) -> Array:
+def push_directions(
+    collider: Collider, pose: Pose, points: Array, spacing: float, *, flanks: bool = False
+) -> Array:
     """(K, 3) unit directions in which the probe pushes points (K, 3) m on or in it.
 
-    The rule of `us_sim.tissue.contact.penetration.push_out`, written down again.
+    The rule of `us_sim.tissue.contact.penetration.push_out`, written down again. With ``flanks`` a
+    point that lies nearer to a flank of a probe of small rounding than to its front is pushed
+    square to that flank.
     """
     box = collider.offset_box
     rounding = box[3]
     local = (points - pose.position) @ pose.rotation
-    if rounding < 2 * spacing:
-        return np.broadcast_to(pose.rotation[:, 2], points.shape)
     side = np.where(local[:, :2] >= 0, 1.0, -1.0)
-    out = np.maximum(np.abs(local[:, :2]) - box[:2], 0.0)
+    inside = box[:2] - np.abs(local[:, :2])
+    out = np.maximum(-inside, 0.0)
+    rise = np.sqrt(np.maximum(rounding**2 - (out**2).sum(axis=1), 0.0))
     ahead = local[:, 2] + rounding
+    if rounding < 2 * spacing:
+        forward = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+        if not flanks:
+            return forward @ pose.rotation.T
+        nearest = (inside == inside.min(axis=1)[:, None]) & (out == 0.0).all(axis=1)[:, None]
+        aside = np.column_stack([side * np.where(nearest, 1.0, out), np.zeros(len(points))])
+        aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
+        beside = np.linalg.norm(np.where(nearest, -inside, out), axis=1)
+        beside = np.where(nearest.any(axis=1), -beside, beside)
+        by_flank = (ahead < 0.0) & (np.abs(beside - rounding) < np.abs(ahead - rise))
+        return np.where(by_flank[:, None], aside, forward) @ pose.rotation.T
     behind = -(ahead + 2 * box[2] + _GRIP)
     up = np.maximum(ahead, 0.0) - np.maximum(behind, 0.0)
     length = np.sqrt((out**2).sum(axis=1) + up**2)
     near = (length >= rounding) | ((length > 0.5 * rounding) & (up >= 0))
     radial = np.column_stack([side * out, up]) / np.maximum(length, 1e-300)[:, None]
-    rise = np.sqrt(np.maximum(rounding**2 - (out**2).sum(axis=1), 0.0))
     from_above = np.column_stack([side * out, rise]) / rounding
     return np.where(near[:, None], radial, from_above) @ pose.rotation.T
 

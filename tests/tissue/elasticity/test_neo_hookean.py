@@ -193,11 +193,10 @@ def test_cells_are_five_tetrahedra(seed, size):
 
     near(cells.forces(displacement), tetrahedra.forces(displacement))
     assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)
-    for positive in (False, True):
-        cells.linearise(displacement, positive)
-        tetrahedra.linearise(displacement, positive)
-        near(cells.tangent_product(change), tetrahedra.tangent_product(change))
-        near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())
+    cells.linearise(displacement)
+    tetrahedra.linearise(displacement)
+    near(cells.tangent_product(change), tetrahedra.tangent_product(change))
+    near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())
     ratios = np.linalg.det(deformation_gradients(CELLS, displacement))
     for tissue in (cells, tetrahedra):
         assert tissue.smallest_volume_ratio(displacement) == pytest.approx(ratios.min(), abs=1e-9)
@@ -206,30 +205,14 @@ def test_cells_are_five_tetrahedra(seed, size):
 
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.05), ratio=st.floats(0.0, 0.499))
 @settings(max_examples=15, deadline=None)
-def test_tangent_is_symmetric_and_when_asked_has_no_negative_eigenvalue(seed, size, ratio):
+def test_tangent_is_symmetric_and_at_rest_has_no_negative_eigenvalue(seed, size, ratio):
     mesh = box_mesh([0.0, 0.01, 0.03], [0.0, 0.02], [0.0, 0.01])
     tissue = NeoHookean(mesh, uniform(ratio, mesh), np.float64)
-    displacement = random_field(size, seed, mesh)
-    tissue.linearise(displacement)
-    exact = tangent_matrix(tissue, len(mesh.nodes))
-    assert abs(exact - exact.T).max() < 1e-13 * abs(exact).max()
-    tissue.linearise(displacement, positive=True)
     eigenvalues = np.linalg.eigvalsh(tangent_matrix(tissue, len(mesh.nodes)))
     assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
-
-
-@BOTH
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_at_rest_and_under_a_pull_from_all_sides_the_positive_tangent_is_the_exact_one(mesh, dtype):
-    tissue = NeoHookean(mesh, uniform(0.3), dtype)
-    change = random_field(1.0).astype(dtype)
-    rest = np.ascontiguousarray(mesh.nodes.T).astype(dtype)
-    for displacement in (0 * rest, rest * np.array([[0.05], [0.05], [0.05]], dtype=dtype)):
-        tissue.linearise(displacement)
-        exact = tissue.tangent_product(change)
-        tissue.linearise(displacement, positive=True)
-        error = abs(tissue.tangent_product(change) - exact).max()
-        assert error < 20 * np.finfo(dtype).eps * abs(exact).max()
+    tissue.linearise(random_field(size, seed, mesh))
+    exact = tangent_matrix(tissue, len(mesh.nodes))
+    assert abs(exact - exact.T).max() < 1e-13 * abs(exact).max()
 
 
 @BOTH
@@ -292,7 +275,7 @@ def test_scikit_fem_has_the_same_forces(ratio):
         cofactor = volume * transpose(inv(deformation))
         missing = np.maximum(0.25 - volume, 0.0)  # crowded below a quarter of the volume
         crowding = -(missing**2) * (2 * volume + 0.25) / (0.75 * volume**2)
-        pressure = bulk * (volume - 1) + shear * crowding
+        pressure = bulk * (volume - 1) + 5 * shear * crowding
         return ddot(shear * deformation + (pressure - shear) * cofactor, grad(v))
 
     basis = Basis(

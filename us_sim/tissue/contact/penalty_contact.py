@@ -39,6 +39,9 @@ _SKIRT = 0.25
 let go. Pressed down it moves sideways; let go at once, it would come up and get under the probe
 again."""
 
+_FORWARD = 0.1
+"""Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
+
 
 class PenaltyContact:
     """Gaps between C surface nodes and the probe, and the forces that these raise.
@@ -87,8 +90,9 @@ class PenaltyContact:
         as a node slides, though the push is not along the surface's normal, and such a force has no
         energy. With the planes fixed until the next aim it has one.
         """
-        margin = np.where(self.push > 0.0, _SKIRT * self._spacing, 0.0)
         before = self.normal
+        by_face = (self.push > 0.0) & (before @ pose.rotation[:, 2] > _FORWARD)
+        margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
         gap, self.normal = push_out(
             self._collider, pose, positions, self._spacing, margin, flanks=True
         )
@@ -97,6 +101,20 @@ class PenaltyContact:
         self._pose = pose
         self._height = np.einsum("ij,ij->i", positions, self.normal) - gap if self.forward else None
         self._measure(gap)
+
+    def follow(self, positions: NDArray[np.float64]) -> float:
+        """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.
+
+        Returns:
+            m, the largest change of a pushed node's gap.
+        """
+        if self._height is None or self._pose is None:
+            return 0.0
+        pushed, before = self.push > 0.0, self.gap
+        self.aim(self._pose, positions)
+        pushed |= self.push > 0.0
+        with np.errstate(invalid="ignore"):
+            return float(np.abs(self.gap - before)[pushed].max(initial=0.0))
 
     def look(self, positions: NDArray[np.float64]) -> None:
         """Measure gaps, normals and pushes at other positions (C, 3) m."""

@@ -71,7 +71,8 @@ def push_out(
         points: (N, 3) m.
         spacing: m, between neighbouring points.
         skirt: (N,) m, how far beside the probe each point still counts as under its rim, for a
-            probe that pushes along +z only; zero by default.
+            probe that pushes along +z only, and how much nearer a flank than the front it may be
+            before the flank pushes it; zero by default.
         flanks: whether a probe that pushes along +z only also pushes aside, square to its flanks,
             what is nearer to leaving it there, and what is beside it. Without, whatever comes in
             from the side is thrown before the face at once, however deep that is.
@@ -184,8 +185,8 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _or_aside(box, gap, nx, ny, nz, x, y, z):
-    """A forward push, or the one of a flank where that moves the point less."""
+def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
+    """A forward push, or the one of a flank where that moves the point less, by the skirt (m)."""
     sx = 1.0 if x >= 0 else -1.0
     sy = 1.0 if y >= 0 else -1.0
     ox = max(abs(x) - box[0], 0.0)
@@ -200,7 +201,7 @@ def _or_aside(box, gap, nx, ny, nz, x, y, z):
         out, ex, ey = abs(x) - box[0] - rounding, sx, 0.0
     else:
         out, ex, ey = abs(y) - box[1] - rounding, 0.0, sy
-    if gap < math.inf and gap >= out:
+    if gap < math.inf and gap >= out - skirt:
         return gap, nx, ny, nz
     inner, _, _, slope = pushing_gap(box, True, 0.0, x - sx * ox, y - sy * oy, z)
     if inner + rounding * slope >= 0.0:  # before the front of the core
@@ -221,7 +222,7 @@ def _pushing_gaps(box, forward, flanks, rotation, origin, points, skirt, gap, no
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         if forward and flanks:
-            g, nx, ny, nz = _or_aside(box, g, nx, ny, nz, x, y, z)
+            g, nx, ny, nz = _or_aside(box, skirt[i], g, nx, ny, nz, x, y, z)
         gap[i] = g
         normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
         normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz

@@ -172,7 +172,7 @@ class FemNonlinear(TissueSolver):
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
         # Where they did not balance, pushes are still those of being hit.
-        shifted = newton.augment() if self._balanced else 0.0
+        shifted = newton.augment() if self._balanced else np.inf
         start = self._predicted(pose) if moved else None
         newton.may_factor = not moved or self._small
         left, stuck, actions = settings.most_iterations, False, []
@@ -190,7 +190,7 @@ class FemNonlinear(TissueSolver):
                     )
                 break
             start = None
-        self._balanced = newton.imbalance <= settings.frame_tolerance * newton.load
+        self._balanced = newton.imbalance <= settings.frame_tolerance * self._reference()
         if stuck:
             actions.append(f"no step led any further: {self._obstacle()}")
         self._settled = stuck

@@ -151,7 +151,8 @@ class Newton:
 
     def augment(self) -> float:
         """Push the tissue out of the probe further; returns by how much at most, m."""
-        change = self.contact.augment(_AUGMENTED)
+        change = self.contact.follow(self.surface)
+        change = max(change, self.contact.augment(_AUGMENTED))
         self._weigh()
         return change
 
