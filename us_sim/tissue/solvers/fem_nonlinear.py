@@ -158,12 +158,12 @@ class FemNonlinear(TissueSolver):
         self._aimed: Pose | None = None  # the pose that the tissue is at or on its way to
         self._balanced = False  # whether the last frame's forces were
         self._inverted = 0  # frames in a row that ended inside out
-        self._upright = self._newton.displacement
         if state.displacement.any():
-            self._newton.put(np.ascontiguousarray(state.displacement.T))
-            if not self._newton.tissue.smallest_volume_ratio(self._newton.displacement) > 0.0:
-                # The way out of it may end in another minimum, of tissue folded over.
-                self._newton.rest()
+            displacement = np.ascontiguousarray(state.displacement.T)
+            # The way out of tissue inside out may end in a minimum where it is folded over.
+            if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
+                self._newton.put(displacement)
+        self._upright = self._newton.displacement
 
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
@@ -251,7 +251,7 @@ class FemNonlinear(TissueSolver):
             actions.append("still inside out, so the last upright state is shown")
             newton.put(self._upright)
         self._heaviest = max(self._heaviest, newton.load)
-        reference = self._reference()
+        reference = self._reference() or newton.imbalance
         residual = newton.imbalance / reference if reference else 0.0
         sunk = -float(contact.gap.min())
         if sunk > _SINKS:

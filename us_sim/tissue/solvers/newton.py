@@ -100,7 +100,7 @@ class Newton:
 
     def __init__(self, model: TissueModel) -> None:
         self._model = model
-        self._factored: FactoredStiffness | None = None  # made where it is needed
+        self._factored: FactoredStiffness | None = None  # made where it is first needed
         #: Whether a step may take the time to factor the stiffness.
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
@@ -135,6 +135,7 @@ class Newton:
         self.contact.clear()
         self._damping = 0.0
         self.patience = _LEAST_PATIENCE  # iterations that the next step may take
+        self._factors = False  # whether factors have been needed since
         self._weigh()
 
     @property
@@ -199,8 +200,8 @@ class Newton:
             self.patience = _LEAST_PATIENCE
         elif self.used >= iterations:
             self.patience *= 2
-            if self.patience > _MOST_PATIENCE and self.may_factor and self._factored is None:
-                self._factored = FactoredStiffness(self._model)
+            if self.patience > _MOST_PATIENCE and self.may_factor:
+                self._factors = True
         if length < 1.0 or curved:
             self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
         else:
@@ -264,7 +265,9 @@ class Newton:
             active = np.flatnonzero(slope > 0.0)
             springs = nodes[active], normal[active], slope[active]
             preconditioner: Preconditioner = self._two_level
-            if self._factored is not None and self.may_factor:
+            if self._factors and self.may_factor:
+                if self._factored is None:
+                    self._factored = FactoredStiffness(self._model)
                 self._factored.prepare(self.displacement, *springs)
                 preconditioner = self._factored
             else:
