@@ -172,7 +172,9 @@ class FemNonlinear(TissueSolver):
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
         # Where they did not balance, pushes are still those of being hit.
-        shifted = newton.augment() if self._balanced else np.inf
+        shifted = np.inf
+        if self._balanced:
+            shifted = newton.augment() if moved else newton.follow()
         start = self._predicted(pose) if moved else None
         newton.may_factor = not moved or self._small
         left, stuck, actions = settings.most_iterations, False, []

@@ -151,10 +151,14 @@ class Newton:
 
     def augment(self) -> float:
         """Push the tissue out of the probe further; returns by how much at most, m."""
-        change = self.contact.follow(self.surface)
-        change = max(change, self.contact.augment(_AUGMENTED))
+        change = self.contact.augment(_AUGMENTED)
         self._weigh()
         return change
+
+    def follow(self) -> float:
+        """As `augment`, and fix the planes of contact where the nodes have come to be."""
+        change = self.contact.follow(self.surface)
+        return max(change, self.augment())
 
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
