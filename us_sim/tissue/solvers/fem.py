@@ -34,6 +34,7 @@ from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffnes
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.linear_algebra.dense_fields import DenseFields
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
@@ -108,9 +109,11 @@ class Fem(TissueSolver):
         else:
             coefficient = settings.friction if settings.contact == "coulomb" else math.inf
             self._contact = FrictionalContact(*surface, coefficient)
-        imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
+        dense = isinstance(self._compliance.fields, DenseFields)
+        imprecise = dense and self._compliance.rounding > _ROUNDING
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
-        self._displacement = np.zeros_like(model.mesh.nodes)
+        # Compiles, too, what a frame calls.
+        self._displacement = self._compliance.field(np.zeros((len(self._reached), 3)))
         super().__init__(model, settings, progress)
 
     @property
