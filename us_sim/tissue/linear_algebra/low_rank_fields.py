@@ -44,6 +44,10 @@ _GAIN = 0.75
 """Two patches are joined if together they need this many vectors over those one by one, or fewer:
 a block next to one of them that is not loaded need not be read."""
 
+_TILE = 64
+"""Numbers of a vector beside each other, those of the next one after them: read in line, and added
+up in registers."""
+
 _LARGEST = 32767  # 16-bit integer
 
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
@@ -64,7 +68,7 @@ class LowRankFields:
     patch: NDArray[np.int64]  # (P,), whose forces
     weights: NDArray[np.int64]  # (P, 2), first and last of the weights of all patches
     place: NDArray[np.int64]  # (P,), where in the left vectors it begins
-    left: NDArray[np.int16]  # of each product, (rank, 3, nodes of the block)
+    left: NDArray[np.int16]  # of each product, (tiles of 3 nodes of the block, rank, _TILE)
     order: NDArray[np.int32]  # (S,), nodes with forces, patches together
     patches: NDArray[np.int64]  # (Q, 2), first and last in the order; patches overlap
     columns: NDArray[np.int64]  # (Q + 1,), where in the weights those of each patch begin
@@ -220,12 +224,14 @@ class _Compression:
         last[by_patch] = np.cumsum(ranks[by_patch])
         columns = _starts(np.bincount(patch, ranks, len(patches)))
         rows = _starts(3 * (patches[:, 1] - patches[:, 0]) * np.diff(columns))
-        place = _starts([product.left.size for product in products])
+        place = _starts([_padded(len(p.left)) * len(p.right) for p in products])
         left, right = np.empty(place[-1], np.int16), np.empty(rows[-1], np.float32)
         for p, product in enumerate(products):
             scale = np.abs(product.left).max(axis=0) / _LARGEST
-            rounded = np.rint(product.left / scale).reshape(-1, 3, len(scale))
-            left[place[p] : place[p + 1]] = rounded.transpose(2, 1, 0).ravel()
+            rounded = np.zeros((_padded(len(product.left)), len(scale)))
+            np.rint(product.left / scale, out=rounded[: len(product.left)])
+            tiles = rounded.reshape(-1, _TILE, len(scale)).transpose(0, 2, 1)
+            left[place[p] : place[p + 1]] = tiles.ravel()
             largest = self._largest[3 * product.first : 3 * product.last, None]
             q = patch[p]
             whole = right[rows[q] : rows[q + 1]].reshape(len(largest), -1)
@@ -245,6 +251,11 @@ class _Compression:
             rows[:-1],
             right,
         )
+
+
+def _padded(count: int) -> int:
+    """The numbers in as many whole tiles as are needed."""
+    return -(-count // _TILE) * _TILE
 
 
 def _starts(lengths: ArrayLike) -> NDArray[np.int64]:
@@ -314,40 +325,43 @@ def _add_products(
     nodes, blocks, products, patch, limits, place, left, weights, loaded, displacement
 ):
     """Adds to displacement (N, 3) the weighted vectors of loaded patches."""
-    moved = np.empty(3 * _BLOCK, np.float32)
+    moved = np.empty(3 * _BLOCK + _TILE, np.float32)
     for b in range(len(blocks) - 1):
-        count = blocks[b + 1] - blocks[b]
         moved[:] = 0.0
+        size = -(-3 * (blocks[b + 1] - blocks[b]) // _TILE) * _TILE
         for p in range(products[b], products[b + 1]):
             if loaded[patch[p]]:
                 first, last = limits[p]
-                end = place[p] + 3 * count * (last - first)
-                _add_vectors(left[place[p] : end], weights[first:last], moved[: 3 * count])
-        for i in range(count):
+                vectors = left[place[p] : place[p] + (last - first) * size]
+                _add_vectors(vectors, weights[first:last], moved[:size])
+        for i in range(blocks[b], blocks[b + 1]):
             for axis in range(3):
-                displacement[nodes[blocks[b] + i], axis] += moved[axis * count + i]
+                displacement[nodes[i], axis] += moved[3 * (i - blocks[b]) + axis]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _add_vectors(vectors, weight, moved):
-    """Adds the weighted vectors (R, n) to moved (n,)."""
-    n = len(moved)
+    """Adds the weighted vectors (tiles of n, R, _TILE) to moved (n,)."""
     four = len(weight) // 4 * 4
-    for r in range(0, four, 4):
-        a = vectors[r * n : (r + 1) * n]
-        b = vectors[(r + 1) * n : (r + 2) * n]
-        c = vectors[(r + 2) * n : (r + 3) * n]
-        d = vectors[(r + 3) * n : (r + 4) * n]
-        p, q, s, t = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
-        for i in range(n):
-            moved[i] += (
-                p * np.float32(a[i])
-                + q * np.float32(b[i])
-                + s * np.float32(c[i])
-                + t * np.float32(d[i])
-            )
-    for r in range(four, len(weight)):
-        a = vectors[r * n : (r + 1) * n]
-        p = weight[r]
-        for i in range(n):
-            moved[i] += p * np.float32(a[i])
+    for tile in range(len(moved) // _TILE):
+        sums = moved[tile * _TILE : (tile + 1) * _TILE]
+        begin = tile * len(weight) * _TILE
+        for r in range(0, four, 4):
+            here = begin + r * _TILE
+            a = vectors[here : here + _TILE]
+            b = vectors[here + _TILE : here + 2 * _TILE]
+            c = vectors[here + 2 * _TILE : here + 3 * _TILE]
+            d = vectors[here + 3 * _TILE : here + 4 * _TILE]
+            p, q, s, t = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
+            for i in range(_TILE):
+                sums[i] += (
+                    p * np.float32(a[i])
+                    + q * np.float32(b[i])
+                    + s * np.float32(c[i])
+                    + t * np.float32(d[i])
+                )
+        for r in range(four, len(weight)):
+            a = vectors[begin + r * _TILE : begin + (r + 1) * _TILE]
+            p = weight[r]
+            for i in range(_TILE):
+                sums[i] += p * np.float32(a[i])
