@@ -15,7 +15,7 @@ from us_sim.tissue.contact.friction import FrictionalContact
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import compliance as compliance_module
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
@@ -183,6 +183,22 @@ def test_compressed_fields_of_large_meshes_agree_with_a_sparse_solve(monkeypatch
     pushed = np.isin(np.arange(len(force)), deformation.contact_nodes)
     unbalanced = np.linalg.norm(force[~pushed & ~model.fixed])
     assert 0.2 < unbalanced / np.linalg.norm(force[pushed]) / deformation.residual < 3
+
+
+@pytest.mark.parametrize(("bone", "ratio"), [(1e7, 0.45), (1e4, 0.4999)])
+def test_compression_is_as_exact_beside_bone_and_when_incompressible(monkeypatch, bone, ratio):
+    mesh = block_mesh((15, 9, 9))
+    centre = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    within = (np.abs(centre[:, 2] - 0.04) < 0.02) & (np.abs(centre[:, 0]) < 0.03)
+    count = len(mesh.tetrahedra)
+    materials = TissueMaterials(
+        np.where(within, bone, 1e4), np.full(count, ratio), np.full(count, 1000.0)
+    )
+    model = block((15, 9, 9), materials=materials)
+    full = Fem(model).deform(PRESSED).nodes - model.mesh.nodes
+    monkeypatch.setattr(compliance_module, "_COMPRESSED", 0)
+    compressed = Fem(model).deform(PRESSED).nodes - model.mesh.nodes
+    assert np.linalg.norm(compressed - full, axis=1).max() <= 5e-5 * abs(full).max()
 
 
 def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):

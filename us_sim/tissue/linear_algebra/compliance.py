@@ -68,7 +68,7 @@ class SurfaceCompliance:
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
     fields: DenseFields | LowRankFields  # of all nodes that are not fixed
     count: int  # N, nodes of the mesh
-    rounding: float  # unbalanced force in a field due to rounding, over the force
+    rounding: float  # unbalanced force in a field by rounding or compression, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; those without are not read."""

@@ -3,7 +3,9 @@
 The stiffness is constant. So the displacement field of a unit force on each node that the probe can
 reach is computed once (`us_sim.tissue.linear_algebra.compliance`). A frame finds the forces on
 these nodes, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and
-adds up their fields.
+adds up their fields. Those of a large mesh are compressed
+(`us_sim.tissue.linear_algebra.low_rank_fields`): its nodes are then within some 1e-5 of the largest
+displacement, and only the surface is solved to rounding.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem import Fem
@@ -43,7 +45,7 @@ __all__ = ["CONTACTS", "Fem", "FemSettings"]
 CONTACTS = ("frictionless", "coulomb", "sticking")  # laws of friction between probe and surface
 
 _ROUNDING = 1e-5
-"""Rounding error of the fields, over the force, above which it is measured anew in every frame."""
+"""Rounding error of full fields, over the force, above which it is measured in every frame."""
 
 _EXTENSIONS = 10
 """Times that nodes overlooked at first, being far from the probe, may be added in a frame."""
@@ -71,10 +73,10 @@ class FemSettings(SolverSettings):
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
-    The residual is the rounding error of the stored fields, together with the forces along the
-    surface of a curved probe (without friction) or the last change of the forces (with friction).
-    The rounding error is the one measured when the fields were made, unless that is large, as with
-    moduli far apart: then it is computed in every frame.
+    The residual is the error of the stored fields, by rounding or compression, together with the
+    forces along the surface of a curved probe (without friction) or the last change of the forces
+    (with friction). That error is the one measured when the fields were made, unless it is large
+    though they are not compressed, as with moduli far apart: then it is computed in every frame.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
