@@ -82,5 +82,5 @@ def test_what_is_far_takes_little_place(points):
     made = LowRankFields.made(
         far, nodes, far[:SURFACE], lambda chosen: kelvin(far, chosen), TOLERANCE
     )
-    assert made.left.size + made.right.size < 0.1 * 9 * SURFACE * len(nodes)
+    assert made.minor.size + made.major.size + made.right.size < 0.1 * 9 * SURFACE * len(nodes)
     assert (np.diff(made.patches, axis=1) == SURFACE).all()  # one patch for each block

@@ -209,7 +209,7 @@ def _pack(made: SurfaceCompliance) -> tuple[dict[str, NDArray], dict[str, Any]]:
 
 
 def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceCompliance:
-    kind = LowRankFields if "left" in arrays else DenseFields
+    kind = LowRankFields if "major" in arrays else DenseFields
     return SurfaceCompliance(
         arrays["surface"],
         arrays["matrix"],

@@ -7,7 +7,8 @@ large as pays: two halves are joined where their forces together need clearly fe
 by one, which is far from the block; next to it they stay small, of nearly full rank. Nothing is
 assumed about the mesh or its materials.
 
-The vectors of the block are 16-bit integers with a scale each, as reading them is most of the time.
+Reading the vectors of the blocks is most of the time. So they are integers with a scale each: of 16
+bits, and the many with small singular values of 8 bits.
 
 >>> import numpy as np
 >>> from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
@@ -48,7 +49,9 @@ _TILE = 64
 """Numbers of a vector beside each other, those of the next one after them: read in line, and added
 up in registers."""
 
-_LARGEST = 32767  # 16-bit integer
+_MINOR = 100
+"""Singular values up to this many times the tolerance are of vectors of 8 bits, whose rounding is
+then below the tolerance."""
 
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
@@ -66,9 +69,10 @@ class LowRankFields:
     blocks: NDArray[np.int64]  # (B + 1,), where in the nodes each block begins
     products: NDArray[np.int64]  # (B + 1,), where in the three below those of each block begin
     patch: NDArray[np.int64]  # (P,), whose forces
-    weights: NDArray[np.int64]  # (P, 2), first and last of the weights of all patches
-    place: NDArray[np.int64]  # (P,), where in the left vectors it begins
-    left: NDArray[np.int16]  # of each product, (tiles of 3 nodes of the block, rank, _TILE)
+    weights: NDArray[np.int64]  # (P, 3), among all patches' its first, first major, and last one
+    place: NDArray[np.int64]  # (P, 2), where in the minor and the major left vectors it begins
+    minor: NDArray[np.int8]  # of each product, (tiles of 3 nodes of the block, vectors, _TILE)
+    major: NDArray[np.int16]  # likewise
     order: NDArray[np.int32]  # (S,), nodes with forces, patches together
     patches: NDArray[np.int64]  # (Q, 2), first and last in the order; patches overlap
     columns: NDArray[np.int64]  # (Q + 1,), where in the weights those of each patch begin
@@ -116,7 +120,8 @@ class LowRankFields:
             self.patch,
             self.weights,
             self.place,
-            self.left,
+            self.minor,
+            self.major,
             weights,
             loaded,
             displacement,
@@ -129,8 +134,12 @@ class _Product:
 
     first: int
     last: int
-    left: NDArray[np.float32]  # (3 nodes of the block, rank)
+    left: NDArray[np.float32]  # (3 nodes of the block, rank), of ascending singular values
     right: NDArray[np.float32]  # (rank, 3 nodes of the patch), orthonormal rows
+
+    def minors(self, bound: float) -> int:
+        """How many singular values are below a bound."""
+        return int((np.linalg.norm(self.left, axis=0) < bound).sum())
 
 
 class _Compression:
@@ -224,33 +233,46 @@ class _Compression:
         last[by_patch] = np.cumsum(ranks[by_patch])
         columns = _starts(np.bincount(patch, ranks, len(patches)))
         rows = _starts(3 * (patches[:, 1] - patches[:, 0]) * np.diff(columns))
-        place = _starts([_padded(len(p.left)) * len(p.right) for p in products])
-        left, right = np.empty(place[-1], np.int16), np.empty(rows[-1], np.float32)
+        minors = np.array([p.minors(_MINOR * self._tolerance) for p in products], np.int64)
+        sizes = np.array([_padded(len(p.left)) for p in products], np.int64)
+        place = np.column_stack([_starts(sizes * minors), _starts(sizes * (ranks - minors))])
+        minor, major = np.empty(place[-1, 0], np.int8), np.empty(place[-1, 1], np.int16)
+        right = np.empty(rows[-1], np.float32)
         for p, product in enumerate(products):
-            scale = np.abs(product.left).max(axis=0) / _LARGEST
-            rounded = np.zeros((_padded(len(product.left)), len(scale)))
-            np.rint(product.left / scale, out=rounded[: len(product.left)])
-            tiles = rounded.reshape(-1, _TILE, len(scale)).transpose(0, 2, 1)
-            left[place[p] : place[p + 1]] = tiles.ravel()
+            here, end = place[p : p + 2]
+            one, one_scale = _tiles(product.left[:, : minors[p]], np.int8)
+            two, two_scale = _tiles(product.left[:, minors[p] :], np.int16)
+            minor[here[0] : end[0]], major[here[1] : end[1]] = one, two
+            scale = np.append(one_scale, two_scale)
             largest = self._largest[3 * product.first : 3 * product.last, None]
             q = patch[p]
             whole = right[rows[q] : rows[q + 1]].reshape(len(largest), -1)
-            end = last[p] - columns[q]
-            whole[:, end - ranks[p] : end] = product.right.T * scale * largest
+            after = last[p] - columns[q]
+            whole[:, after - ranks[p] : after] = product.right.T * scale * largest
         return LowRankFields(
             self._nodes.astype(np.int32),
             self._blocks,
             _starts([len(done) for done in self._done]),
             patch.astype(np.int64),
-            np.column_stack([last - ranks, last]),
+            np.column_stack([last - ranks, last - ranks + minors, last]),
             place[:-1],
-            left,
+            minor,
+            major,
             self._order.astype(np.int32),
             patches,
             columns,
             rows[:-1],
             right,
         )
+
+
+def _tiles(vectors: NDArray[np.float32], kind: type) -> tuple[NDArray, NDArray[np.float32]]:
+    """Columns as integers (tiles, columns, _TILE), flat, and the scale of each."""
+    scale = np.abs(vectors).max(axis=0) / np.iinfo(kind).max
+    rounded = np.zeros((_padded(len(vectors)), len(scale)))
+    np.rint(vectors / scale, out=rounded[: len(vectors)])
+    tiles = rounded.reshape(len(rounded) // _TILE, _TILE, len(scale)).transpose(0, 2, 1)
+    return tiles.astype(kind).ravel(), scale
 
 
 def _padded(count: int) -> int:
@@ -322,7 +344,7 @@ def _weights(patches, columns, rows, right, forces):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_products(
-    nodes, blocks, products, patch, limits, place, left, weights, loaded, displacement
+    nodes, blocks, products, patch, limits, place, minor, major, weights, loaded, displacement
 ):
     """Adds to displacement (N, 3) the weighted vectors of loaded patches."""
     moved = np.empty(3 * _BLOCK + _TILE, np.float32)
@@ -331,9 +353,11 @@ def _add_products(
         size = -(-3 * (blocks[b + 1] - blocks[b]) // _TILE) * _TILE
         for p in range(products[b], products[b + 1]):
             if loaded[patch[p]]:
-                first, last = limits[p]
-                vectors = left[place[p] : place[p] + (last - first) * size]
-                _add_vectors(vectors, weights[first:last], moved[:size])
+                first, middle, last = limits[p]
+                vectors = minor[place[p, 0] : place[p, 0] + (middle - first) * size]
+                _add_vectors(vectors, weights[first:middle], moved[:size])
+                others = major[place[p, 1] : place[p, 1] + (last - middle) * size]
+                _add_vectors(others, weights[middle:last], moved[:size])
         for i in range(blocks[b], blocks[b + 1]):
             for axis in range(3):
                 displacement[nodes[i], axis] += moved[3 * (i - blocks[b]) + axis]
