@@ -64,7 +64,7 @@ _LEAST_PATIENCE = 12
 """Iterations of the first step: solved further, a step after a large change overshoots. Those after
 it may take twice as many as long as steps need not be cut."""
 
-_MOST_PATIENCE = 50
+_MOST_PATIENCE = 100
 """Iterations beyond which a factor of the stiffness takes less time."""
 
 _BACKTRACKS = 8
@@ -178,6 +178,12 @@ class Newton:
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
         self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
+
+    def rehearse(self) -> None:
+        """Take a step with a factor, and one with damping, as only some frames do."""
+        self._factored, self.may_factor, self._damping = FactoredStiffness(self._model), True, 0.1
+        self.step(2)
+        self._factored, self.may_factor, self._damping = None, False, 0.0
 
     @property
     def unbalanced(self) -> NDArray[np.float64]:
