@@ -66,7 +66,7 @@ def energy(model, nodes):
 
 def checker(model):
     return IndependentResidual(
-        model, lambda u: neo_hookean_forces(model.mesh, model.materials, u), 1e-9
+        model, lambda u: neo_hookean_forces(model.mesh, model.materials, u), 1e-9, flanks=True
     )
 
 
@@ -160,7 +160,7 @@ def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(rati
     model = block((20, 10, 10), materials=made_of(ratio, (20, 10, 10)))
     solver, exact = (
         FemNonlinear(model),
-        FemNonlinear(model, FemNonlinearSettings(iterations=200, most_iterations=400)),
+        FemNonlinear(model, FemNonlinearSettings(frame_tolerance=1e-5, most_iterations=2000)),
     )
     for frame in range(1, 11):
         solver.deform(at(z=0.0025 * frame))
@@ -251,7 +251,10 @@ def test_nothing_turns_inside_out_whatever_the_probe_does(collider, ratio):
                 assert np.isfinite(deformation.nodes).all()
                 assert smallest_volume_ratio(model, deformation.nodes) > 0
                 checked, rounding = check.check(deformation, pose)
-                assert checked == pytest.approx(deformation.residual, rel=0.5, abs=1e-5 + rounding)
+                found = deformation.residual
+                # What pushes do not balance may raise or lower what is pushed by as much.
+                if found < 0.5:
+                    assert checked < 1.01 * found / (1 - found) + 1e-5 + rounding
         released = solver.deform(None)
         np.testing.assert_array_equal(released.nodes, model.mesh.nodes)
 
@@ -353,14 +356,15 @@ def test_everything_fixed_stays():
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("iterations", 0),
-        ("iterations", 2.5),
         ("most_iterations", 0),
         ("most_iterations", True),
         ("tolerance", 0.0),
         ("tolerance", float("nan")),
         ("frame_tolerance", 1.5),
         ("frame_tolerance", "0.1 mm"),
+        ("frame_budget", 0.0),
+        ("frame_budget", "0.1 ms"),
+        ("frame_budget", 11.0),
     ],
 )
 def test_settings_out_of_range_are_refused(setting, value):

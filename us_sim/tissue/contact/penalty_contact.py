@@ -43,6 +43,12 @@ _FORWARD = 0.99
 """Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
 
 
+_FOLLOWED = 12
+"""How often at one pose the planes are fixed anew where the nodes have moved to. It usually takes a
+few; at the rim a node can go to and fro between the front and a flank, or between being held and
+let go, without end, and then stays where it is."""
+
+
 class PenaltyContact:
     """Gaps between C surface nodes and the probe, and the forces that these raise.
 
@@ -77,6 +83,7 @@ class PenaltyContact:
         """No probe is near."""
         count = len(self._stiffness)
         self._pose: Pose | None = None
+        self._followed = 0
         self._height: NDArray[np.float64] | None = None  # (C,) m along the normal, of the surface
         self._shift = np.zeros(count)  # (C,) m, how far before the probe the springs end
         self.normal = np.zeros((count, 3))  # (C, 3), direction in which the probe pushes
@@ -90,6 +97,10 @@ class PenaltyContact:
         as a node slides, though the push is not along the surface's normal, and such a force has no
         energy. With the planes fixed until the next aim it has one.
         """
+        self._followed = 0
+        self._fix_planes(pose, positions)
+
+    def _fix_planes(self, pose: Pose, positions: NDArray[np.float64]) -> None:
         before = self.normal
         by_face = (self.push > 0.0) & (before @ pose.rotation[:, 2] > _FORWARD)
         margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
@@ -106,15 +117,17 @@ class PenaltyContact:
         """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.
 
         Returns:
-            m, the largest change of a pushed node's gap.
+            m, the largest change of a pushed node's gap, or of its normal times the spacing.
         """
-        if self._height is None or self._pose is None:
+        if self._height is None or self._pose is None or self._followed == _FOLLOWED:
             return 0.0
-        pushed, before = self.push > 0.0, self.gap
-        self.aim(self._pose, positions)
+        self._followed += 1
+        pushed, gap, normal = self.push > 0.0, self.gap, self.normal
+        self._fix_planes(self._pose, positions)
         pushed |= self.push > 0.0
-        with np.errstate(invalid="ignore"):
-            return float(np.abs(self.gap - before)[pushed].max(initial=0.0))
+        closer = np.abs(self.gap[pushed] - gap[pushed]).max(initial=0.0)
+        turned = np.abs(self.normal[pushed] - normal[pushed]).max(initial=0.0)
+        return float(max(closer, self._spacing * turned))
 
     def look(self, positions: NDArray[np.float64]) -> None:
         """Measure gaps, normals and pushes at other positions (C, 3) m."""

@@ -124,8 +124,9 @@ class FemNonlinear(TissueSolver):
         super().__init__(model, settings, progress)
         self._own = settings
         self._surface = model.movable_contact_nodes
-        self._sunk = _SUNK * settings.tolerance * model.contact_spacing
-        self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
+        smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
+        self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
+        self._touching = _TOUCHING * smallest
         self._newton = Newton(model)
         self._upright = self._newton.displacement  # (3, N) m, the last that was
         self._small = int((~model.fixed).sum()) <= _SMALL
@@ -161,9 +162,12 @@ class FemNonlinear(TissueSolver):
         self._still = 0  # frames in a row with the probe at rest
         self._balanced = False  # whether the last frame's forces were
         self._inverted = 0  # frames in a row that ended inside out
-        self._upright = self._newton.displacement
         if state.displacement.any():
-            self._newton.put(np.ascontiguousarray(state.displacement.T))
+            displacement = np.ascontiguousarray(state.displacement.T)
+            # The way out of tissue inside out may end in a minimum where it is folded over.
+            if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
+                self._newton.put(displacement)
+        self._upright = self._newton.displacement
 
     def _rehearse(self) -> None:
         self._newton.rehearse()
@@ -258,7 +262,7 @@ class FemNonlinear(TissueSolver):
             actions.append("still inside out, so the last upright state is shown")
             newton.put(self._upright)
         self._heaviest = max(self._heaviest, newton.load)
-        reference = self._reference()
+        reference = self._reference() or newton.imbalance
         residual = newton.imbalance / reference if reference else 0.0
         sunk = -float(contact.gap.min())
         if sunk > _SINKS:

@@ -100,7 +100,7 @@ class Newton:
 
     def __init__(self, model: TissueModel) -> None:
         self._model = model
-        self._factored: FactoredStiffness | None = None  # made where it is needed
+        self._factored: FactoredStiffness | None = None  # made where it is first needed
         #: Whether a step may take the time to factor the stiffness.
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
@@ -135,6 +135,7 @@ class Newton:
         self.contact.clear()
         self._damping = 0.0
         self.patience = _LEAST_PATIENCE  # iterations that the next step may take
+        self._factors = False  # whether factors have been needed since
         self._weigh()
 
     @property
@@ -157,8 +158,10 @@ class Newton:
 
     def follow(self) -> float:
         """As `augment`, and fix the planes of contact where the nodes have come to be."""
-        change = self.contact.follow(self.surface)
-        return max(change, self.augment())
+        change = self.contact.augment(_AUGMENTED)
+        change = max(change, self.contact.follow(self.surface))
+        self._weigh()
+        return change
 
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
@@ -180,10 +183,10 @@ class Newton:
         self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
 
     def rehearse(self) -> None:
-        """Take a step with a factor, and one with damping, as only some frames do."""
-        self._factored, self.may_factor, self._damping = FactoredStiffness(self._model), True, 0.1
+        """Take a step with a factor and with damping, as only some frames do."""
+        self._factors, self.may_factor, self._damping = True, True, _DAMPING
         self.step(2)
-        self._factored, self.may_factor, self._damping = None, False, 0.0
+        self.rest()
 
     @property
     def unbalanced(self) -> NDArray[np.float64]:
@@ -209,8 +212,8 @@ class Newton:
             self.patience = _LEAST_PATIENCE
         elif self.used >= iterations:
             self.patience *= 2
-            if self.patience > _MOST_PATIENCE and self.may_factor and self._factored is None:
-                self._factored = FactoredStiffness(self._model)
+            if self.patience > _MOST_PATIENCE and self.may_factor:
+                self._factors = True
         if length < 1.0 or curved:
             self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
         else:
@@ -274,7 +277,9 @@ class Newton:
             active = np.flatnonzero(slope > 0.0)
             springs = nodes[active], normal[active], slope[active]
             preconditioner: Preconditioner = self._two_level
-            if self._factored is not None and self.may_factor:
+            if self._factors and self.may_factor:
+                if self._factored is None:
+                    self._factored = FactoredStiffness(self._model)
                 self._factored.prepare(self.displacement, *springs)
                 preconditioner = self._factored
             else:
