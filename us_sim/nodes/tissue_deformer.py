@@ -32,8 +32,9 @@ __all__ = ["TissueDeformer", "main"]
 
 ALWAYS = Time()
 """The stamp of what does not change: zero, which tf takes as the latest."""
-GO_ON_S = 1 / 60
-"""Time without a pose after which an unfinished frame is gone on with."""
+GO_ON_S = 0.05
+"""Time without a pose after which an unfinished frame is gone on with. It is longer than a frame:
+an executor serves timers before messages."""
 VISIBLE_M = 5e-5
 """How far a node must have moved for the frame that was gone on with to be sent again."""
 

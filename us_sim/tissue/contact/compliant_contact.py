@@ -293,14 +293,14 @@ def _push(block, point, gap, normal, limit, first, active, forces):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def yielded(block, active, forces, displacement):
     """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
-    pushed = np.flatnonzero(active)
+    load = np.zeros(len(block))
+    for m in np.flatnonzero(active):
+        load[3 * m : 3 * m + 3] = forces[m]
     for i in range(len(block)):
         row = block[i]
         value = 0.0
-        for p in range(len(pushed)):
-            n = pushed[p]
-            for axis in range(3):
-                value += row[3 * n + axis] * forces[n, axis]
+        for j in range(len(load)):  # reading zeros in line is faster than skipping them
+            value += row[j] * load[j]
         displacement[i // 3, i % 3] = value
 
 

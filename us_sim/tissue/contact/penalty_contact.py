@@ -39,7 +39,7 @@ _SKIRT = 0.25
 let go. Pressed down it moves sideways; let go at once, it would come up and get under the probe
 again."""
 
-_FORWARD = 0.1
+_FORWARD = 0.99
 """Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
 
 

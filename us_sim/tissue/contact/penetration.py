@@ -38,6 +38,13 @@ _GRIP = 0.1
 cannot slip past it there, and are found in it even after a jump beyond the collider's thickness."""
 
 
+_STEEP = math.radians(60)
+"""Slope of the flank beside a probe that pushes along +z. A vertical one would sweep up before it
+the nodes that a real rim, round between them, glides over."""
+
+_SIN, _COS = math.sin(_STEEP), math.cos(_STEEP)
+
+
 def only_forward(collider: Collider, spacing: float) -> bool:
     """Whether the collider pushes with its face alone, not along the normals of its rounding.
 
@@ -186,7 +193,10 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
-    """A forward push, or the one of a flank where that moves the point less, by the skirt (m)."""
+    """A forward push, or that of a flank where it moves the point less, by the skirt (m) at least.
+
+    The flank is a plane that touches the rounding where this is ``_STEEP`` to the face.
+    """
     sx = 1.0 if x >= 0 else -1.0
     sy = 1.0 if y >= 0 else -1.0
     ox = max(abs(x) - box[0], 0.0)
@@ -195,18 +205,20 @@ def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
     rounding = box[3]
     if z + rounding + 2 * box[2] + _GRIP <= 0.0:
         return math.inf, 0.0, 0.0, 1.0  # behind the grip
+    inner, _, _, slope = pushing_gap(box, True, 0.0, x - sx * ox, y - sy * oy, z)
+    ahead = inner + rounding * slope
+    if ahead >= 0.0:  # before the front of the core
+        return gap, nx, ny, nz
     if beside > 0.0:
-        out, ex, ey = beside - rounding, sx * ox / beside, sy * oy / beside
+        side, ex, ey = beside, sx * ox / beside, sy * oy / beside
     elif box[0] - abs(x) < box[1] - abs(y):
-        out, ex, ey = abs(x) - box[0] - rounding, sx, 0.0
+        side, ex, ey = abs(x) - box[0], sx, 0.0
     else:
-        out, ex, ey = abs(y) - box[1] - rounding, 0.0, sy
+        side, ex, ey = abs(y) - box[1], 0.0, sy
+    out = _SIN * side + _COS * ahead - rounding
     if gap < math.inf and gap >= out - skirt:
         return gap, nx, ny, nz
-    inner, _, _, slope = pushing_gap(box, True, 0.0, x - sx * ox, y - sy * oy, z)
-    if inner + rounding * slope >= 0.0:  # before the front of the core
-        return gap, nx, ny, nz
-    return out, ex, ey, 0.0
+    return out, _SIN * ex, _SIN * ey, _COS
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

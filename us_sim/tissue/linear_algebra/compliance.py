@@ -15,25 +15,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.cache import Form, kept
 from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure, averaged_pressure
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.linear_algebra.condensation import Field, condense
+from us_sim.tissue.linear_algebra.dense_fields import DenseFields
+from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
+from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["SurfaceCompliance", "surface_compliance"]
 
-_VERSION = 3
+_VERSION = 4
 """Part of the cache's key: raise it when the bytes change."""
 
 _DOUBLE = 4_000_000
@@ -43,14 +47,17 @@ time."""
 _KEPT = 12_000_000
 """Numbers in the fields from which on they are cached, as making them takes a second."""
 
-_INTEGER = 400_000_000
-"""Numbers in the fields from which on they are 16-bit integers with a scale for each block of
-nodes, as reading them, and not the arithmetic, then takes the time."""
+_COMPRESSED = 100_000_000
+"""Numbers in the fields from which on they are compressed, and made in single precision."""
 
-_BLOCK = 1024  # nodes
+_TOLERANCE = 1e-4
+"""Singular values that compression leaves out, over the largest displacement by each force: a
+whole press is then off by about a tenth of that."""
 
-_SAMPLES = 24
-"""Number of forces by which the rounding error of the fields is measured."""
+_SAMPLES = 12
+"""Number of single forces, and of presses, by which the fields' rounding error is measured."""
+
+_PRESSED = 16  # nodes of the surface over those that such a press is on
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,30 +65,20 @@ class SurfaceCompliance:
     """Displacements per force at the S nodes that the probe can touch and move."""
 
     nodes: NDArray[np.int32]  # (S,), the model's movable contact nodes
-    free: NDArray[np.int32]  # (F,), nodes that are not fixed, neighbours together
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
-    fields: NDArray  # (3S, 3, F), m/N, what each force does to all free nodes; integers if scaled
-    scales: NDArray[np.float32]  # (3S, 3, blocks of F), m/N, of integers; else (0, 3, 0)
+    fields: DenseFields | LowRankFields  # of all nodes that are not fixed
     count: int  # N, nodes of the mesh
-    rounding: float  # unbalanced force in a field due to rounding, over the force
+    rounding: float  # unbalanced force in a field by rounding or compression, over the force
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
-        """Add what forces (S, 3) N do to displacement (3, N) m; rows without force are not read."""
-        self._add(forces, displacement.T)
+        """Add what forces (S, 3) N do to displacement (3, N) m; those without are not read."""
+        self.fields.add(forces.ravel(), displacement.T)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, what forces (S, 3) N do to every node."""
         displacement = np.zeros((self.count, 3))
-        self._add(forces, displacement)
+        self.fields.add(forces.ravel(), displacement)
         return displacement
-
-    def _add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
-        rows = np.flatnonzero(forces)
-        weights = forces.ravel()[rows]
-        if len(self.scales):
-            _add_scaled_rows(self.fields, self.scales, rows, weights, self.free, displacement)
-        else:
-            _add_rows(self.fields, rows, weights, self.free, displacement)
 
 
 def surface_compliance(
@@ -116,77 +113,77 @@ def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> 
         if progress is not None:
             progress(fraction, "compliance of the surface")
 
-    nodes = model.movable_contact_nodes
-    count = int((~model.fixed).sum())
+    nodes, points = model.movable_contact_nodes, model.mesh.nodes
+    free = np.flatnonzero(~model.fixed)
+    size = 9 * len(nodes) * len(free)
+    compressed = size >= _COMPRESSED
     system = averaged_pressure(model.mesh, model.materials)
-    size = 9 * len(nodes) * count
+    matrix = np.empty((3 * len(nodes), 3 * len(nodes)))
+    done = 0
     # Products of matrices this small take longer on several threads.
-    with threadpool_limits(1, user_api="blas"):
-        condensed = condense(
+    with threadpool_limits(1, user_api="blas"), _scratch(compressed) as file:
+        eliminated = eliminate(
             model.mesh,
             system,
             model.fixed,
             nodes,
-            np.float64 if size < _INTEGER else np.float32,
-            report=lambda done: show(0.6 * done),
+            np.float32 if compressed else np.float64,
+            lambda fraction: show(0.6 * fraction),
+            file,
         )
-        precision = np.float64 if size < _DOUBLE else np.float32
-        fields = np.empty((3 * len(nodes), 3, count), precision if size < _INTEGER else np.int16)
-        scaled = (len(fields), 3, -(-count // _BLOCK)) if size >= _INTEGER else (0, 3, 0)
-        scales = np.zeros(scaled, np.float32)
-        done = 0
-        order = []
-        for block, moved in _blocks(condensed.fields()):
-            place = slice(done, done + len(block))
-            if len(scales):
-                scale = np.maximum(np.abs(moved).max(axis=2), np.finfo(np.float32).tiny) / 32767
-                scales[:, :, done // _BLOCK] = scale
-                moved = np.rint(moved / scale[:, :, None])
-            fields[:, :, place] = moved
-            done += len(block)
-            order.append(block)
-            show(0.6 + 0.4 * done / count)
-    free = np.concatenate(order).astype(np.int32) if order else np.empty(0, np.int32)
-    made = SurfaceCompliance(
-        nodes, free, condensed.compliance, fields, scales, len(model.mesh.nodes), 0.0
-    )
-    return replace(made, rounding=_rounding(made, system, model.fixed))
+
+        def solve(chosen: NDArray[np.int64]) -> NDArray[np.floating]:
+            nonlocal done
+            moved = eliminated.fields(nodes[chosen])
+            columns = (3 * chosen[:, None] + np.arange(3)).ravel()
+            matrix[:, columns] = moved[nodes].reshape(len(matrix), -1)
+            done += len(chosen)
+            show(0.6 + 0.4 * done / len(nodes))
+            return moved
+
+        found: DenseFields | LowRankFields
+        if compressed:
+            found = LowRankFields.made(points, free, points[nodes], solve, _TOLERANCE)
+        else:
+            precision = np.float64 if size < _DOUBLE else np.float32
+            found = DenseFields.made(free, len(nodes), solve, precision)
+    matrix += matrix.T  # symmetric to the last digit
+    matrix /= 2
+    made = SurfaceCompliance(nodes, matrix, found, len(points), 0.0)
+    return replace(made, rounding=_rounding(made, points[nodes], system, model.fixed))
 
 
-def _blocks(parts: Iterator[Field]) -> Iterator[Field]:
-    """The fields of parts, in blocks of a fixed number of nodes B: (B,), (3S, 3, B) m/N."""
-    waiting: list[Field] = []
-    for part, rows in parts:
-        if len(part) == 0:
-            continue
-        waiting.append((part, rows.reshape(len(part), 3, -1).transpose(2, 1, 0)))
-        if sum(len(nodes) for nodes, _ in waiting) >= _BLOCK:
-            nodes = np.concatenate([nodes for nodes, _ in waiting])
-            moved = np.concatenate([moved for _, moved in waiting], axis=2)
-            whole = len(nodes) // _BLOCK * _BLOCK
-            for first in range(0, whole, _BLOCK):
-                yield nodes[first : first + _BLOCK], moved[:, :, first : first + _BLOCK]
-            waiting = [(nodes[whole:], moved[:, :, whole:])] if len(nodes) > whole else []
-    if waiting:
-        nodes = np.concatenate([nodes for nodes, _ in waiting])
-        yield nodes, np.concatenate([moved for _, moved in waiting], axis=2)
+def _scratch(needed: bool) -> AbstractContextManager[Any]:
+    """A file that vanishes when it is closed; None if it is not needed or there is no place."""
+    with contextlib.suppress(OSError):
+        if needed:
+            return tempfile.TemporaryFile(buffering=0)
+    return contextlib.nullcontext()
 
 
-def _rounding(made: SurfaceCompliance, system: AveragedPressure, fixed: NDArray[np.bool_]) -> float:
-    """The unbalanced force of single forces, in the median, or of all together, over their norm."""
+def _rounding(
+    made: SurfaceCompliance,
+    points: NDArray[np.float64],
+    system: AveragedPressure,
+    fixed: NDArray[np.bool_],
+) -> float:
+    """The unbalanced force over the norm of the forces: the median of single ones and of presses,
+    whichever is larger.
+    """
     random = np.random.Generator(np.random.PCG64(0))
-    loads = [np.zeros((len(made.nodes), 3)) for _ in range(min(_SAMPLES, 3 * len(made.nodes)))]
-    for load in loads:
-        load.flat[random.integers(load.size)] = 1.0
-    if loads:
-        loads += [np.tile(axis, (len(made.nodes), 1)) for axis in np.eye(3)]
-    found = []
-    for load in loads:
-        balance = system.forces(made.field(load))
-        balance[made.nodes] -= load
-        balance[fixed] = 0.0
-        found.append(float(np.linalg.norm(balance) / np.linalg.norm(load)))
-    return max(float(np.median(found[:-3])), *found[-3:]) if found else 0.0
+    medians = []
+    for count in (1, 1 + len(points) // _PRESSED):
+        found = []
+        for _ in range(min(_SAMPLES, 3 * len(points))):
+            distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
+            load = np.zeros_like(points)
+            load[np.argsort(distance)[:count]] = random.normal(size=3)
+            balance = system.forces(made.field(load))
+            balance[made.nodes] -= load
+            balance[fixed] = 0.0
+            found.append(float(np.linalg.norm(balance) / np.linalg.norm(load)))
+        medians.append(float(np.median(found)) if found else 0.0)
+    return max(medians)
 
 
 def _key(model: TissueModel) -> str:
@@ -206,88 +203,20 @@ def _key(model: TissueModel) -> str:
 
 
 def _pack(made: SurfaceCompliance) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    arrays: dict[str, NDArray] = {
-        "nodes": made.nodes,
-        "free": made.free,
-        "matrix": made.matrix,
-        "fields": made.fields,
-        "scales": made.scales,
-    }
-    return arrays, {"count": made.count, "rounding": made.rounding}
+    own = {"surface": made.nodes, "matrix": made.matrix}
+    facts = {"count": made.count, "rounding": made.rounding}
+    return {**own, **vars(made.fields)}, facts
 
 
 def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceCompliance:
+    kind = LowRankFields if "major" in arrays else DenseFields
     return SurfaceCompliance(
-        **{name: arrays[name] for name in ("nodes", "free", "matrix", "fields", "scales")},
+        arrays["surface"],
+        arrays["matrix"],
+        kind(**{field.name: arrays[field.name] for field in fields(kind)}),
         count=int(facts["count"]),
         rounding=float(facts["rounding"]),
     )
 
 
 _FORM = Form("compliance.json", _pack, _unpack)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _add_rows(fields, rows, weights, free, displacement):
-    """Adds the weighted rows of fields (R, 3, F) to displacement (N, 3) of free (F,) nodes."""
-    width = 1024  # nodes of a piece that stays in the fastest cache
-    four = len(rows) // 4 * 4
-    whole = np.empty((3, width))
-    for begin in range(0, len(free), width):
-        end = min(begin + width, len(free))
-        for axis in range(3):
-            piece = whole[axis, : end - begin]
-            piece[:] = 0.0
-            for m in range(0, four, 4):
-                a = fields[rows[m], axis, begin:end]
-                b = fields[rows[m + 1], axis, begin:end]
-                c = fields[rows[m + 2], axis, begin:end]
-                d = fields[rows[m + 3], axis, begin:end]
-                p, q, r, s = weights[m], weights[m + 1], weights[m + 2], weights[m + 3]
-                for i in range(len(piece)):
-                    piece[i] += p * a[i] + q * b[i] + r * c[i] + s * d[i]
-            for m in range(four, len(rows)):
-                a = fields[rows[m], axis, begin:end]
-                p = weights[m]
-                for i in range(len(piece)):
-                    piece[i] += p * a[i]
-        for i in range(end - begin):
-            for axis in range(3):
-                displacement[free[begin + i], axis] += whole[axis, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _add_scaled_rows(fields, scales, rows, weights, free, displacement):
-    """As `_add_rows`, of integers with a scale for each of their blocks."""
-    four = len(rows) // 4 * 4
-    whole = np.empty((3, _BLOCK), np.float32)
-    for block in range(scales.shape[2]):
-        begin = block * _BLOCK
-        end = min(begin + _BLOCK, len(free))
-        for axis in range(3):
-            piece = whole[axis, : end - begin]
-            piece[:] = 0.0
-            for m in range(0, four, 4):
-                a = fields[rows[m], axis, begin:end]
-                b = fields[rows[m + 1], axis, begin:end]
-                c = fields[rows[m + 2], axis, begin:end]
-                d = fields[rows[m + 3], axis, begin:end]
-                p = np.float32(weights[m] * scales[rows[m], axis, block])
-                q = np.float32(weights[m + 1] * scales[rows[m + 1], axis, block])
-                r = np.float32(weights[m + 2] * scales[rows[m + 2], axis, block])
-                s = np.float32(weights[m + 3] * scales[rows[m + 3], axis, block])
-                for i in range(len(piece)):
-                    piece[i] += (
-                        p * np.float32(a[i])
-                        + q * np.float32(b[i])
-                        + r * np.float32(c[i])
-                        + s * np.float32(d[i])
-                    )
-            for m in range(four, len(rows)):
-                a = fields[rows[m], axis, begin:end]
-                p = np.float32(weights[m] * scales[rows[m], axis, block])
-                for i in range(len(piece)):
-                    piece[i] += p * np.float32(a[i])
-        for i in range(end - begin):
-            for axis in range(3):
-                displacement[free[begin + i], axis] += whole[axis, i]

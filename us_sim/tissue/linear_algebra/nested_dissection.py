@@ -6,10 +6,9 @@
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 >>> from us_sim.tissue.linear_algebra.nested_dissection import nested_dissection
 >>> mesh = box_mesh(uniform_planes(0, 0.8, 9), uniform_planes(0, 0.4, 5), uniform_planes(0, 0.4, 5))
->>> kept = mesh.nodes[:, 2] == 0
->>> root = nested_dissection(mesh.nodes, mesh.edges, kept, largest=50)
+>>> root = nested_dissection(mesh.nodes, mesh.edges, largest=50)
 >>> len(root.own), [len(part.own) for part in root.parts]
-(45, [20])
+(25, [20, 20])
 """
 
 from __future__ import annotations
@@ -35,24 +34,19 @@ class Part:
 def nested_dissection(
     points: NDArray[np.float64],
     edges: NDArray[np.integer],
-    kept: NDArray[np.bool_],
     largest: int = 60,
 ) -> Part:
-    """The tree of parts, whose root are the kept nodes.
+    """The tree of parts.
 
     Args:
         points: (N, 3) m, by whose coordinates nodes are halved.
         edges: (E, 2), which nodes couple.
-        kept: (N,), nodes that come last.
         largest: number of nodes up to which a part is not halved.
     """
     count = len(points)
     both = np.concatenate([edges, edges[:, ::-1]])
     graph = coo_array((np.ones(len(both), np.int8), tuple(both.T)), shape=(count, count)).tocsr()
-    root = Part(np.flatnonzero(kept))
-    rest = np.flatnonzero(~kept)
-    if len(rest):
-        root.parts.append(_dissect(points, graph, rest, largest))
+    root = _dissect(points, graph, np.arange(count), largest)
     _bound(root, graph, np.zeros(count, dtype=bool))
     return root
 

@@ -3,7 +3,9 @@
 The stiffness is constant. So the displacement field of a unit force on each node that the probe can
 reach is computed once (`us_sim.tissue.linear_algebra.compliance`). A frame finds the forces on
 these nodes, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and
-adds up their fields.
+adds up their fields. Those of a large mesh are compressed
+(`us_sim.tissue.linear_algebra.low_rank_fields`): its nodes are then within some 1e-5 of the largest
+displacement, and only the surface is solved to rounding.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem import Fem
@@ -35,6 +37,7 @@ from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
 from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.linear_algebra.dense_fields import DenseFields
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
@@ -43,7 +46,7 @@ __all__ = ["CONTACTS", "Fem", "FemSettings"]
 CONTACTS = ("frictionless", "coulomb", "sticking")  # laws of friction between probe and surface
 
 _ROUNDING = 1e-5
-"""Rounding error of the fields, over the force, above which it is measured anew in every frame."""
+"""Rounding error of full fields, over the force, above which it is measured in every frame."""
 
 _EXTENSIONS = 10
 """Times that nodes overlooked at first, being far from the probe, may be added in a frame."""
@@ -71,10 +74,10 @@ class FemSettings(SolverSettings):
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
-    The residual is the rounding error of the stored fields, together with the forces along the
-    surface of a curved probe (without friction) or the last change of the forces (with friction).
-    The rounding error is the one measured when the fields were made, unless that is large, as with
-    moduli far apart: then it is computed in every frame.
+    The residual is the error of the stored fields, by rounding or compression, together with the
+    forces along the surface of a curved probe (without friction) or the last change of the forces
+    (with friction). That error is the one measured when the fields were made, unless it is large
+    though they are not compressed, as with moduli far apart: then it is computed in every frame.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -109,10 +112,12 @@ class Fem(TissueSolver):
         else:
             coefficient = settings.friction if settings.contact == "coulomb" else math.inf
             self._contact = FrictionalContact(*surface, coefficient)
-        imprecise = self._compliance.rounding > _ROUNDING and len(self._compliance.scales) == 0
+        dense = isinstance(self._compliance.fields, DenseFields)
+        imprecise = dense and self._compliance.rounding > _ROUNDING
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
-        self._displacement = np.zeros_like(model.mesh.nodes)
         self._watched = watched_tetrahedra(model)
+        # Compiles, too, what a frame calls.
+        self._displacement = self._compliance.field(np.zeros((len(self._reached), 3)))
         super().__init__(model, settings, progress)
 
     @property

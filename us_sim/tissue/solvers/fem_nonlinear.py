@@ -56,6 +56,9 @@ _TOUCHING = 0.1
 _SMALL = 500
 """Free nodes up to which there is time to factor the stiffness while the probe moves."""
 
+_RESTING = 30
+"""Frames of a probe at rest after which one may take longer than it should, if that is needed."""
+
 _SUNK = 10.0
 """Depth to which the probe may sink into settled tissue, over the spacing of the nodes that it can
 touch, for a tolerance of 1."""
@@ -156,6 +159,7 @@ class FemNonlinear(TissueSolver):
         self._newton.rest()
         self._heaviest = 0.0  # N, norm of the contact forces, the largest since rest
         self._aimed: Pose | None = None  # the pose that the tissue is at or on its way to
+        self._still = 0  # frames in a row with the probe at rest
         self._balanced = False  # whether the last frame's forces were
         self._inverted = 0  # frames in a row that ended inside out
         if state.displacement.any():
@@ -165,6 +169,9 @@ class FemNonlinear(TissueSolver):
                 self._newton.put(displacement)
         self._upright = self._newton.displacement
 
+    def _rehearse(self) -> None:
+        self._newton.rehearse()
+
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
         newton, settings = self._newton, self._own
@@ -173,14 +180,18 @@ class FemNonlinear(TissueSolver):
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
             return self._resting()
+        budget = settings.frame_budget or self.frame_limit
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
         # Where they did not balance, pushes are still those of being hit.
-        shifted = newton.augment() if self._balanced else np.inf
+        shifted = np.inf
+        if self._balanced:
+            shifted = newton.augment() if moved else newton.follow()
         start = self._predicted(pose) if moved else None
-        newton.may_factor = not moved or self._small
+        self._still = 0 if moved else self._still + 1
+        hurried = budget is not None and self._still < _RESTING
+        newton.may_factor = self._small or not (moved or hurried)
         left, stuck, actions = settings.most_iterations, False, []
-        budget = settings.frame_budget or self.frame_limit
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough = goal * newton.load if start is None else 0.0
             taken = newton.step(min(left, newton.patience), enough, start)

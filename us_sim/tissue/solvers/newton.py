@@ -64,7 +64,7 @@ _LEAST_PATIENCE = 12
 """Iterations of the first step: solved further, a step after a large change overshoots. Those after
 it may take twice as many as long as steps need not be cut."""
 
-_MOST_PATIENCE = 50
+_MOST_PATIENCE = 100
 """Iterations beyond which a factor of the stiffness takes less time."""
 
 _BACKTRACKS = 8
@@ -153,6 +153,12 @@ class Newton:
     def augment(self) -> float:
         """Push the tissue out of the probe further; returns by how much at most, m."""
         change = self.contact.augment(_AUGMENTED)
+        self._weigh()
+        return change
+
+    def follow(self) -> float:
+        """As `augment`, and fix the planes of contact where the nodes have come to be."""
+        change = self.contact.augment(_AUGMENTED)
         change = max(change, self.contact.follow(self.surface))
         self._weigh()
         return change
@@ -175,6 +181,12 @@ class Newton:
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
         self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
+
+    def rehearse(self) -> None:
+        """Take a step with a factor and with damping, as only some frames do."""
+        self._factors, self.may_factor, self._damping = True, True, _DAMPING
+        self.step(2)
+        self.rest()
 
     @property
     def unbalanced(self) -> NDArray[np.float64]:

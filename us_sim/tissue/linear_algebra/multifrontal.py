@@ -1,0 +1,348 @@
+"""The displacement fields of unit forces, by a multifrontal elimination of the mesh.
+
+(J. W. H. Liu, The multifrontal method for sparse matrix solution, SIAM Review 34, 1992.) Each part
+of a nested dissection, when eliminated, stores how its unknowns follow those around it; the parts
+that forces are put on also store what forces on themselves do. Fields then come from dense
+products, down the tree, for many forces at once.
+
+The pressures of nearly incompressible tissue are unknowns of their own. The matrix is then
+quasi-definite, and can be factored in any order without pivoting (R. J. Vanderbei, Symmetric
+quasidefinite matrices, SIAM J. Optim. 5, 1995): in every part first the displacements by a Cholesky
+factor, then the pressures by one of the negative.
+
+>>> import numpy as np
+>>> from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+>>> from us_sim.tissue.linear_algebra.multifrontal import eliminate
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+>>> mesh = box_mesh(*(uniform_planes(0.0, 0.1, 4) for axis in range(3)))
+>>> system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))
+>>> top, fixed = np.flatnonzero(mesh.nodes[:, 2] == 0.0), mesh.nodes[:, 2] == 0.1
+>>> fields = eliminate(mesh, system, fixed, top).fields(top[:2])
+>>> fields.shape
+(64, 3, 6)
+>>> float(abs(fields[fixed]).max())
+0.0
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import FileIO
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.sparse import block_array, csr_array, dia_array
+
+from us_sim.errors import SolverError
+from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure
+from us_sim.tissue.linear_algebra.nested_dissection import Part, nested_dissection
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["Eliminated", "eliminate"]
+
+_LARGE = 100_000
+"""Numbers in a matrix from which on it may be kept in a file."""
+
+_Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
+
+
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    """A matrix, in memory or in a file."""
+
+    matrix: NDArray[np.floating]  # empty if in a file
+    file: FileIO | None
+    place: int  # where in the file it begins
+    shape: tuple[int, ...]
+
+    @classmethod
+    def put(cls, matrix: NDArray[np.floating], file: FileIO | None) -> _Stored:
+        """At the end of a file, if the matrix is large, and the file is given and not full."""
+        if file is not None and matrix.size >= _LARGE:
+            place = file.seek(0, os.SEEK_END)
+            with contextlib.suppress(OSError):
+                if file.write(np.ascontiguousarray(matrix).data) == matrix.nbytes:
+                    return cls(matrix[:0].copy(), file, place, matrix.shape)
+        return cls(matrix, None, 0, matrix.shape)
+
+    def get(self) -> NDArray[np.floating]:
+        """The matrix."""
+        if self.file is None:
+            return self.matrix
+        self.file.seek(self.place)
+        matrix = np.empty(self.shape, self.matrix.dtype)
+        if self.file.readinto(matrix.data) != matrix.nbytes:
+            raise OSError("a temporary file has become shorter")
+        return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class _Front:
+    """How the unknowns of one part follow those around it."""
+
+    own: NDArray[np.int64]  # (O,), unknowns of the part
+    around: NDArray[np.int64]  # (R,), unknowns of parts above that they touch
+    response: _Stored  # (O, R), of its own per unknown around it
+    inverse: _Stored | None  # (O, O), of its own per force; None where none can be
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """A mesh whose parts are eliminated, ready for forces on some of its nodes."""
+
+    _fronts: list[_Front]  # a part comes after those below it
+    _nodes: int  # N
+    _unknowns: int
+    _precision: type
+
+    def fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
+        """(N, 3, 3K) m/N, what a unit force along each axis at each of nodes (K,) does to all.
+
+        The nodes are among those that `eliminate` was told; column 3 k + axis is of node k.
+        """
+        loads = (3 * nodes[:, None] + np.arange(3)).ravel()
+        fields: NDArray[np.floating] = np.zeros((self._unknowns, len(loads)), self._precision)
+        fields[loads, np.arange(len(loads))] = 1.0
+        loaded = np.zeros(self._unknowns, dtype=bool)
+        loaded[loads] = True
+        for front in self._fronts:
+            if front.inverse is not None and loaded[front.own].any():
+                loaded[front.around] = True
+                fields[front.around] += front.response.get().T @ fields[front.own]
+        for front in reversed(self._fronts):
+            moved = front.response.get() @ fields[front.around]
+            if front.inverse is not None and loaded[front.own].any():
+                moved += front.inverse.get() @ fields[front.own]
+            fields[front.own] = moved
+        return fields[: 3 * self._nodes].reshape(self._nodes, 3, -1)
+
+
+def eliminate(
+    mesh: TetrahedralMesh,
+    system: AveragedPressure,
+    fixed: NDArray[np.bool_],
+    loaded: NDArray[np.integer],
+    precision: type = np.float64,
+    report: Callable[[float], None] | None = None,
+    file: FileIO | None = None,
+) -> Eliminated:
+    """Eliminate all nodes.
+
+    Args:
+        mesh: of the system.
+        system: its equations.
+        fixed: (N,), nodes that stay; enough to make the stiffness positive definite.
+        loaded: (K,) nodes that are not fixed, on which there will be forces.
+        precision: of the numbers that say how parts follow.
+        report: told the fraction of the arithmetic done.
+        file: where the larger matrices are kept while there is place, rather than in memory.
+
+    Raises:
+        SolverError: to rounding, the stiffness is not positive definite.
+    """
+    root = nested_dissection(mesh.nodes, mesh.edges)
+    elimination = _Elimination(system, fixed, loaded, precision, report, file)
+    try:
+        elimination.run(root)
+    except LinAlgError as error:
+        raise SolverError(
+            "the stiffness is not positive definite to rounding: the tetrahedra are too flat or "
+            "their moduli too different"
+        ) from error
+    unknowns = 3 * len(mesh.nodes) + len(system.pressure_nodes)
+    return Eliminated(elimination.fronts, len(mesh.nodes), unknowns, precision)
+
+
+class _Elimination:
+    """One elimination: the numbering of the unknowns, and the fronts made so far."""
+
+    def __init__(
+        self,
+        system: AveragedPressure,
+        fixed: NDArray[np.bool_],
+        loaded: NDArray[np.integer],
+        precision: type,
+        report: Callable[[float], None] | None,
+        file: FileIO | None,
+    ) -> None:
+        count = len(fixed)
+        self._file = file
+        self.fronts: list[_Front] = []
+        self._free = ~fixed
+        self._precision = precision
+        self._report = report
+        self._pressed = np.zeros(count, dtype=bool)
+        self._pressed[system.pressure_nodes] = True
+        self._pressure = np.cumsum(self._pressed) - 1 + 3 * count
+        capacity = dia_array((-system.capacity[None], [0]), shape=2 * system.capacity.shape)
+        self._matrix = csr_array(
+            block_array(
+                [[system.element.tocsr(), system.coupling.T], [system.coupling, capacity]],
+                format="csr",
+            )
+        )
+        self._position = np.full(self._matrix.shape[0], -1, dtype=np.int64)
+        self._loaded = np.zeros(self._matrix.shape[0], dtype=bool)
+        self._loaded[(3 * loaded[:, None] + np.arange(3)).ravel()] = True
+        self._done = self._total = 0.0
+
+    def run(self, root: Part) -> None:
+        """Eliminate all parts."""
+        self._total = self._work(root)
+        self._eliminate(root)
+
+    def _unknowns(self, nodes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Displacements and pressures of nodes, each ascending."""
+        free = nodes[self._free[nodes]]
+        moves = (3 * free[:, None] + np.arange(3)).ravel()
+        return moves, self._pressure[nodes[self._pressed[nodes]]]
+
+    def _work(self, part: Part) -> float:
+        size = sum(len(unknowns) for unknowns in self._unknowns(part.own))
+        around = sum(len(unknowns) for unknowns in self._unknowns(part.boundary))
+        return size * float(size + around) ** 2 + sum(self._work(below) for below in part.parts)
+
+    def _eliminate(self, part: Part) -> _Update:
+        """Eliminate a part and those below it; what that adds to the unknowns around it."""
+        updates = [self._eliminate(below) for below in part.parts]
+        moves, presses = self._unknowns(part.own)
+        own = np.concatenate([moves, presses])
+        around = np.concatenate(self._unknowns(part.boundary))
+        if len(own) == 0 and len(updates) == 1:
+            return updates[0]
+        stiffness, side, left = self._assembled(own, around, updates)
+        factor = _Factor(stiffness, len(moves))
+        response, schur = factor.condensed(side, left)
+        loaded = self._loaded[own].any()
+        if loaded:
+            self._loaded[around] = True
+        self.fronts.append(
+            _Front(
+                own,
+                around,
+                self._stored(response),
+                self._stored(factor.solve(np.eye(len(own)))) if loaded else None,
+            )
+        )
+        if self._report is not None:
+            self._done += len(own) * float(len(own) + len(around)) ** 2
+            self._report(self._done / self._total)
+        return around, schur
+
+    def _stored(self, matrix: NDArray[np.float64]) -> _Stored:
+        return _Stored.put(matrix.astype(self._precision), self._file)
+
+    def _assembled(
+        self, own: NDArray[np.int64], around: NDArray[np.int64], updates: list[_Update]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The blocks own-own, own-around and around-around, with the updates from below."""
+        stiffness = np.zeros((len(own), len(own)))
+        side = np.zeros((len(own), len(around)))
+        left = np.zeros((len(around), len(around)))
+        position, matrix = self._position, self._matrix
+        position[own] = np.arange(len(own))
+        position[around] = len(own) + np.arange(len(around))
+        _assemble(stiffness, side, own, matrix.indptr, matrix.indices, matrix.data, position)
+        while updates:
+            unknowns, schur = updates.pop()
+            _extend_add(stiffness, side, left, schur, position[unknowns])
+        position[own] = position[around] = -1
+        return stiffness, side, left
+
+
+class _Factor:
+    """The Cholesky factors of a part's own unknowns, displacements first."""
+
+    def __init__(self, stiffness: NDArray[np.float64], moves: int) -> None:
+        self._moves = moves
+        self._factor = _cholesky(stiffness[:moves, :moves])
+        self._side = _forward(self._factor, stiffness[:moves, moves:])
+        negative = self._side.T @ self._side
+        negative -= stiffness[moves:, moves:]
+        self._negative = _cholesky(negative)
+
+    def condensed(
+        self, side: NDArray[np.float64], left: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How own unknowns follow those around, coupled by ``side``, and the Schur complement that
+        is made of ``left``.
+        """
+        upper, lower = self._halves(side)
+        left -= upper.T @ upper
+        left += lower.T @ lower
+        response = self._rest(upper, lower)
+        np.negative(response, out=response)
+        return response, left
+
+    def solve(self, right: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Own unknowns under forces on them, those around at rest."""
+        return self._rest(*self._halves(right))
+
+    def _halves(
+        self, right: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        upper = _forward(self._factor, right[: self._moves])
+        lower = self._side.T @ upper
+        lower -= right[self._moves :]
+        return upper, _forward(self._negative, lower)
+
+    def _rest(self, upper: NDArray[np.float64], lower: NDArray[np.float64]) -> NDArray[np.float64]:
+        pressures = _backward(self._negative, lower)
+        upper -= self._side @ pressures
+        return np.concatenate([_backward(self._factor, upper), pressures])
+
+
+def _cholesky(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    if len(matrix) == 0:
+        return matrix
+    return cholesky(matrix, lower=True, check_finite=False)
+
+
+def _forward(factor: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    if right.size == 0:
+        return right.copy()
+    return solve_triangular(factor, right, lower=True, check_finite=False)
+
+
+def _backward(factor: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    if right.size == 0:
+        return right
+    return solve_triangular(factor, right, lower=True, trans=1, check_finite=False)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _assemble(stiffness, side, own, start, columns, values, position):
+    """Adds the rows ``own`` of a sparse matrix to stiffness, and to side where the position of a
+    column is after the own ones.
+    """
+    for row in range(len(own)):
+        for entry in range(start[own[row]], start[own[row] + 1]):
+            column = position[columns[entry]]
+            if column >= len(own):
+                side[row, column - len(own)] += values[entry]
+            elif column >= 0:
+                stiffness[row, column] += values[entry]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _extend_add(stiffness, side, left, update, index):
+    """Adds update (r, r) to the rows and columns ``index``: own ones first, then those around."""
+    own = len(stiffness)
+    for i in range(len(index)):
+        row = index[i]
+        for j in range(len(index)):
+            column = index[j]
+            if row >= own:
+                if column >= own:
+                    left[row - own, column - own] += update[i, j]
+            elif column >= own:
+                side[row, column - own] += update[i, j]
+            else:
+                stiffness[row, column] += update[i, j]
