@@ -64,6 +64,8 @@ _YIELD = 1.5
 
 _GRIP = 0.1  # m, how far the probe is taken to go on behind its collider
 
+_STEEP = math.radians(60)  # of the flanks of a probe of small rounding to its face
+
 
 @dataclass(frozen=True)
 class SpringSettings:
@@ -318,7 +320,7 @@ def push_directions(
 
     The rule of `us_sim.tissue.contact.penetration.push_out`, written down again. With ``flanks`` a
     point that lies nearer to a flank of a probe of small rounding than to its front is pushed
-    square to that flank.
+    square to that flank, a plane along the rounding where this is 60 degrees to the face.
     """
     box = collider.offset_box
     rounding = box[3]
@@ -333,11 +335,13 @@ def push_directions(
         if not flanks:
             return forward @ pose.rotation.T
         nearest = (inside == inside.min(axis=1)[:, None]) & (out == 0.0).all(axis=1)[:, None]
-        aside = np.column_stack([side * np.where(nearest, 1.0, out), np.zeros(len(points))])
-        aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
-        beside = np.linalg.norm(np.where(nearest, -inside, out), axis=1)
-        beside = np.where(nearest.any(axis=1), -beside, beside)
-        by_flank = (ahead < 0.0) & (np.abs(beside - rounding) < np.abs(ahead - rise))
+        beside = np.where(nearest.any(axis=1), -inside.min(axis=1), np.linalg.norm(out, axis=1))
+        along = side * np.where(nearest, 1.0, out)
+        along /= np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
+        sine, cosine = math.sin(_STEEP), math.cos(_STEEP)
+        aside = np.column_stack([sine * along, np.full(len(points), cosine)])
+        to_flank = sine * beside + cosine * ahead - rounding
+        by_flank = (ahead < 0.0) & (np.abs(to_flank) < np.abs(ahead - rise))
         return np.where(by_flank[:, None], aside, forward) @ pose.rotation.T
     behind = -(ahead + 2 * box[2] + _GRIP)
     up = np.maximum(ahead, 0.0) - np.maximum(behind, 0.0)
