@@ -86,7 +86,7 @@ class FemNonlinearSettings(SolverSettings):
         default=None,
     )
     most_iterations: int = setting(
-        COUNT, "conjugate-gradient iterations of any frame at most", default=400
+        COUNT, "conjugate-gradient iterations of any frame at most", default=250
     )
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
@@ -153,6 +153,7 @@ class FemNonlinear(TissueSolver):
             contact.push[pushed, None] * contact.normal[pushed],
             compliance_between(self._compliance.matrix, pushed),
             self.model.contact_spacing,
+            flanks=True,
         )
 
     def _restore(self, state: TissueState) -> None:
