@@ -1,0 +1,182 @@
+"""Conjugate gradients with springs, and what preconditions them, against dense solves."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tissue_block import block
+
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
+from us_sim.tissue.linear_algebra.two_level import TwoLevel, apply_blocks, conjugate_gradients
+
+MODEL = block((7, 5, 5))
+COUNT = len(MODEL.mesh.nodes)
+FIXED = np.flatnonzero(MODEL.fixed)
+FREE = np.flatnonzero(~MODEL.fixed)
+TISSUE = NeoHookean(MODEL.mesh, MODEL.materials, np.float64)
+BLOCKS = TISSUE.diagonal_blocks()
+GRIDS = pytest.mark.parametrize("coarse", [False, True])
+
+springs_at = st.lists(
+    st.tuples(
+        st.integers(0, len(MODEL.movable_contact_nodes) - 1),
+        st.floats(-1, 1),
+        st.floats(-1, 1),
+        st.floats(0.0, 1e6),
+    ),
+    max_size=12,
+    unique_by=lambda spring: spring[0],
+)
+
+
+def grid(dtype=np.float64):
+    return CoarseGrid(MODEL.mesh, MODEL.fixed, TISSUE.tangent_product, dtype)
+
+
+def two_level(coarse, springs, dtype=np.float64, made=None):
+    """Prepared, and its springs: nodes, normals, stiffness in N/m."""
+    made = made or TwoLevel(grid(dtype) if coarse else None, FIXED, 1.0)
+    nodes = MODEL.movable_contact_nodes[[s[0] for s in springs]].astype(np.int64)
+    normals = np.array([[s[1], s[2], 1.0] for s in springs]).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    stiffness = np.array([s[3] for s in springs], dtype=float)
+    made.prepare(BLOCKS.astype(dtype), nodes, normals, stiffness)
+    return made, nodes, normals, stiffness
+
+
+def dense(function, count=COUNT):
+    columns = []
+    for unit in np.eye(3 * count).reshape(-1, 3, count):
+        out = np.empty((3, count))
+        function(np.ascontiguousarray(unit), out)
+        columns.append(out.ravel())
+    return np.array(columns).T
+
+
+STIFFNESS = dense(TISSUE.tangent_product)
+MOVABLE = np.repeat(~MODEL.fixed[None], 3, axis=0).ravel()
+
+
+def with_springs(nodes, normals, stiffness):
+    whole = STIFFNESS.copy()
+    for node, normal, k in zip(nodes, normals, stiffness, strict=True):
+        rows = node + COUNT * np.arange(3)
+        whole[np.ix_(rows, rows)] += k * np.outer(normal, normal)
+    return whole
+
+
+SPRINGS = [(0, 0.3, -0.2, 1e4), (3, 0.0, 0.0, 1e6), (11, -1.0, 0.5, 1.0), (5, 0.0, 0.1, 0.0)]
+
+
+@GRIDS
+def test_the_solution_is_that_of_a_dense_solve(coarse):
+    made, *springs = two_level(coarse, SPRINGS)
+    force = np.random.default_rng(0).normal(size=(3, COUNT))
+    force[:, FIXED] = 0.0
+    solved = conjugate_gradients(TISSUE.tangent_product, made, force.copy(), 500, 1e-12)
+    whole = with_springs(*springs)[np.ix_(MOVABLE, MOVABLE)]
+    expected = np.zeros(3 * COUNT)
+    expected[MOVABLE] = np.linalg.solve(whole, force.ravel()[MOVABLE])
+    assert not solved.curved
+    np.testing.assert_allclose(solved.solution.ravel(), expected, atol=1e-9 * abs(expected).max())
+    image = TISSUE.tangent_product(solved.solution)
+    np.testing.assert_allclose(solved.image, image, atol=1e-9 * abs(image).max())
+
+
+def test_the_coarse_level_saves_iterations_with_and_without_springs():
+    force = np.zeros((3, COUNT))
+    force[2, MODEL.movable_contact_nodes] = 1.0
+    firm = [(i, 0.0, 0.0, 1e4) for i in range(12)]
+    counts = [
+        conjugate_gradients(
+            TISSUE.tangent_product, two_level(coarse, springs)[0], force.copy(), 500, 1e-6
+        ).iterations
+        for coarse in (False, True)
+        for springs in ([], firm)
+    ]
+    assert counts[2] < 0.8 * counts[0]
+    assert counts[3] < 0.8 * counts[1]
+
+
+def test_it_ends_at_the_tolerance_or_with_the_iterations():
+    made, *_ = two_level(True, SPRINGS)
+    force = np.zeros((3, COUNT))
+    force[:, FREE] = 1.0
+    few, left = force.copy(), force.copy()
+    assert conjugate_gradients(TISSUE.tangent_product, made, few, 3, 1e-12).iterations == 3
+    solved = conjugate_gradients(TISSUE.tangent_product, made, left, 500, 1e-3)
+    assert np.linalg.norm(left) <= 1e-3 < np.linalg.norm(few)
+    assert 3 < solved.iterations < 500
+    assert conjugate_gradients(TISSUE.tangent_product, made, force, 0, 1e-3).iterations == 0
+
+
+def test_negative_curvature_ends_it_with_what_came_before():
+    made, *_ = two_level(False, [])
+    force = np.random.default_rng(1).normal(size=(3, COUNT))
+    force[:, FIXED] = 0.0
+    shift = 2e-2 * np.linalg.eigvalsh(STIFFNESS)[-1]
+
+    def indefinite(field, image):
+        TISSUE.tangent_product(field, image)
+        image -= shift * field
+
+    solved = conjugate_gradients(indefinite, made, force.copy(), 500, 1e-12)
+    assert solved.curved
+    direction, image = solved.direction, np.empty_like(force)
+    indefinite(direction, image)
+    assert np.vdot(direction, image) <= 0.0
+    assert np.vdot(direction, force) > 0.0  # and it leads down
+    indefinite(solved.solution, image)
+    decrease = np.vdot(solved.solution, 0.5 * image - force)
+    assert decrease < 0.0 or not solved.solution.any()
+
+
+@settings(max_examples=25, deadline=None)
+@given(springs_at, st.booleans(), st.integers(0, 2**32 - 1))
+def test_the_preconditioner_is_symmetric_and_positive(springs, coarse, seed):
+    made, *_ = two_level(coarse, springs, made=MADE[coarse])
+    a, b = np.random.default_rng(seed).normal(size=(2, 3, COUNT))
+    a[:, FIXED] = b[:, FIXED] = 0.0
+    to_a, to_b = np.empty_like(a), np.empty_like(b)
+    made.apply(a, to_a)
+    made.apply(b, to_b)
+    assert np.vdot(a, to_a) > 0.0
+    size = np.sqrt(np.vdot(a, to_a) * np.vdot(b, to_b))
+    assert np.vdot(a, to_b) == pytest.approx(np.vdot(b, to_a), abs=1e-9 * size)
+    assert not to_a[:, FIXED].any()
+
+
+MADE = {coarse: TwoLevel(grid() if coarse else None, FIXED, 1.0) for coarse in (False, True)}
+
+
+def test_without_a_grid_it_is_the_inverse_of_each_nodes_block_with_its_spring():
+    made, nodes, normals, stiffness = two_level(False, SPRINGS)
+    residual = np.random.default_rng(2).normal(size=(3, COUNT))
+    out = np.empty_like(residual)
+    made.apply(residual, out)
+    whole = with_springs(nodes, normals, stiffness).reshape(3, COUNT, 3, COUNT)
+    for node in (*nodes, FREE[0], FREE[-1]):
+        expected = np.linalg.solve(whole[:, node, :, node], residual[:, node])
+        np.testing.assert_allclose(out[:, node], expected, rtol=1e-8)
+    assert not out[:, FIXED].any()
+
+
+def test_blocks_times_a_field():
+    field = np.random.default_rng(3).normal(size=(3, COUNT))
+    own = STIFFNESS.reshape(3, COUNT, 3, COUNT)
+    expected = np.einsum("inj,jn->in", np.einsum("injn->inj", own), field)
+    product = apply_blocks(BLOCKS, field)
+    np.testing.assert_allclose(product, expected, atol=1e-10 * abs(expected).max())
+
+
+def test_single_precision_solves_to_single_precision():
+    made, *springs = two_level(True, SPRINGS, np.float32)
+    single = NeoHookean(MODEL.mesh, MODEL.materials, np.float32)
+    force = np.random.default_rng(4).normal(size=(3, COUNT)).astype(np.float32)
+    force[:, FIXED] = 0.0
+    solved = conjugate_gradients(single.tangent_product, made, force.copy(), 200, 1e-4)
+    assert solved.solution.dtype == np.float32
+    whole = with_springs(*springs)[np.ix_(MOVABLE, MOVABLE)]
+    left = force.ravel()[MOVABLE] - whole @ solved.solution.ravel()[MOVABLE]
+    assert np.linalg.norm(left) < 1e-3 * np.linalg.norm(force)

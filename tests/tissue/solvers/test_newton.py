@@ -1,0 +1,146 @@
+"""Newton's method on the energy of tissue and contact: every step lowers it, from anywhere."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tissue_block import block, block_mesh
+
+from us_sim.geometry.collider import RoundedBox, Sphere
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.solvers.newton import Newton
+
+NODES = (6, 5, 4)
+COUNT = len(block_mesh(NODES).nodes)
+
+
+def layered():
+    """Soft and stiff tetrahedra side by side, nearly incompressible."""
+    mesh = block_mesh(NODES)
+    stiff = np.random.default_rng(0).uniform(size=len(mesh.tetrahedra)) < 0.3
+    return TissueMaterials(
+        np.where(stiff, 300e3, 3e3), np.where(stiff, 0.45, 0.49), np.full(len(stiff), 1e3)
+    )
+
+
+MODELS = {
+    "sphere": block(NODES, Sphere(0.1)),  # pushes along its normals
+    "box": block(NODES, RoundedBox(0.08, 0.05, 0.1, 0.004)),  # along fixed planes
+    "layered": block(NODES, Sphere(0.1), materials=layered()),
+}
+NEWTONS = {name: Newton(model) for name, model in MODELS.items()}
+EVERY = pytest.mark.parametrize("name", MODELS)
+
+
+def pressed(name, pose, size=0.0, seed=0):
+    """At a pose, every free node displaced by about ``size`` (m)."""
+    newton = NEWTONS[name]
+    newton.rest()
+    displacement = np.random.default_rng(seed).normal(size=(3, COUNT)) * size
+    displacement[:, MODELS[name].fixed] = 0.0
+    newton.put(displacement)
+    newton.aim(pose)
+    return newton
+
+
+def at(x=0.0, y=0.0, z=0.0, tilt=0.0):
+    return Pose(np.array([x, y, z]), np.array([tilt, 0.0, 0.0, 1.0]))
+
+
+poses = st.builds(
+    at, st.floats(-0.1, 0.1), st.floats(-0.05, 0.05), st.floats(-0.01, 0.05), st.floats(-0.3, 0.3)
+)
+
+
+@EVERY
+@pytest.mark.parametrize("size", [1e-4, 1e-2])
+def test_unbalanced_forces_are_the_slope_of_the_energy(name, size):
+    newton = pressed(name, at(z=0.01), size)
+    slope, start = newton.unbalanced.copy(), newton.displacement
+    assert newton.load > 0.0
+    assert np.linalg.norm(slope) == pytest.approx(newton.imbalance)
+    change = np.random.default_rng(1).normal(size=(3, COUNT))
+    change[:, MODELS[name].fixed] = 0.0
+    step, energy = 1e-8, []
+    for sign in (1, -1):
+        newton.put(start + sign * step * change)
+        energy.append(newton.energy)
+    expected = (energy[0] - energy[1]) / (2 * step)
+    scale = np.linalg.norm(slope) * np.linalg.norm(change)
+    assert np.vdot(slope, change) == pytest.approx(expected, abs=1e-5 * scale)
+
+
+@EVERY
+def test_every_step_lowers_the_energy_from_any_start_also_inside_out(name):
+    inverted = 0
+
+    @settings(max_examples=20, deadline=None, derandomize=True)
+    @given(poses, st.sampled_from([0.0, 1e-3, 1e-2, 3e-2]), st.integers(0, 2**32 - 1))
+    def descend(pose, size, seed):
+        nonlocal inverted
+        newton = pressed(name, pose, size, seed)
+        inverted += newton.tissue.inverted(newton.displacement) > 0
+        for _ in range(12):
+            energy, before = newton.energy, newton.displacement
+            taken = newton.step(newton.patience)
+            assert np.isfinite(newton.energy)
+            assert newton.energy <= energy * (1 + 1e-11)
+            # What is kept is what the displacement has.
+            kept, imbalance = newton.energy, newton.imbalance
+            newton.put(newton.displacement)
+            assert (newton.energy, newton.imbalance) == pytest.approx((kept, imbalance), rel=1e-9)
+            if not taken:
+                np.testing.assert_array_equal(newton.displacement, before)
+
+    descend()
+    assert inverted > 3
+
+
+@EVERY
+@pytest.mark.parametrize("size", [0.0, 5e-3, 1.5e-2])
+def test_it_converges_to_a_balance(name, size):
+    newton = pressed(name, at(x=0.004, z=0.015), size)
+    for _ in range(80):
+        newton.step(newton.patience)
+        if newton.imbalance <= 1e-7 * newton.load:
+            break
+    assert newton.imbalance <= 1e-7 * newton.load
+    assert not newton.is_stuck
+    assert not newton.unbalanced[:, MODELS[name].fixed].any()
+
+
+@EVERY
+def test_augmenting_lets_the_probe_sink_in_no_more(name):
+    newton = pressed(name, at(z=0.01))
+    for _ in range(40):
+        while newton.imbalance > 1e-9 * newton.load:
+            assert newton.step(50) or not newton.is_stuck
+        if newton.augment() < 1e-8:
+            break
+    pushed = newton.contact.push > 0.0
+    assert pushed.sum() > 2
+    assert abs(newton.contact.gap[pushed]).max() < 2e-8
+
+
+def test_rest_is_at_balance_and_a_fresh_start():
+    newton = pressed("sphere", at(z=0.01))
+    first = [newton.step(20) and newton.energy for _ in range(4)]
+    newton.rest()
+    assert newton.energy == newton.imbalance == newton.load == 0.0
+    again = pressed("sphere", at(z=0.01))
+    assert [again.step(20) and again.energy for _ in range(4)] == first
+
+
+def test_a_factor_of_the_stiffness_changes_the_way_and_not_the_end():
+    ends = []
+    for may_factor in (False, True):
+        newton = pressed("layered", at(z=0.012))
+        newton.may_factor = may_factor
+        for _ in range(60):
+            newton.step(200)
+            if newton.imbalance <= 1e-9 * newton.load:
+                break
+        ends.append(newton.displacement)
+    NEWTONS["layered"].may_factor = False
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-8)
