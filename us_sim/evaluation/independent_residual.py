@@ -59,6 +59,8 @@ _WALL = 5.0
 """Modulus of that resistance, over the geometric mean of a tetrahedron's own shear modulus and the
 largest among the tetrahedra with which it shares a node."""
 
+_FLANK = math.radians(60)  # between the front of a probe and its flanks
+
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
 
@@ -318,7 +320,7 @@ def push_directions(
 
     The rule of `us_sim.tissue.contact.penetration.push_out`, written down again. With ``flanks`` a
     point that lies nearer to a flank of a probe of small rounding than to its front is pushed
-    square to that flank.
+    square to that flank, which is a plane at 60 degrees to the front.
     """
     box = collider.offset_box
     rounding = box[3]
@@ -333,11 +335,14 @@ def push_directions(
         if not flanks:
             return forward @ pose.rotation.T
         nearest = (inside == inside.min(axis=1)[:, None]) & (out == 0.0).all(axis=1)[:, None]
-        aside = np.column_stack([side * np.where(nearest, 1.0, out), np.zeros(len(points))])
+        aside = side * np.where(nearest, 1.0, out)
         aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
+        sine, cosine = math.sin(_FLANK), math.cos(_FLANK)
+        aside = np.column_stack([sine * aside, np.full(len(points), cosine)])
         beside = np.linalg.norm(np.where(nearest, -inside, out), axis=1)
         beside = np.where(nearest.any(axis=1), -beside, beside)
-        by_flank = (ahead < 0.0) & (np.abs(beside - rounding) < np.abs(ahead - rise))
+        from_flank = np.abs(sine * beside + cosine * ahead - rounding)
+        by_flank = (ahead < 0.0) & (from_flank < np.abs(ahead - rise))
         return np.where(by_flank[:, None], aside, forward) @ pose.rotation.T
     behind = -(ahead + 2 * box[2] + _GRIP)
     up = np.maximum(ahead, 0.0) - np.maximum(behind, 0.0)
