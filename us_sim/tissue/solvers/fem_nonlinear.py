@@ -20,6 +20,7 @@ on but never shown.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
+from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out, wrench_on_probe
 from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
@@ -83,10 +85,21 @@ class FemNonlinearSettings(SolverSettings):
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
     )
+    contact: str = setting(
+        choices=CONTACTS,
+        default="frictionless",
+        description="what holds between probe and tissue; sticking: a touched node keeps its place "
+        "on the probe until it is let go",
+    )
+    friction: float = setting(
+        COEFFICIENT,
+        "Coulomb's coefficient, where contact is coulomb; the default is meant for gel, and chosen",
+        default=0.07,
+    )
 
 
 class FemNonlinear(TissueSolver):
-    """Stable neo-Hookean finite elements with frictionless contact, by Newton's method.
+    """Stable neo-Hookean finite elements under a probe, by Newton's method.
 
     The residual is the norm of the unbalanced nodal forces, of tissue and contact together, over
     the norm of the contact forces (without any, over the largest since rest), in double precision
@@ -117,7 +130,8 @@ class FemNonlinear(TissueSolver):
         self._own = settings
         self._surface = model.movable_contact_nodes
         self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
-        self._newton = Newton(model)
+        laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
+        self._newton = Newton(model, laws[settings.contact])
         self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
@@ -130,11 +144,15 @@ class FemNonlinear(TissueSolver):
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: computed with the tissue's compliance at rest."""
+        """Approximate: computed with the tissue's compliance at rest. With friction, how much a
+        node may be dragged is not known.
+        """
         contact = self._newton.contact
         pushed = np.flatnonzero(contact.push > 0.0)
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
+        if self._own.contact != "frictionless":
+            return None
         return contact_stiffness(
             self.model.collider,
             self._pose,
@@ -209,6 +227,7 @@ class FemNonlinear(TissueSolver):
             contact.softness,
             self._touching,
         )
+        newton.expect(np.einsum("ij,ij->i", held + change, contact.normal))
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
         return field.astype(np.float64)
@@ -227,9 +246,9 @@ class FemNonlinear(TissueSolver):
         residual = newton.imbalance / reference if reference else 0.0
         contact = newton.contact
         nodes = self.model.mesh.nodes + newton.displacement.T
-        pushed = contact.push > 0
-        touched = self._surface[pushed]
-        forces = contact.push[pushed, None] * contact.normal[pushed]
+        forces = contact.force
+        pushed = forces.any(axis=1)
+        touched, forces = self._surface[pushed], forces[pushed]
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         self._settled = stuck or (residual <= self._own.tolerance and shifted < _SUNK)
         if stuck:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
+from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
@@ -98,9 +99,10 @@ class Newton:
 
     Args:
         model: of the tissue and the probe.
+        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
     """
 
-    def __init__(self, model: TissueModel) -> None:
+    def __init__(self, model: TissueModel, friction: float = 0.0) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is needed
         #: Whether a step may take the time to factor the stiffness.
@@ -120,12 +122,9 @@ class Newton:
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
         own = (rest[0] + rest[3] + rest[5])[self._surface] / 3
-        self.contact = PenaltyContact(
-            model.collider,
-            model.contact_spacing,
-            _FIRMNESS * own,
-            _GREATEST_PUSH * _shear_times_area(model)[self._surface],
-        )
+        strongest = _GREATEST_PUSH * _shear_times_area(model)[self._surface]
+        law = (model.collider, model.contact_spacing, _FIRMNESS * own, strongest)
+        self.contact = PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
         shape = (3, len(mesh.nodes))
         self.displacement = np.zeros(shape)  # m
         self._force = np.zeros(shape)  # N, the slope of the tissue's energy
@@ -157,6 +156,11 @@ class Newton:
         self._weigh()
         return change
 
+    def expect(self, push: NDArray[np.float64]) -> None:
+        """Learn which pushes (C,) N on the surface are likely at the pose; nothing moves."""
+        if self.contact.expect(push):
+            self._weigh()
+
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
         self.displacement = displacement
@@ -169,10 +173,11 @@ class Newton:
         tissue.forces(self.displacement, self._force)
         self.energy = tissue.energy(self.displacement) + contact.energy  # J
         self._slope = self._force.copy()
-        self._slope[:, self._surface] -= (contact.push[:, None] * contact.normal).T
+        force = contact.force
+        self._slope[:, self._surface] -= force.T
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
-        self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
+        self.load = float(np.linalg.norm(force))  # N, of the contact forces
 
     @property
     def unbalanced(self) -> NDArray[np.float64]:
@@ -228,7 +233,6 @@ class Newton:
         if not contact.forward and len(pushed):
             turn = contact.push[pushed, None, None] * contact.curvature(self.surface, pushed)
         turned = nodes[pushed] if len(turn) else nodes[:0]
-        gap, normal = contact.gap, contact.normal
 
         def elastic(change: NDArray, image: NDArray) -> None:
             """The tangent without springs, of which there are more or fewer as nodes touch."""
@@ -249,18 +253,17 @@ class Newton:
             self.used += 1
         enough, segment = None, _SEGMENT
         while True:
-            reached = gap + np.einsum("ij,ji->i", normal, step[:, nodes])
-            slope = contact.slope_at(reached)
+            moved = step[:, nodes].T
             left = -self._force - image
-            left[:, nodes] += (contact.push_at(reached)[:, None] * normal).T
+            left[:, nodes] += contact.force_after(moved).T
             left[:, self._fixed] = 0.0
             size = float(np.linalg.norm(left))
             if enough is None:
                 enough = max(_FORCING * max(size, self.imbalance * (start is None)), _AIM * goal)
             if size <= enough or self.used >= iterations:
                 return step, False
-            active = np.flatnonzero(slope > 0.0)
-            springs = nodes[active], normal[active], slope[active]
+            active, directions, stiffness = contact.springs_after(moved)
+            springs = nodes[active], directions, stiffness
             preconditioner: TwoLevel | FactoredStiffness
             if self._factored is not None and self.may_factor:
                 preconditioner = self._factored
