@@ -45,6 +45,12 @@ from us_sim.tissue.contact.penalty_contact import PenaltyContact
 
 __all__ = ["PenaltyFriction"]
 
+_OVERSHOOT = 0.1
+"""Slope of the energy where a change ends, over the one where it begins, that does not matter."""
+
+_HALVINGS = 6
+"""Halvings of an interval of lengths in which the energy is least."""
+
 
 class PenaltyFriction(PenaltyContact):
     """Penalty contact with Coulomb's friction, or with a probe to which touched nodes stick.
@@ -183,6 +189,28 @@ class PenaltyFriction(PenaltyContact):
         along_surface = [self._stiff[sticks], (self._stiff * kept)[turns]]
         stiffness = np.concatenate([stiffness, *along_surface])
         return nodes[order], directions[order], stiffness[order]
+
+
+    def length_along(
+        self,
+        start: NDArray[np.float64],
+        change: NDArray[np.float64],
+        pull: float,
+        curvature: float,
+    ) -> float:
+        """As `PenaltyContact.length_along`; nodes that come to stick, or turn back, cut it."""
+
+        def slope(length: float) -> float:
+            force = self.force_after(start + length * change)
+            return length * curvature - pull - float((force * change).sum())
+
+        if slope(1.0) <= _OVERSHOOT * abs(slope(0.0)):
+            return 1.0
+        low, high = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if slope(middle) > 0.0 else (middle, high)
+        return (low + high) / 2
 
 
 def _along(vectors: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:

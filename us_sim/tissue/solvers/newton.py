@@ -280,8 +280,13 @@ class Newton:
             )
             self.used += solved.iterations
             segment *= 2
-            step += size * solved.solution
-            image += size * solved.image
+            change = size * solved.solution.astype(np.float64)
+            bend = size * solved.image.astype(np.float64)
+            pull = -float((change * (self._force + image)).sum())
+            curvature = float((change * bend).sum())
+            length = contact.length_along(moved, change[:, nodes].T, pull, curvature)
+            step += length * change
+            image += length * bend
             if solved.curved:
                 return (step if step.any() else size * solved.direction), True
 
