@@ -168,23 +168,6 @@ class PenaltyContact:
         active = np.flatnonzero(slope > 0.0)
         return active, self.normal[active], slope[active]
 
-    def length_along(
-        self,
-        start: NDArray[np.float64],  # noqa: ARG002
-        change: NDArray[np.float64],  # noqa: ARG002
-        pull: float,  # noqa: ARG002
-        curvature: float,  # noqa: ARG002
-    ) -> float:
-        """The fraction of a change of displacement to take, that quadratic model's forces lower.
-
-        Args:
-            start: (C, 3) m, how far the nodes have moved before.
-            change: (C, 3) m, of these nodes.
-            pull: J, what the forces inside do along the change of all nodes.
-            curvature: J, the tangent along it.
-        """
-        return 1.0
-
     def expect(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
         """Learn which pushes (C,) N are likely at the new pose; returns if forces change by it."""
         return False

@@ -190,7 +190,6 @@ class PenaltyFriction(PenaltyContact):
         stiffness = np.concatenate([stiffness, *along_surface])
         return nodes[order], directions[order], stiffness[order]
 
-
     def length_along(
         self,
         start: NDArray[np.float64],
@@ -198,7 +197,16 @@ class PenaltyFriction(PenaltyContact):
         pull: float,
         curvature: float,
     ) -> float:
-        """As `PenaltyContact.length_along`; nodes that come to stick, or turn back, cut it."""
+        """How much of a change, along which the tissue's forces are linear, lowers the energy most.
+
+        It is less than all where nodes come to stick, or turn back.
+
+        Args:
+            start: (C, 3) m, how far the nodes have moved before.
+            change: (C, 3) m, theirs.
+            pull: J, of the tissue's forces now along the change of all nodes.
+            curvature: J, of its tangent along that.
+        """
 
         def slope(length: float) -> float:
             force = self.force_after(start + length * change)

@@ -3,7 +3,9 @@
 Quasi-static: every frame the energy of `neo_hookean` and of a penalty contact is made least, by
 Newton's method with a line search (see `us_sim.tissue.solvers.newton`), from where the frame before
 ended. A new pose of the probe is met with the exact linear answer to it first (contact is a
-complementarity problem on the surface compliance). What a frame's time does not allow for goes on
+complementarity problem on the surface compliance). Friction and viscous tissue, where they are
+asked for, remember the frames before (see `us_sim.tissue.contact.penalty_friction` and
+`us_sim.tissue.elasticity.overstress`). What a frame's time does not allow for goes on
 in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
 on but never shown.
 
@@ -38,6 +40,7 @@ from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
+from us_sim.tissue.elasticity.overstress import PronyBranch
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.newton import Newton
@@ -93,8 +96,25 @@ class FemNonlinearSettings(SolverSettings):
     )
     friction: float = setting(
         COEFFICIENT,
-        "Coulomb's coefficient, where contact is coulomb; the default is meant for gel, and chosen",
+        "Coulomb's coefficient, where contact is coulomb; the default is a choice, meant for gel",
         default=0.07,
+    )
+    viscosity: float = setting(
+        Quantity("number", 0.0, 10.0),
+        "stiffness that relaxes while a deformation lasts, over the one that stays: tissue gives "
+        "way slowly and creeps back when it is let go; 0: none",
+        default=0.0,
+    )
+    relaxation_time: float = setting(
+        Quantity("time", 1e-3, 1e3),
+        "time in which that falls to 37 percent (1/e)",
+        default=0.5,
+    )
+    frame_interval: float = setting(
+        Quantity("time", 1e-4, 10.0),
+        "time that is taken to pass from one frame to the next, for viscous tissue; a frame is "
+        "one pose of the probe",
+        default=0.0167,
     )
 
 
@@ -131,7 +151,8 @@ class FemNonlinear(TissueSolver):
         self._surface = model.movable_contact_nodes
         self._touching = _TOUCHING * float(np.ptp(model.mesh.nodes, axis=0).min())
         laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
-        self._newton = Newton(model, laws[settings.contact])
+        branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
+        self._newton = Newton(model, laws[settings.contact], branch if settings.viscosity else None)
         self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
@@ -158,9 +179,21 @@ class FemNonlinear(TissueSolver):
             self._pose,
             self._newton.surface[pushed],
             contact.push[pushed, None] * contact.normal[pushed],
-            compliance_between(self._compliance.matrix, pushed),
+            compliance_between(self._compliance.matrix, pushed) / self._stiffer,
             self.model.contact_spacing,
         )
+
+    @property
+    def _stiffer(self) -> float:
+        """Stiffness within a frame, over the one that stays."""
+        overstress = self._newton.overstress
+        return 1.0 if overstress is None else 1.0 + overstress.stiffness
+
+    @property
+    def _has_relaxed(self) -> bool:
+        """Whether viscous tissue will not creep any more."""
+        overstress = self._newton.overstress
+        return overstress is None or overstress.load <= self._own.tolerance * self._reference()
 
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()
@@ -170,12 +203,15 @@ class FemNonlinear(TissueSolver):
         self._inverted = 0  # frames in a row that ended inside out
         if state.displacement.any():
             self._newton.put(np.ascontiguousarray(state.displacement.T))
+            if self._newton.overstress is not None:
+                self._newton.overstress.forget(self._newton.displacement)
         self._upright = self._newton.displacement
 
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
         newton = self._newton
-        if pose is None or self._depth(pose, self.model.mesh.nodes[self._surface]) <= GAP_TOLERANCE:
+        newton.relax()
+        if self._is_unloaded(pose):
             # Nothing reaches the undeformed tissue: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
@@ -183,7 +219,12 @@ class FemNonlinear(TissueSolver):
         moved = not same_pose(pose, self._aimed)
         goal = self._own.frame_tolerance if moved else self._own.tolerance
         shifted = newton.augment() if self._balanced else 0.0
-        start = self._predicted(pose) if moved else None
+        start = None
+        if pose is None:
+            newton.lift()
+            self._aimed = None
+        elif moved:
+            start = self._predicted(pose)
         newton.may_factor = not moved or self._small
         self.cg = self.steps = 0
         left = self._own.most_iterations
@@ -206,6 +247,14 @@ class FemNonlinear(TissueSolver):
         """N, what unbalanced forces are measured by."""
         return self._newton.load or self._heaviest
 
+    def _is_unloaded(self, pose: Pose | None) -> bool:
+        """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
+        overstress = self._newton.overstress
+        if overstress is not None and np.abs(overstress.relaxed).max() > _SUNK:
+            return False
+        rest = self.model.mesh.nodes[self._surface]
+        return pose is None or self._depth(pose, rest) <= GAP_TOLERANCE
+
     def _depth(self, pose: Pose, points: NDArray[np.float64]) -> float:
         """How deep (m) the probe is in points (C, 3), at least 0."""
         if len(points) == 0:
@@ -223,16 +272,16 @@ class FemNonlinear(TissueSolver):
             self._compliance.matrix,
             contact.reach,
             contact.normal,
-            held,
-            contact.softness,
+            held / self._stiffer,
+            contact.softness * self._stiffer,
             self._touching,
         )
-        newton.expect(np.einsum("ij,ij->i", held + change, contact.normal))
+        newton.expect(np.einsum("ij,ij->i", held + self._stiffer * change, contact.normal))
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
         return field.astype(np.float64)
 
-    def _outcome(self, pose: Pose, stuck: bool, shifted: float) -> Deformation:
+    def _outcome(self, pose: Pose | None, stuck: bool, shifted: float) -> Deformation:
         newton, actions = self._newton, []
         shown = newton.displacement
         if newton.tissue.smallest_volume_ratio(shown) > 0.0:
@@ -249,8 +298,11 @@ class FemNonlinear(TissueSolver):
         forces = contact.force
         pushed = forces.any(axis=1)
         touched, forces = self._surface[pushed], forces[pushed]
-        force, torque = wrench_on_probe(pose, nodes[touched], forces)
-        self._settled = stuck or (residual <= self._own.tolerance and shifted < _SUNK)
+        force, torque = np.zeros(3), np.zeros(3)
+        if pose is not None:
+            force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        balanced = residual <= self._own.tolerance and shifted < _SUNK
+        self._settled = self._has_relaxed and (stuck or balanced)
         if stuck:
             actions.append("no step led any further")
         if newton.displacement is not shown:

@@ -1,8 +1,8 @@
 """Newton's method for the energy of tissue and contact together: every step lowers it.
 
-The energy is that of `neo_hookean` and of `penalty_contact`. A step minimises its quadratic model,
-in which nodes come to touch and are let go as the displacement says, by conjugate gradients with
-the exact tangent; then a line search takes as much of it as lowers the energy itself. Where the
+The energy is that of `neo_hookean` and of `penalty_contact`, and where they are asked for those of
+`penalty_friction` and `overstress`. A step minimises its quadratic model, in which nodes come to
+touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a line search takes as much of it as lowers the energy itself. Where the
 tangent is indefinite or a step had to be cut, the model is made stiffer (K. Levenberg, A method for
 the solution of certain non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer
 again as steps succeed. The iterates may be inside out, which the energy allows for; whoever shows
@@ -31,6 +31,7 @@ from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
@@ -100,9 +101,12 @@ class Newton:
     Args:
         model: of the tissue and the probe.
         friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
+        branch: of viscous tissue.
     """
 
-    def __init__(self, model: TissueModel, friction: float = 0.0) -> None:
+    def __init__(
+        self, model: TissueModel, friction: float = 0.0, branch: PronyBranch | None = None
+    ) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is needed
         #: Whether a step may take the time to factor the stiffness.
@@ -117,7 +121,13 @@ class Newton:
         self._fixed = np.flatnonzero(model.fixed)
         self._surface = model.movable_contact_nodes
         self._surface_rest = mesh.nodes[self._surface]
-        grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
+        self.overstress: Overstress | None = None
+        if branch is not None:
+            single = NeoHookean(mesh, model.materials, self._dtype)
+            self.overstress = Overstress(branch, self.tissue, single)
+        stiffened = self.overstress.stiffened if self.overstress else None
+        product = stiffened or self.tissue.tangent_product
+        grid = CoarseGrid(mesh, model.fixed, product, self._dtype)
         rest = self.tissue.diagonal_blocks()
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
@@ -134,6 +144,8 @@ class Newton:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
         self.contact.clear()
+        if self.overstress is not None:
+            self.overstress.forget(self.displacement)
         self._damping = 0.0
         self.patience = _LEAST_PATIENCE  # iterations that the next step may take
         self._weigh()
@@ -149,6 +161,18 @@ class Newton:
         self._damping = 0.0
         self.patience = _LEAST_PATIENCE
         self._weigh()
+
+    def lift(self) -> None:
+        """Take the probe away, and weigh the forces; nothing moves."""
+        self.contact.clear()
+        self._damping = 0.0
+        self._weigh()
+
+    def relax(self) -> None:
+        """Let the time from frame to frame pass; nothing moves."""
+        if self.overstress is not None:
+            self.overstress.relax(self.displacement)
+            self._weigh()
 
     def augment(self) -> float:
         """Push the tissue out of the probe further; returns by how much at most, m."""
@@ -169,15 +193,24 @@ class Newton:
 
     def _weigh(self) -> None:
         """The energy and its slope at the displacement."""
-        contact, tissue = self.contact, self.tissue
-        tissue.forces(self.displacement, self._force)
-        self.energy = tissue.energy(self.displacement) + contact.energy  # J
+        contact = self.contact
+        self.tissue.forces(self.displacement, self._force)
+        self.energy = self._energy()  # J
+        if self.overstress is not None:
+            self.overstress.add_forces(self.displacement, self._force)
         self._slope = self._force.copy()
         force = contact.force
         self._slope[:, self._surface] -= force.T
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
         self.load = float(np.linalg.norm(force))  # N, of the contact forces
+
+    def _energy(self) -> float:
+        """J, of tissue and contact at the displacement."""
+        energy = self.tissue.energy(self.displacement) + self.contact.energy
+        if self.overstress is not None:
+            energy += self.overstress.energy(self.displacement)
+        return energy
 
     @property
     def unbalanced(self) -> NDArray[np.float64]:
@@ -228,6 +261,8 @@ class Newton:
         if self._damping > 0.0:
             damped = self._dtype(self._damping) * self._rest_blocks
             blocks += damped
+        if (overstress := self.overstress) is not None:
+            blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         pushed = np.flatnonzero(contact.push > 0.0)
         turn = np.zeros((0, 3, 3))
         if not contact.forward and len(pushed):
@@ -239,6 +274,8 @@ class Newton:
             tangent.tangent_product(change, image)
             if damped is not None:
                 image += apply_blocks(damped, change)
+            if overstress is not None:
+                overstress.add_product(change, image)
             if len(turned):
                 image[:, turned] -= np.einsum("kij,jk->ik", turn, change[:, turned])
 
@@ -280,13 +317,14 @@ class Newton:
             )
             self.used += solved.iterations
             segment *= 2
-            change = size * solved.solution.astype(np.float64)
-            bend = size * solved.image.astype(np.float64)
-            pull = -float((change * (self._force + image)).sum())
-            curvature = float((change * bend).sum())
-            length = contact.length_along(moved, change[:, nodes].T, pull, curvature)
-            step += length * change
-            image += length * bend
+            change, bent = size * solved.solution, size * solved.image
+            if isinstance(contact, PenaltyFriction):
+                pull = -float(np.vdot(change, self._force + image))
+                along = change[:, nodes].T.astype(np.float64)
+                length = contact.length_along(moved, along, pull, float(np.vdot(change, bent)))
+                change, bent = length * change, length * bent
+            step += change
+            image += bent
             if solved.curved:
                 return (step if step.any() else size * solved.direction), True
 
@@ -303,7 +341,7 @@ class Newton:
                 length /= 2
                 continue
             self.contact.look(self.surface)
-            if self.tissue.energy(self.displacement) + self.contact.energy <= bound:
+            if self._energy() <= bound:
                 self._weigh()
                 if self.energy < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
                     return length
