@@ -122,11 +122,11 @@ def test_a_small_press_and_drag_is_that_of_linear_elasticity(contact, friction):
     assert error < 0.01
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     seed=st.integers(0, 1000),
     friction=st.floats(0.01, 1.5),
-    collider=st.sampled_from([Sphere(0.04), LINEAR]),
+    collider=st.sampled_from([Sphere(0.04), PLATE]),
 )
 def test_a_held_probe_keeps_the_law_and_does_not_creep(seed, friction, collider):
     solver = rubbing(collider, friction=friction)
@@ -141,8 +141,10 @@ def test_a_held_probe_keeps_the_law_and_does_not_creep(seed, friction, collider)
     drag, push = drags_and_pushes(solver.model, pose, deformation)
     assert push.min() > -1e-4 * push.max()
     assert (np.linalg.norm(drag, axis=1) <= friction * push + 2e-3 * push.max()).all()
-    solver._settled = False  # or nothing would be computed
-    np.testing.assert_allclose(solver.deform(pose).nodes, deformation.nodes, atol=2e-6)
+    for _ in range(20):
+        solver._settled = False  # or nothing would be computed
+        later = solver.deform(pose)
+    np.testing.assert_allclose(later.nodes, deformation.nodes, atol=5e-5)
 
 
 def test_the_wrench_is_what_holds_the_block():

@@ -2,11 +2,11 @@
 
 The energy is that of `neo_hookean` and of `penalty_contact`, and where they are asked for those of
 `penalty_friction` and `overstress`. A step minimises its quadratic model, in which nodes come to
-touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a line search takes as much of it as lowers the energy itself. Where the
-tangent is indefinite or a step had to be cut, the model is made stiffer (K. Levenberg, A method for
-the solution of certain non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer
-again as steps succeed. The iterates may be inside out, which the energy allows for; whoever shows
-them has to wait.
+touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a
+line search takes as much of it as lowers the energy itself. Where the tangent is indefinite or a
+step had to be cut, the model is made stiffer (K. Levenberg, A method for the solution of certain
+non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer again as steps succeed.
+The iterates may be inside out, which the energy allows for; whoever shows them has to wait.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
