@@ -191,6 +191,32 @@ class PenaltyContact:
         return np.where((push > 0.0) & (push < self._strongest), self._stiffness, 0.0)
 
     @property
+    def force(self) -> NDArray[np.float64]:
+        """(C, 3) N, on the tissue."""
+        force: NDArray[np.float64] = self.push[:, None] * self.normal
+        return force
+
+    def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(C, 3) N, `force` after nodes moved by ``change`` (C, 3) m, as normals are now."""
+        reached = self.gap + np.einsum("ij,ij->i", self.normal, change)
+        force: NDArray[np.float64] = self.push_at(reached)[:, None] * self.normal
+        return force
+
+    def springs_after(
+        self, change: NDArray[np.float64]
+    ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
+        """How that falls with the change: nodes (K,), each with all its springs in a row, the
+        springs' directions (K, 3) and stiffnesses (K,) N/m.
+        """
+        slope = self.slope_at(self.gap + np.einsum("ij,ij->i", self.normal, change))
+        active = np.flatnonzero(slope > 0.0)
+        return active, self.normal[active], slope[active]
+
+    def expect(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
+        """Learn which pushes (C,) N are likely at the new pose; returns if forces change by it."""
+        return False
+
+    @property
     def reach(self) -> NDArray[np.float64]:
         """(C,) m, gaps to where the springs end."""
         return self.gap - self._shift
