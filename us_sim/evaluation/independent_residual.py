@@ -59,12 +59,12 @@ _WALL = 5.0
 """Modulus of that resistance, over the geometric mean of a tetrahedron's own shear modulus and the
 largest among the tetrahedra with which it shares a node."""
 
-_FLANK = math.radians(60)  # between the front of a probe and its flanks
-
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
 
 _GRIP = 0.1  # m, how far the probe is taken to go on behind its collider
+
+_STEEP = math.radians(60)  # of the flanks of a probe of small rounding to its face
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ def push_directions(
 
     The rule of `us_sim.tissue.contact.penetration.push_out`, written down again. With ``flanks`` a
     point that lies nearer to a flank of a probe of small rounding than to its front is pushed
-    square to that flank, which is a plane at 60 degrees to the front.
+    square to that flank, a plane along the rounding where this is 60 degrees to the face.
     """
     box = collider.offset_box
     rounding = box[3]
@@ -335,14 +335,13 @@ def push_directions(
         if not flanks:
             return forward @ pose.rotation.T
         nearest = (inside == inside.min(axis=1)[:, None]) & (out == 0.0).all(axis=1)[:, None]
-        aside = side * np.where(nearest, 1.0, out)
-        aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
-        sine, cosine = math.sin(_FLANK), math.cos(_FLANK)
-        aside = np.column_stack([sine * aside, np.full(len(points), cosine)])
-        beside = np.linalg.norm(np.where(nearest, -inside, out), axis=1)
-        beside = np.where(nearest.any(axis=1), -beside, beside)
-        from_flank = np.abs(sine * beside + cosine * ahead - rounding)
-        by_flank = (ahead < 0.0) & (from_flank < np.abs(ahead - rise))
+        beside = np.where(nearest.any(axis=1), -inside.min(axis=1), np.linalg.norm(out, axis=1))
+        along = side * np.where(nearest, 1.0, out)
+        along /= np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
+        sine, cosine = math.sin(_STEEP), math.cos(_STEEP)
+        aside = np.column_stack([sine * along, np.full(len(points), cosine)])
+        to_flank = sine * beside + cosine * ahead - rounding
+        by_flank = (ahead < 0.0) & (np.abs(to_flank) < np.abs(ahead - rise))
         return np.where(by_flank[:, None], aside, forward) @ pose.rotation.T
     behind = -(ahead + 2 * box[2] + _GRIP)
     up = np.maximum(ahead, 0.0) - np.maximum(behind, 0.0)

@@ -147,18 +147,19 @@ def aside(where, skirt=0.0):
 
 @pytest.mark.parametrize("depth", [0.006, 0.01, 0.02])
 @pytest.mark.parametrize("entered", [1e-4, 1e-3])
-def test_what_comes_in_from_the_side_is_moved_by_the_lateral_depth(depth, entered):
-    gap, normal = aside([0.025 - entered, 0.0, -depth])
-    assert gap == pytest.approx(-entered)
-    np.testing.assert_allclose(normal, [1, 0, 0])
-    gap, normal = aside([0.0, entered - 0.015, -depth])
-    assert gap == pytest.approx(-entered)
-    np.testing.assert_allclose(normal, [0, -1, 0])
-    # Round the edge, along a radius in the ratio 3 : 4.
-    radius = 0.004 - entered
-    gap, normal = aside([0.021 + 0.6 * radius, 0.011 + 0.8 * radius, -depth])
-    assert gap == pytest.approx(-entered)
-    np.testing.assert_allclose(normal, [0.6, 0.8, 0], atol=1e-12)
+def test_what_comes_in_from_the_side_is_pushed_aside_and_not_thrown_before_the_face(depth, entered):
+    # The flank is 60 degrees to the face, and touches the rounding of 4 mm.
+    sine, cosine = np.sqrt(0.75), 0.5
+    wide = (0.004 + cosine * (depth - 0.004)) / sine - entered  # from the core, there
+    for core, direction in (
+        ([0.021, 0.0], [1.0, 0.0]),
+        ([0.0, -0.011], [0.0, -1.0]),
+        ([0.021, 0.011], [0.6, 0.8]),
+    ):
+        x, y = np.add(core, wide * np.array(direction))
+        gap, normal = aside([x, y, -depth])
+        assert gap == pytest.approx(-sine * entered)
+        np.testing.assert_allclose(normal, [*np.multiply(sine, direction), cosine], atol=1e-12)
 
 
 def test_a_flank_ends_behind_the_probe_and_begins_behind_the_rounding():
@@ -176,9 +177,10 @@ def test_whatever_is_inside_is_pushed_out_the_shorter_way(x, y, z):
     forward = push_out(BOX, Pose(), np.array([[x, y, z]]), COARSE)[0][0]
     assert gap >= forward - 1e-15
     landed = np.array([[x, y, z]]) - gap * normal
-    left, _ = push_out(BOX, Pose(), landed, COARSE, flanks=True)
+    assert (landed - [x, y, z])[0, 2] >= 0 or gap > 0
     if gap < 0:
-        assert left[0] == pytest.approx(0.0, abs=1e-12)
+        left, _ = push_out(BOX, Pose(), landed, COARSE, flanks=True)
+        assert left[0] >= -1e-12
 
 
 @settings(deadline=None, max_examples=200)
@@ -217,12 +219,12 @@ def test_planes_follow_the_nodes_until_these_lie_on_the_surface():
 
 
 def test_a_node_that_goes_to_and_fro_is_not_followed_without_end():
-    contact, _ = contact_at(BOX, [[0.0249, 0.0, -0.0039]], COARSE, Pose())
+    contact, _ = contact_at(BOX, [[0.0, 0.0, -0.002]], COARSE, Pose())
     changes = []
-    for place in 20 * [[0.0249, 0.0, -0.0041 - 0.006], [0.0249, 0.0, -0.0039]]:
+    for place in 20 * [[0.0239, 0.0, -0.012], [0.0, 0.0, -0.002]]:
         contact.look(np.array([place]))
         changes.append(contact.follow(np.array([place])))
     assert changes[0] > 0.005
     assert not np.any(changes[-10:])
-    contact.aim(Pose(position=[0.0, 0.0, 1e-6]), np.array([[0.0249, 0.0, -0.0039]]))
-    assert contact.follow(np.array([[0.0, 0.0, -0.001]])) > 0.0
+    contact.aim(Pose(position=[0.0, 0.0, 1e-6]), np.array([[0.0, 0.0, -0.002]]))
+    assert contact.follow(np.array([[0.0239, 0.0, -0.012]])) > 0.0

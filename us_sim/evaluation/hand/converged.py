@@ -110,17 +110,19 @@ def patient_solver(model: TissueModel) -> TissueSolver:
 
 
 def settled(solver: TissueSolver, pose: Pose) -> Deformation:
-    """The best of many frames at one pose: until it has converged, or goes no further."""
+    """The last of many frames at one pose, or the best: until it settles, or goes no further.
+
+    Of frames in balance the last is the best: in the earlier ones the probe is still sunk in.
+    """
     found = solver.deform(pose)
     best = [found]
     for _ in range(_MOST_CALLS - 1):
         stalled = len(best) > _PATIENCE and (
-            best[-1].residual > _PROGRESS * best[-1 - _PATIENCE].residual
+            best[-1].residual > max(CONVERGED, _PROGRESS * best[-1 - _PATIENCE].residual)
         )
-        if best[-1].residual <= CONVERGED or stalled:
+        if solver.is_settled or stalled:
             break
-        before, found = found, solver.deform(pose)
-        if found is before:  # it will not change any more
-            break
-        best.append(min(best[-1], found, key=lambda each: each.residual))
+        found = solver.deform(pose)
+        balanced = found.residual <= CONVERGED
+        best.append(found if balanced else min(best[-1], found, key=lambda each: each.residual))
     return best[-1]

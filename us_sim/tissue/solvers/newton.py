@@ -12,7 +12,7 @@ The iterates may be inside out, which the energy allows for; whoever shows them 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.newton import Newton
->>> newton = Newton(TissueModel.block(nodes=(4, 4, 4)))
+>>> newton = Newton(TissueModel.block(nodes=(5, 5, 5)))
 >>> newton.aim(Pose(position=[0.0, 0.0, 0.005]))
 >>> unbalanced, energy = newton.imbalance, newton.energy
 >>> all(newton.step(20) for _ in range(6))
