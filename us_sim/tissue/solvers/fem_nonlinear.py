@@ -58,9 +58,6 @@ __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 _TOUCHING = 0.1
 """Gap up to which a node may come to touch in one frame, over the tissue's smallest extent."""
 
-_SMALL = 500
-"""Free nodes up to which there is time to factor the stiffness while the probe moves."""
-
 _RESTING = 30
 """Frames of a probe at rest after which one may take longer than it should, if that is needed."""
 
@@ -91,7 +88,9 @@ class FemNonlinearSettings(SolverSettings):
         default=None,
     )
     most_iterations: int = setting(
-        COUNT, "conjugate-gradient iterations of any frame at most", default=250
+        COUNT,
+        "conjugate-gradient iterations of a frame at most, twice as many while the probe rests",
+        default=250,
     )
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
@@ -164,7 +163,6 @@ class FemNonlinear(TissueSolver):
         branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
         self._newton = Newton(model, laws[settings.contact], branch if settings.viscosity else None)
         self._upright = self._newton.displacement  # (3, N) m, the last that was
-        self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
         self._restore(self.state)
@@ -250,8 +248,9 @@ class FemNonlinear(TissueSolver):
             start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
-        newton.may_factor = self._small or not (moved or hurried)
-        left, stuck, actions = settings.most_iterations, False, []
+        newton.may_factor = newton.is_small or not (moved or hurried)
+        left = settings.most_iterations if moved else 2 * settings.most_iterations
+        stuck, actions = False, []
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough = goal * newton.load if start is None else 0.0
             taken = newton.step(min(left, newton.patience), enough, start)

@@ -66,8 +66,11 @@ _LEAST_PATIENCE = 12
 """Iterations of the first step: solved further, a step after a large change overshoots. Those after
 it may take twice as many as long as steps need not be cut."""
 
-_MOST_PATIENCE = 100
-"""Iterations beyond which a factor of the stiffness takes less time."""
+_SMALL = 500
+"""Free nodes up to which a factor of the stiffness takes no longer than a frame."""
+
+_MOST_PATIENCE, _MOST_PATIENCE_SMALL = 100, 45
+"""Iterations beyond which a factor of the stiffness takes less time, the latter up to that size."""
 
 _BACKTRACKS = 8
 """Step lengths that are tried, each half the last."""
@@ -82,7 +85,7 @@ _SEGMENT = 12
 _ROUNDING = 1e-12
 """Fraction of the energy by which rounding may seem to raise it."""
 
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.01, 1e3
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.01, 0.001, 1e3
 """Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
 
 _LOCAL_WEIGHT = 6.0
@@ -107,6 +110,9 @@ class Newton:
     ) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is first needed
+        #: Whether a factor takes no longer than a frame.
+        self.is_small = int((~model.fixed).sum()) <= _SMALL
+        self._most_patience = _MOST_PATIENCE_SMALL if self.is_small else _MOST_PATIENCE
         #: Whether a step may take the time to factor the stiffness.
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
@@ -248,7 +254,7 @@ class Newton:
             self.patience = _LEAST_PATIENCE
         elif self.used >= iterations:
             self.patience *= 2
-            if self.patience > _MOST_PATIENCE and self.may_factor:
+            if self.patience > self._most_patience and self.may_factor:
                 self._factors = True
         if length < 1.0 or curved:
             self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
