@@ -23,12 +23,14 @@ from us_sim.evaluation.settling import frames_until
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.solvers.frame_time import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver
 
 __all__ = [
     "ENOUGH",
     "HOLD",
     "OWN_EVERY",
+    "SENDING_S",
     "Frames",
     "Held",
     "Live",
@@ -43,6 +45,8 @@ HOLD = 60
 """Frames in which the probe stays where it is."""
 OWN_EVERY = 5
 """Frames, of which one is converged by itself."""
+SENDING_S = 0.0005
+"""What it takes a node to send its result."""
 _SMALL = 1e-3
 """Residual that a held probe must come to."""
 
@@ -252,9 +256,11 @@ class _Bench:
     def live(self) -> Live:
         """Poses come at their times, and a frame begins with the newest of them.
 
-        The clock is the wall's while a frame is made; waiting for a pose takes no time.
+        The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
+        take as long as `frame_limit` says, as in the node.
         """
         self._solver.reset()
+        self._solver.frame_limit = frame_limit(SENDING_S, usable_cores())
         poses = self._motion.poses
         rows, latency = [], []
         now, done = 0.0, -1
@@ -270,6 +276,7 @@ class _Bench:
             if newest >= self._motion.begins:
                 rows.append(row)
                 latency.append(1e3 * (now - newest / RATE))
+        self._solver.frame_limit = None
         return Live(len(poses) - self._motion.begins, _frames(rows), np.array(latency))
 
     def _frame(self, k: int, *, own_balance: bool = False) -> tuple[float, ...]:

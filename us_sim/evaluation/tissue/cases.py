@@ -36,6 +36,10 @@ _STEP = 0.0025  # m, of the probe in a frame
 _TURN = math.radians(2.5)  # of the probe in a frame
 _SPHERE = Sphere(0.03)
 
+_GROWTH, _FAST_GROWTH = 1.2, 1.5  # of the reference's elements, away from the probe
+_HARDLY_COMPRESSIBLE = 0.49
+"""Poisson's ratio beyond which the reference's linear equations take too long on small elements."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -64,10 +68,11 @@ class Scene:
     def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
         low, high, beside = self.touched
+        growth = _GROWTH if self.poisson_ratio <= _HARDLY_COMPRESSIBLE else _FAST_GROWTH
         return (
-            graded_planes(*EXTENT[0], low, high, size),
-            graded_planes(0.0, EXTENT[1][1], 0.0, beside, size),
-            graded_planes(*EXTENT[2], 0.0, 0.02, size),
+            graded_planes(*EXTENT[0], low, high, size, growth),
+            graded_planes(0.0, EXTENT[1][1], 0.0, beside, size, growth),
+            graded_planes(*EXTENT[2], 0.0, 0.02, size, growth),
         )
 
 

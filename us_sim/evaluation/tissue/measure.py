@@ -32,7 +32,7 @@ __all__ = ["Trial", "evaluate_tissue", "plan"]
 
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
 _QUICK_SETTINGS = 3  # of each method, the defaults among them
-_SIZES, _QUICK_SIZES = (0.01, 0.005, 0.00325), (0.01, 0.0065)  # m, of the reference's elements
+_SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the reference's elements
 
 
 @dataclass(frozen=True)

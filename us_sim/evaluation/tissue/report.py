@@ -109,8 +109,9 @@ def _parts(
         "frame as it came out while the probe moved: L2 and maximum of all nodes' displacements, "
         "the force along the probe, and the block's volume over its volume at rest.",
         "## Against large deformation",
-        "The reference is a stable neo-Hookean block of 27-node hexahedra with contact over the "
-        "whole surface, by scikit-fem; what it still changes from one mesh to the next finer is:",
+        "The reference is a stable neo-Hookean block of 27-node hexahedra, in each of which the "
+        "pressure is linear, with contact over the whole surface, by scikit-fem; what it still "
+        "changes from one mesh to the next finer is:",
         _reference_table(references),
         "![Error against run time](tissue_error.png)",
         "Full marks are defaults; lines join a method's settings that solve the same equations; "

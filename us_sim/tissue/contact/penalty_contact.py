@@ -43,10 +43,11 @@ _FORWARD = 0.99
 """Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
 
 
-_FOLLOWED = 12
-"""How often at one pose the planes are fixed anew where the nodes have moved to. It usually takes a
-few; at the rim a node can go to and fro between the front and a flank, or between being held and
-let go, without end, and then stays where it is."""
+_ALIKE = 0.999
+"""Cosine between two normals of the same part of a probe."""
+
+_FOLLOWED = 40
+"""How often at one pose the planes are fixed anew where the nodes have moved to."""
 
 
 class PenaltyContact:
@@ -98,36 +99,48 @@ class PenaltyContact:
         energy. With the planes fixed until the next aim it has one.
         """
         self._followed = 0
-        self._fix_planes(pose, positions)
-
-    def _fix_planes(self, pose: Pose, positions: NDArray[np.float64]) -> None:
         before = self.normal
-        by_face = (self.push > 0.0) & (before @ pose.rotation[:, 2] > _FORWARD)
-        margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
-        gap, self.normal = push_out(
-            self._collider, pose, positions, self._spacing, margin, flanks=True
-        )
+        gap, self.normal = self._gaps(pose, positions)
         likeness = np.einsum("ij,ij->i", before, self.normal)
         self._shift *= np.where(np.isfinite(gap), np.maximum(likeness, 0.0), 0.0)
         self._pose = pose
         self._height = np.einsum("ij,ij->i", positions, self.normal) - gap if self.forward else None
         self._measure(gap)
 
+    def _gaps(
+        self, pose: Pose, positions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        by_face = (self.push > 0.0) & (self.normal @ pose.rotation[:, 2] > _FORWARD)
+        margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
+        return push_out(self._collider, pose, positions, self._spacing, margin, flanks=True)
+
     def follow(self, positions: NDArray[np.float64]) -> float:
         """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.
 
+        Only their heights: a node that the front pushes is not handed to a flank, nor the other way
+        round, as some would go to and fro without end.
+
         Returns:
-            m, the largest change of a pushed node's gap, or of its normal times the spacing.
+            m, the largest change of a pushed node's gap.
         """
         if self._height is None or self._pose is None or self._followed == _FOLLOWED:
             return 0.0
         self._followed += 1
-        pushed, gap, normal = self.push > 0.0, self.gap, self.normal
-        self._fix_planes(self._pose, positions)
+        gap, normal = self._gaps(self._pose, positions)
+        alike = np.einsum("ij,ij->i", normal, self.normal) > _ALIKE
+        taken = np.isfinite(gap) & (alike | ~np.isfinite(self.gap))
+        self.normal = np.where(taken[:, None], normal, self.normal)
+        height = np.einsum("ij,ij->i", positions, normal) - gap
+        pushed, before = self.push > 0.0, self.gap
+        # Half the way: at the rim heights change faster than nodes slide.
+        old = np.isfinite(self._height)
+        halfway = np.where(old, (height + np.where(old, self._height, 0.0)) / 2, height)
+        self._height = np.where(taken, halfway, self._height)
+        self.look(positions)
         pushed |= self.push > 0.0
-        closer = np.abs(self.gap[pushed] - gap[pushed]).max(initial=0.0)
-        turned = np.abs(self.normal[pushed] - normal[pushed]).max(initial=0.0)
-        return float(max(closer, self._spacing * turned))
+        with np.errstate(invalid="ignore"):
+            change = np.abs(self.gap[pushed] - before[pushed])
+        return float(np.nan_to_num(change, posinf=self._spacing).max(initial=0.0))
 
     def look(self, positions: NDArray[np.float64]) -> None:
         """Measure gaps, normals and pushes at other positions (C, 3) m."""
@@ -176,6 +189,32 @@ class PenaltyContact:
         """(C,) N/m, how fast the pushes fall with gaps (C,) m."""
         push = self._stiffness * (self._shift - gap)
         return np.where((push > 0.0) & (push < self._strongest), self._stiffness, 0.0)
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """(C, 3) N, on the tissue."""
+        force: NDArray[np.float64] = self.push[:, None] * self.normal
+        return force
+
+    def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(C, 3) N, `force` after nodes moved by ``change`` (C, 3) m, as normals are now."""
+        reached = self.gap + np.einsum("ij,ij->i", self.normal, change)
+        force: NDArray[np.float64] = self.push_at(reached)[:, None] * self.normal
+        return force
+
+    def springs_after(
+        self, change: NDArray[np.float64]
+    ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
+        """How that falls with the change: nodes (K,), each with all its springs in a row, the
+        springs' directions (K, 3) and stiffnesses (K,) N/m.
+        """
+        slope = self.slope_at(self.gap + np.einsum("ij,ij->i", self.normal, change))
+        active = np.flatnonzero(slope > 0.0)
+        return active, self.normal[active], slope[active]
+
+    def expect(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
+        """Learn which pushes (C,) N are likely at the new pose; returns if forces change by it."""
+        return False
 
     @property
     def reach(self) -> NDArray[np.float64]:

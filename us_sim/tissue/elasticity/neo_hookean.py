@@ -63,18 +63,19 @@ class NeoHookean:
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.float32, np.float64):
             raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
-        self._count = len(mesh.nodes)
+        #: Number of nodes, N.
+        self.count = len(mesh.nodes)
         kind = TetrahedraSums if mesh.planes is None else CellSums
         self._sums: NodalSums = kind(mesh, materials, self.dtype)
         weight = volumetric_split(materials).nodal * mesh.volumes / 4
-        total = np.zeros(self._count)
+        total = np.zeros(self.count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
-        self._nodal = np.zeros(self._count if self._averaged else 0, dtype=self.dtype)
+        self._nodal = np.zeros(self.count if self._averaged else 0, dtype=self.dtype)
         self._nodal_blocks = _nodal_blocks(mesh, weight, total).astype(self.dtype)
-        self.linearise(np.zeros((3, self._count), dtype=self.dtype))
+        self.linearise(np.zeros((3, self.count), dtype=self.dtype))
 
     def energy(self, displacement: NDArray) -> float:
         """J, summed in double precision."""
@@ -116,7 +117,7 @@ class NeoHookean:
 
         The nodal part of the bulk stiffness is counted as it is at rest.
         """
-        blocks = np.empty((6, self._count), dtype=self.dtype)
+        blocks = np.empty((6, self.count), dtype=self.dtype)
         self._sums.diagonal_blocks(blocks)
         blocks += self._nodal_blocks
         return blocks
@@ -133,13 +134,13 @@ class NeoHookean:
 
     def _require(self, field: NDArray) -> None:
         if (
-            field.shape != (3, self._count)
+            field.shape != (3, self.count)
             or field.dtype != self.dtype
             or not field.flags.c_contiguous
         ):
             raise SolverError(
                 f"a field of the neo-Hookean tissue is {field.dtype} of shape {field.shape}: give "
-                f"C-contiguous {self.dtype} of shape {(3, self._count)}"
+                f"C-contiguous {self.dtype} of shape {(3, self.count)}"
             )
 
     def _mean_change(self, displacement: NDArray) -> NDArray:

@@ -87,7 +87,7 @@ class TwoLevel:
 
         Args:
             blocks: (6, N) N/m, xx, xy, xz, yy, yz, zz of each node's block of the stiffness.
-            nodes: (K,), where there are springs.
+            nodes: (K,), where there are springs, all of one node in a row.
             normals: (K, 3), their directions.
             stiffness: (K,) N/m.
         """
@@ -108,7 +108,8 @@ class TwoLevel:
             self._inverse,
         )
         if self._grid is not None:
-            self._grid.touch(nodes, normals, own)
+            # A spring softer than the tissue does not keep it from moving.
+            self._grid.touch(nodes, normals, np.minimum(own, stiffness))
 
     def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         """Overwrite ``out`` with the preconditioner times ``residual``."""
@@ -164,7 +165,7 @@ def apply_blocks(blocks: NDArray[np.floating], field: NDArray[np.floating]) -> N
 
 @njit(**_LOOP)
 def _invert_blocks(blocks, scale, fixed, nodes, normals, springs, own, inverse):
-    """Inverse of each block with its spring, times scale; fills own (K,), n' D n of the blocks."""
+    """Inverse of each block with its springs, times scale; fills own (K,), n' D n of the blocks."""
     for i in range(blocks.shape[1]):
         _invert(blocks[:, i], scale, inverse[:, i])
     one = np.empty(6, blocks.dtype)
@@ -173,12 +174,13 @@ def _invert_blocks(blocks, scale, fixed, nodes, normals, springs, own, inverse):
         x = normals[k, 0]
         y = normals[k, 1]
         z = normals[k, 2]
-        one[:] = blocks[:, i]
+        if k == 0 or nodes[k - 1] != i:
+            one[:] = blocks[:, i]
         own[k] = (
-            one[0] * x * x
-            + one[3] * y * y
-            + one[5] * z * z
-            + 2 * (one[1] * x * y + one[2] * x * z + one[4] * y * z)
+            blocks[0, i] * x * x
+            + blocks[3, i] * y * y
+            + blocks[5, i] * z * z
+            + 2 * (blocks[1, i] * x * y + blocks[2, i] * x * z + blocks[4, i] * y * z)
         )
         s = springs[k]
         one[0] += s * x * x

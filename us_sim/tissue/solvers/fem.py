@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.compliant_contact import CompliantContact
 from us_sim.tissue.contact.friction import FrictionalContact
+from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.penetration import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
@@ -41,9 +41,7 @@ from us_sim.tissue.linear_algebra.dense_fields import DenseFields
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["CONTACTS", "Fem", "FemSettings"]
-
-CONTACTS = ("frictionless", "coulomb", "sticking")  # laws of friction between probe and surface
+__all__ = ["Fem", "FemSettings"]
 
 _ROUNDING = 1e-5
 """Rounding error of full fields, over the force, above which it is measured in every frame."""
@@ -65,9 +63,7 @@ class FemSettings(SolverSettings):
         "on the probe until it is pulled",
     )
     friction: float = setting(
-        Quantity("number", 1e-9, 10.0),
-        "Coulomb's coefficient, where contact is coulomb",
-        default=0.3,
+        COEFFICIENT, "Coulomb's coefficient, where contact is coulomb", default=0.3
     )
 
 

@@ -3,7 +3,9 @@
 Quasi-static: every frame the energy of `neo_hookean` and of a penalty contact is made least, by
 Newton's method with a line search (see `us_sim.tissue.solvers.newton`), from where the frame before
 ended. A new pose of the probe is met with the exact linear answer to it first (contact is a
-complementarity problem on the surface compliance). What a frame's time does not allow for goes on
+complementarity problem on the surface compliance). Friction and viscous tissue, where they are
+asked for, remember the frames before (see `us_sim.tissue.contact.penalty_friction` and
+`us_sim.tissue.elasticity.overstress`). What a frame's time does not allow for goes on
 in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
 on but never shown.
 
@@ -20,6 +22,7 @@ on but never shown.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,11 +34,13 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
+from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out, wrench_on_probe
 from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
+from us_sim.tissue.elasticity.overstress import PronyBranch
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
@@ -52,9 +57,6 @@ __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
 _TOUCHING = 0.1
 """Gap up to which a node may come to touch in one frame, over the tissue's smallest extent."""
-
-_SMALL = 500
-"""Free nodes up to which there is time to factor the stiffness while the probe moves."""
 
 _RESTING = 30
 """Frames of a probe at rest after which one may take longer than it should, if that is needed."""
@@ -86,15 +88,45 @@ class FemNonlinearSettings(SolverSettings):
         default=None,
     )
     most_iterations: int = setting(
-        COUNT, "conjugate-gradient iterations of any frame at most", default=400
+        COUNT,
+        "conjugate-gradient iterations of a frame at most, twice as many while the probe rests",
+        default=250,
     )
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
     )
+    contact: str = setting(
+        choices=CONTACTS,
+        default="frictionless",
+        description="what holds between probe and tissue; sticking: a touched node keeps its place "
+        "on the probe until it is let go",
+    )
+    friction: float = setting(
+        COEFFICIENT,
+        "Coulomb's coefficient, where contact is coulomb; the default is a choice, meant for gel",
+        default=0.07,
+    )
+    viscosity: float = setting(
+        Quantity("number", 0.0, 10.0),
+        "stiffness that relaxes while a deformation lasts, over the one that stays: tissue gives "
+        "way slowly and creeps back when it is let go; 0: none",
+        default=0.0,
+    )
+    relaxation_time: float = setting(
+        Quantity("time", 1e-3, 1e3),
+        "time in which that falls to 37 percent (1/e)",
+        default=0.5,
+    )
+    frame_interval: float = setting(
+        Quantity("time", 1e-4, 10.0),
+        "time that is taken to pass from one frame to the next, for viscous tissue; a frame is "
+        "one pose of the probe",
+        default=0.0167,
+    )
 
 
 class FemNonlinear(TissueSolver):
-    """Stable neo-Hookean finite elements with frictionless contact, by Newton's method.
+    """Stable neo-Hookean finite elements under a probe, by Newton's method.
 
     The residual is the norm of the unbalanced nodal forces, of tissue and contact together, over
     the norm of the contact forces (without any, over the largest since rest), in double precision
@@ -127,9 +159,10 @@ class FemNonlinear(TissueSolver):
         smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
         self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
         self._touching = _TOUCHING * smallest
-        self._newton = Newton(model)
+        laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
+        branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
+        self._newton = Newton(model, laws[settings.contact], branch if settings.viscosity else None)
         self._upright = self._newton.displacement  # (3, N) m, the last that was
-        self._small = int((~model.fixed).sum()) <= _SMALL
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
         self._restore(self.state)
@@ -141,19 +174,36 @@ class FemNonlinear(TissueSolver):
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: computed with the tissue's compliance at rest."""
+        """Approximate: computed with the tissue's compliance at rest. With friction, how much a
+        node may be dragged is not known.
+        """
         contact = self._newton.contact
         pushed = np.flatnonzero(contact.push > 0.0)
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
+        if self._own.contact != "frictionless":
+            return None
         return contact_stiffness(
             self.model.collider,
             self._pose,
             self._newton.surface[pushed],
             contact.push[pushed, None] * contact.normal[pushed],
-            compliance_between(self._compliance.matrix, pushed),
+            compliance_between(self._compliance.matrix, pushed) / self._stiffer,
             self.model.contact_spacing,
+            flanks=True,
         )
+
+    @property
+    def _stiffer(self) -> float:
+        """Stiffness within a frame, over the one that stays."""
+        overstress = self._newton.overstress
+        return 1.0 if overstress is None else 1.0 + overstress.stiffness
+
+    @property
+    def _has_relaxed(self) -> bool:
+        """Whether viscous tissue will not creep any more."""
+        overstress = self._newton.overstress
+        return overstress is None or overstress.load <= self._own.tolerance * self._reference()
 
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()
@@ -167,6 +217,8 @@ class FemNonlinear(TissueSolver):
             # The way out of tissue inside out may end in a minimum where it is folded over.
             if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
                 self._newton.put(displacement)
+                if self._newton.overstress is not None:
+                    self._newton.overstress.forget(displacement)
         self._upright = self._newton.displacement
 
     def _rehearse(self) -> None:
@@ -175,7 +227,8 @@ class FemNonlinear(TissueSolver):
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
         newton, settings = self._newton, self._own
-        if pose is None or self._depth(pose, self.model.mesh.nodes[self._surface]) <= GAP_TOLERANCE:
+        newton.relax()
+        if self._is_unloaded(pose):
             # Nothing reaches the undeformed tissue: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
@@ -187,11 +240,17 @@ class FemNonlinear(TissueSolver):
         shifted = np.inf
         if self._balanced:
             shifted = newton.augment() if moved else newton.follow()
-        start = self._predicted(pose) if moved else None
+        start = None
+        if pose is None:
+            newton.lift()
+            self._aimed = None
+        elif moved:
+            start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
-        newton.may_factor = self._small or not (moved or hurried)
-        left, stuck, actions = settings.most_iterations, False, []
+        newton.may_factor = newton.is_small or not (moved or hurried)
+        left = settings.most_iterations if moved else 2 * settings.most_iterations
+        stuck, actions = False, []
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough = goal * newton.load if start is None else 0.0
             taken = newton.step(min(left, newton.patience), enough, start)
@@ -215,6 +274,14 @@ class FemNonlinear(TissueSolver):
         """N, what unbalanced forces are measured by."""
         return self._newton.load or self._heaviest
 
+    def _is_unloaded(self, pose: Pose | None) -> bool:
+        """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
+        overstress = self._newton.overstress
+        if overstress is not None and np.abs(overstress.relaxed).max() > _SUNK:
+            return False
+        rest = self.model.mesh.nodes[self._surface]
+        return pose is None or self._depth(pose, rest) <= GAP_TOLERANCE
+
     def _depth(self, pose: Pose, points: NDArray[np.float64]) -> float:
         """How deep (m) the probe is in points (C, 3), at least 0."""
         if len(points) == 0:
@@ -232,10 +299,11 @@ class FemNonlinear(TissueSolver):
             self._compliance.matrix,
             contact.reach,
             contact.normal,
-            held,
-            contact.softness,
+            held / self._stiffer,
+            contact.softness * self._stiffer,
             self._touching,
         )
+        newton.expect(np.einsum("ij,ij->i", held + self._stiffer * change, contact.normal))
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
         return field.astype(np.float64)
@@ -252,7 +320,7 @@ class FemNonlinear(TissueSolver):
             "of its volume"
         )
 
-    def _outcome(self, pose: Pose, shifted: float, actions: list[str]) -> Deformation:
+    def _outcome(self, pose: Pose | None, shifted: float, actions: list[str]) -> Deformation:
         newton, contact = self._newton, self._newton.contact
         reached = newton.displacement
         if newton.tissue.smallest_volume_ratio(reached) > 0.0:
@@ -268,12 +336,15 @@ class FemNonlinear(TissueSolver):
         if sunk > _SINKS:
             actions.append(f"the probe is {1e3 * sunk:.2g} mm inside the tissue")
         nodes = self.model.mesh.nodes + newton.displacement.T
-        pushed = contact.push > 0
-        touched = self._surface[pushed]
-        forces = contact.push[pushed, None] * contact.normal[pushed]
-        force, torque = wrench_on_probe(pose, nodes[touched], forces)
+        forces = contact.force
+        pushed = forces.any(axis=1)
+        touched, forces = self._surface[pushed], forces[pushed]
+        force, torque = np.zeros(3), np.zeros(3)
+        if pose is not None:
+            force, torque = wrench_on_probe(pose, nodes[touched], forces)
         if self._inverted == 0:
-            self._settled |= residual <= self._own.tolerance and shifted <= self._sunk
+            balanced = residual <= self._own.tolerance and shifted <= self._sunk
+            self._settled = self._has_relaxed and (self._settled or balanced)
         elif self._inverted > _PATIENCE:
             actions.append("begun anew from rest")
             self._restore(TissueState.at_rest(len(nodes)))

@@ -1,12 +1,12 @@
 """Newton's method for the energy of tissue and contact together: every step lowers it.
 
-The energy is that of `neo_hookean` and of `penalty_contact`. A step minimises its quadratic model,
-in which nodes come to touch and are let go as the displacement says, by conjugate gradients with
-the exact tangent; then a line search takes as much of it as lowers the energy itself. Where the
-tangent is indefinite or a step had to be cut, the model is made stiffer (K. Levenberg, A method for
-the solution of certain non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer
-again as steps succeed. The iterates may be inside out, which the energy allows for; whoever shows
-them has to wait.
+The energy is that of `neo_hookean` and of `penalty_contact`, and where they are asked for those of
+`penalty_friction` and `overstress`. A step minimises its quadratic model, in which nodes come to
+touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a
+line search takes as much of it as lowers the energy itself. Where the tangent is indefinite or a
+step had to be cut, the model is made stiffer (K. Levenberg, A method for the solution of certain
+non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer again as steps succeed.
+The iterates may be inside out, which the energy allows for; whoever shows them has to wait.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -28,8 +28,10 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
+from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
@@ -64,8 +66,11 @@ _LEAST_PATIENCE = 12
 """Iterations of the first step: solved further, a step after a large change overshoots. Those after
 it may take twice as many as long as steps need not be cut."""
 
-_MOST_PATIENCE = 100
-"""Iterations beyond which a factor of the stiffness takes less time."""
+_SMALL = 500
+"""Free nodes up to which a factor of the stiffness takes no longer than a frame."""
+
+_MOST_PATIENCE, _MOST_PATIENCE_SMALL = 100, 45
+"""Iterations beyond which a factor of the stiffness takes less time, the latter up to that size."""
 
 _BACKTRACKS = 8
 """Step lengths that are tried, each half the last."""
@@ -80,7 +85,7 @@ _SEGMENT = 12
 _ROUNDING = 1e-12
 """Fraction of the energy by which rounding may seem to raise it."""
 
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.01, 1e3
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.01, 0.001, 1e3
 """Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
 
 _LOCAL_WEIGHT = 6.0
@@ -96,11 +101,18 @@ class Newton:
 
     Args:
         model: of the tissue and the probe.
+        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
+        branch: of viscous tissue.
     """
 
-    def __init__(self, model: TissueModel) -> None:
+    def __init__(
+        self, model: TissueModel, friction: float = 0.0, branch: PronyBranch | None = None
+    ) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is first needed
+        #: Whether a factor takes no longer than a frame.
+        self.is_small = int((~model.fixed).sum()) <= _SMALL
+        self._most_patience = _MOST_PATIENCE_SMALL if self.is_small else _MOST_PATIENCE
         #: Whether a step may take the time to factor the stiffness.
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
@@ -113,17 +125,20 @@ class Newton:
         self._fixed = np.flatnonzero(model.fixed)
         self._surface = model.movable_contact_nodes
         self._surface_rest = mesh.nodes[self._surface]
-        grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
+        self.overstress: Overstress | None = None
+        if branch is not None:
+            single = NeoHookean(mesh, model.materials, self._dtype)
+            self.overstress = Overstress(branch, self.tissue, single)
+        stiffened = self.overstress.stiffened if self.overstress else None
+        product = stiffened or self.tissue.tangent_product
+        grid = CoarseGrid(mesh, model.fixed, product, self._dtype)
         rest = self.tissue.diagonal_blocks()
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
         own = (rest[0] + rest[3] + rest[5])[self._surface] / 3
-        self.contact = PenaltyContact(
-            model.collider,
-            model.contact_spacing,
-            _FIRMNESS * own,
-            _GREATEST_PUSH * _shear_times_area(model)[self._surface],
-        )
+        strongest = _GREATEST_PUSH * _shear_times_area(model)[self._surface]
+        law = (model.collider, model.contact_spacing, _FIRMNESS * own, strongest)
+        self.contact = PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
         shape = (3, len(mesh.nodes))
         self.displacement = np.zeros(shape)  # m
         self._force = np.zeros(shape)  # N, the slope of the tissue's energy
@@ -133,6 +148,8 @@ class Newton:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
         self.contact.clear()
+        if self.overstress is not None:
+            self.overstress.forget(self.displacement)
         self._damping = 0.0
         self.patience = _LEAST_PATIENCE  # iterations that the next step may take
         self._factors = False  # whether factors have been needed since
@@ -150,6 +167,18 @@ class Newton:
         self.patience = _LEAST_PATIENCE
         self._weigh()
 
+    def lift(self) -> None:
+        """Take the probe away, and weigh the forces; nothing moves."""
+        self.contact.clear()
+        self._damping = 0.0
+        self._weigh()
+
+    def relax(self) -> None:
+        """Let the time from frame to frame pass; nothing moves."""
+        if self.overstress is not None:
+            self.overstress.relax(self.displacement)
+            self._weigh()
+
     def augment(self) -> float:
         """Push the tissue out of the probe further; returns by how much at most, m."""
         change = self.contact.augment(_AUGMENTED)
@@ -163,6 +192,11 @@ class Newton:
         self._weigh()
         return change
 
+    def expect(self, push: NDArray[np.float64]) -> None:
+        """Learn which pushes (C,) N on the surface are likely at the pose; nothing moves."""
+        if self.contact.expect(push):
+            self._weigh()
+
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
         self.displacement = displacement
@@ -171,16 +205,24 @@ class Newton:
 
     def _weigh(self, energy: float | None = None) -> None:
         """The energy, unless it is known, and its slope at the displacement."""
-        contact, tissue = self.contact, self.tissue
-        tissue.forces(self.displacement, self._force)
-        if energy is None:
-            energy = tissue.energy(self.displacement) + contact.energy
-        self.energy = energy  # J
+        contact = self.contact
+        self.tissue.forces(self.displacement, self._force)
+        self.energy = self._energy() if energy is None else energy  # J
+        if self.overstress is not None:
+            self.overstress.add_forces(self.displacement, self._force)
         self._slope = self._force.copy()
-        self._slope[:, self._surface] -= (contact.push[:, None] * contact.normal).T
+        force = contact.force
+        self._slope[:, self._surface] -= force.T
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
-        self.load = float(np.linalg.norm(contact.push))  # N, of the contact forces
+        self.load = float(np.linalg.norm(force))  # N, of the contact forces
+
+    def _energy(self) -> float:
+        """J, of tissue and contact at the displacement."""
+        energy = self.tissue.energy(self.displacement) + self.contact.energy
+        if self.overstress is not None:
+            energy += self.overstress.energy(self.displacement)
+        return energy
 
     def rehearse(self) -> None:
         """Take a step with a factor and with damping, as only some frames do."""
@@ -212,7 +254,7 @@ class Newton:
             self.patience = _LEAST_PATIENCE
         elif self.used >= iterations:
             self.patience *= 2
-            if self.patience > _MOST_PATIENCE and self.may_factor:
+            if self.patience > self._most_patience and self.may_factor:
                 self._factors = True
         if length < 1.0 or curved:
             self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
@@ -237,18 +279,21 @@ class Newton:
         if self._damping > 0.0:
             damped = self._dtype(self._damping) * self._rest_blocks
             blocks += damped
+        if (overstress := self.overstress) is not None:
+            blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         pushed = np.flatnonzero(contact.push > 0.0)
         turn = np.zeros((0, 3, 3))
         if not contact.forward and len(pushed):
             turn = contact.push[pushed, None, None] * contact.curvature(self.surface, pushed)
         turned = nodes[pushed] if len(turn) else nodes[:0]
-        gap, normal = contact.gap, contact.normal
 
         def elastic(change: NDArray, image: NDArray) -> None:
             """The tangent without springs, of which there are more or fewer as nodes touch."""
             tangent.tangent_product(change, image)
             if damped is not None:
                 image += apply_blocks(damped, change)
+            if overstress is not None:
+                overstress.add_product(change, image)
             if len(turned):
                 image[:, turned] -= np.einsum("kij,jk->ik", turn, change[:, turned])
 
@@ -264,18 +309,17 @@ class Newton:
         enough: float | None = None
         segment = _SEGMENT
         while True:
-            reached = gap + np.einsum("ij,ji->i", normal, step[:, nodes])
-            slope = contact.slope_at(reached)
+            moved = step[:, nodes].T
             left = -self._force - image
-            left[:, nodes] += (contact.push_at(reached)[:, None] * normal).T
+            left[:, nodes] += contact.force_after(moved).T
             left[:, self._fixed] = 0.0
             size = float(np.linalg.norm(left))
             if enough is None:
                 enough = max(_FORCING * max(size, self.imbalance * (start is None)), _AIM * goal)
             if size <= enough or self.used >= iterations:
                 return step, False
-            active = np.flatnonzero(slope > 0.0)
-            springs = nodes[active], normal[active], slope[active]
+            active, directions, stiffness = contact.springs_after(moved)
+            springs = nodes[active], directions, stiffness
             preconditioner: Preconditioner = self._two_level
             if self._factors and self.may_factor:
                 if self._factored is None:
@@ -293,8 +337,16 @@ class Newton:
             )
             self.used += solved.iterations
             segment *= 2
-            step += size * solved.solution.astype(np.float64)
-            image += size * solved.image.astype(np.float64)
+            change = size * solved.solution.astype(np.float64)
+            bent = size * solved.image.astype(np.float64)
+            if isinstance(contact, PenaltyFriction):
+                pull = -float(np.vdot(change, self._force + image))
+                length = contact.length_along(
+                    moved, change[:, nodes].T, pull, float(np.vdot(change, bent))
+                )
+                change, bent = length * change, length * bent
+            step += change
+            image += bent
             if solved.curved:
                 return (step if step.any() else size * solved.direction.astype(np.float64)), True
 
@@ -306,7 +358,7 @@ class Newton:
         for _ in range(_BACKTRACKS):
             self.displacement = start + length * change
             self.contact.look(self.surface)
-            tried = self.tissue.energy(self.displacement) + self.contact.energy
+            tried = self._energy()
             if tried <= bound:
                 self._weigh(tried)
                 if tried < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
