@@ -49,6 +49,9 @@ _ALIKE = 0.999
 _FOLLOWED = 40
 """How often at one pose the planes are fixed anew where the nodes have moved to."""
 
+_FULLY = 6
+"""How often of these to the full: that converges in a few frames, or not at all."""
+
 
 class PenaltyContact:
     """Gaps between C surface nodes and the probe, and the forces that these raise.
@@ -132,10 +135,11 @@ class PenaltyContact:
         self.normal = np.where(taken[:, None], normal, self.normal)
         height = np.einsum("ij,ij->i", positions, normal) - gap
         pushed, before = self.push > 0.0, self.gap
-        # Half the way: at the rim heights change faster than nodes slide.
-        old = np.isfinite(self._height)
-        halfway = np.where(old, (height + np.where(old, self._height, 0.0)) / 2, height)
-        self._height = np.where(taken, halfway, self._height)
+        # Later half the way: at the rim heights change faster than nodes slide.
+        part = 1.0 if self._followed <= _FULLY else 0.5
+        old = np.where(np.isfinite(self._height), self._height, height)
+        with np.errstate(invalid="ignore"):
+            self._height = np.where(taken, old + part * (height - old), self._height)
         self.look(positions)
         pushed |= self.push > 0.0
         with np.errstate(invalid="ignore"):
