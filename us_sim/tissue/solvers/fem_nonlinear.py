@@ -277,7 +277,7 @@ class FemNonlinear(TissueSolver):
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
         overstress = self._newton.overstress
-        if overstress is not None and np.abs(overstress.relaxed).max() > _SUNK:
+        if overstress is not None and np.abs(overstress.relaxed).max() > self._sunk:
             return False
         rest = self.model.mesh.nodes[self._surface]
         return pose is None or self._depth(pose, rest) <= GAP_TOLERANCE
