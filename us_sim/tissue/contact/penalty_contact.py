@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import only_forward, push_out
+from us_sim.tissue.contact.penetration import is_beside, only_forward, push_out
 
 __all__ = ["PenaltyContact"]
 
@@ -42,6 +42,9 @@ again."""
 _FORWARD = 0.99
 """Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
 
+
+_BESIDE = 0.1
+"""Depth in a flank, over the spacing, up to which a node counts as beside the probe."""
 
 _ALIKE = 0.999
 """Cosine between two normals of the same part of a probe."""
@@ -88,6 +91,7 @@ class PenaltyContact:
         count = len(self._stiffness)
         self._pose: Pose | None = None
         self._followed = 0
+        self._aside = np.zeros(count, dtype=bool)  # (C,), which nodes flanks may push
         self._height: NDArray[np.float64] | None = None  # (C,) m along the normal, of the surface
         self._shift = np.zeros(count)  # (C,) m, how far before the probe the springs end
         self.normal = np.zeros((count, 3))  # (C, 3), direction in which the probe pushes
@@ -102,6 +106,11 @@ class PenaltyContact:
         energy. With the planes fixed until the next aim it has one.
         """
         self._followed = 0
+        self._aside = np.zeros(len(positions), dtype=bool)
+        if self._pose is not None and self.forward:
+            # What comes in from the side, and not from before the face.
+            margin = _BESIDE * self._spacing
+            self._aside = is_beside(self._collider, self._pose, positions, margin)
         before = self.normal
         gap, self.normal = self._gaps(pose, positions)
         likeness = np.einsum("ij,ij->i", before, self.normal)
@@ -115,7 +124,7 @@ class PenaltyContact:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         by_face = (self.push > 0.0) & (self.normal @ pose.rotation[:, 2] > _FORWARD)
         margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
-        return push_out(self._collider, pose, positions, self._spacing, margin, flanks=True)
+        return push_out(self._collider, pose, positions, self._spacing, margin, self._aside)
 
     def follow(self, positions: NDArray[np.float64]) -> float:
         """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.

@@ -24,6 +24,7 @@ from us_sim.geometry.pose import Pose
 
 __all__ = [
     "GAP_TOLERANCE",
+    "is_beside",
     "only_forward",
     "push_out",
     "pushing_gap",
@@ -61,7 +62,7 @@ def push_out(
     points: NDArray[np.float64],
     spacing: float,
     skirt: NDArray[np.float64] | None = None,
-    flanks: bool = False,
+    flanks: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
@@ -80,9 +81,9 @@ def push_out(
         skirt: (N,) m, how far beside the probe each point still counts as under its rim, for a
             probe that pushes along +z only, and how much nearer a flank than the front it may be
             before the flank pushes it; zero by default.
-        flanks: whether a probe that pushes along +z only also pushes aside, square to its flanks,
-            what is nearer to leaving it there, and what is beside it. Without, whatever comes in
-            from the side is thrown before the face at once, however deep that is.
+        flanks: (N,), which points a probe that pushes along +z only may also push aside, where they
+            are nearer to leaving it there, or are beside it. Without, whatever comes in from the
+            side is thrown before the face at once, however deep that is.
 
     Returns:
         (N,) m, negative inside, infinite where the probe cannot push, and (N, 3) unit directions in
@@ -94,7 +95,7 @@ def push_out(
     _pushing_gaps(
         collider.offset_box,
         only_forward(collider, spacing),
-        flanks,
+        np.zeros(len(points), dtype=np.bool_) if flanks is None else flanks,
         pose.rotation,
         np.array(pose.position),
         points,
@@ -103,6 +104,20 @@ def push_out(
         normal,
     )
     return gap, normal
+
+
+def is_beside(
+    collider: Collider, pose: Pose, points: NDArray[np.float64], margin: float
+) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 3) m are behind the front of a probe, and beside its outline or
+    within a margin (m) of it.
+    """
+    box = collider.offset_box
+    local = (points - pose.position) @ pose.rotation
+    inside = box[:2] - np.abs(local[:, :2])
+    side = np.hypot(*np.maximum(-inside, 0.0).T)
+    side = np.where(side > 0.0, side, -inside.min(axis=1))
+    return np.asarray((local[:, 2] + box[3] < 0.0) & (side >= box[3] - margin))
 
 
 def wrench_on_probe(
@@ -215,7 +230,7 @@ def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
         side, ex, ey = abs(x) - box[0], sx, 0.0
     else:
         side, ex, ey = abs(y) - box[1], 0.0, sy
-    out = _SIN * side + _COS * ahead - rounding
+    out = (side - rounding) / _SIN
     if gap < math.inf and gap >= out - skirt:
         return gap, nx, ny, nz
     return out, _SIN * ex, _SIN * ey, _COS
@@ -233,7 +248,7 @@ def _pushing_gaps(box, forward, flanks, rotation, origin, points, skirt, gap, no
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
-        if forward and flanks:
+        if forward and flanks[i]:
             g, nx, ny, nz = _or_aside(box, skirt[i], g, nx, ny, nz, x, y, z)
         gap[i] = g
         normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz

@@ -39,7 +39,6 @@ def contact_stiffness(
     forces: NDArray[np.float64],
     compliance: NDArray[np.float64],
     spacing: float,
-    flanks: bool = False,
 ) -> NDArray[np.float64]:
     """The tangent of a frictionless contact on tissue of known compliance.
 
@@ -50,7 +49,6 @@ def contact_stiffness(
         forces: (K, 3) N, of the probe on the tissue there.
         compliance: (3K, 3K) m/N, between these points.
         spacing: m, between neighbours among the nodes that can be touched.
-        flanks: whether the probe's flanks push too, as `push_out` says.
 
     Returns:
         (6, 6) N/m, N, N m: how much the wrench on the probe, force and torque about its origin
@@ -63,7 +61,7 @@ def contact_stiffness(
     points = np.asarray(points, dtype=np.float64)
     count = len(points)
     push = np.linalg.norm(forces, axis=1)
-    slope, normal, turn = _surface(collider, pose, points, spacing, flanks)
+    slope, normal, turn = _surface(collider, pose, points, spacing)
     arms = points - pose.position
     # Of the six motions of the probe: where its points go (3K, 6), how normals turn with it.
     carried = np.zeros((count, 3, 6))
@@ -102,7 +100,7 @@ def compliance_between(
 
 
 def _surface(
-    collider: Collider, pose: Pose, points: NDArray[np.float64], spacing: float, flanks: bool
+    collider: Collider, pose: Pose, points: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """At (K, 3) points: the gap's slope (K, 3), the push's direction (K, 3), and how that turns as
     the point moves (K, 3, 3) 1/m.
@@ -110,9 +108,7 @@ def _surface(
     count = len(points)
     offsets = np.concatenate([np.zeros((1, 3)), _STEP * np.eye(3), -_STEP * np.eye(3)])
     around = (points[:, None] + offsets).reshape(-1, 3)
-    gap, normal = push_out(
-        collider, pose, around, spacing, np.full(len(around), spacing), flanks=flanks
-    )
+    gap, normal = push_out(collider, pose, around, spacing, np.full(len(around), spacing))
     gap, normal = gap.reshape(count, 7), normal.reshape(count, 7, 3)
     slope = (gap[:, 1:4] - gap[:, 4:7]) / (2 * _STEP)
     turn = (normal[:, 1:4] - normal[:, 4:7]).transpose(0, 2, 1) / (2 * _STEP)

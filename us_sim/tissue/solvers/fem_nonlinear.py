@@ -190,7 +190,6 @@ class FemNonlinear(TissueSolver):
             contact.push[pushed, None] * contact.normal[pushed],
             compliance_between(self._compliance.matrix, pushed) / self._stiffer,
             self.model.contact_spacing,
-            flanks=True,
         )
 
     @property
