@@ -107,12 +107,13 @@ def demo(
     recording = out / "session.mcap"
     if recording.exists():
         raise UsSimError(f"{recording} exists already; choose another folder with --out")
-    path_of(scene, file)  # before anything is made for what cannot be played
+    source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
+    if source == "path":
+        path_of(scene, file)  # before anything is made for what cannot be played
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     video = _prepared_video(scene, file) if source == "camera" else None
     played = file if video is None else None
     plan = plan_of(scene, parameters, record=recording, path=played, video=video)

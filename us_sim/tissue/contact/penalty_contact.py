@@ -111,6 +111,7 @@ class PenaltyContact:
             # What comes in from the side, and not from before the face.
             margin = _BESIDE * self._spacing
             self._aside = is_beside(self._collider, self._pose, positions, margin)
+            self._aside &= ~self._by_face(self._pose)
         before = self.normal
         gap, self.normal = self._gaps(pose, positions)
         likeness = np.einsum("ij,ij->i", before, self.normal)
@@ -122,9 +123,12 @@ class PenaltyContact:
     def _gaps(
         self, pose: Pose, positions: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        by_face = (self.push > 0.0) & (self.normal @ pose.rotation[:, 2] > _FORWARD)
-        margin = np.where(by_face, _SKIRT * self._spacing, 0.0)
+        margin = np.where(self._by_face(pose), _SKIRT * self._spacing, 0.0)
         return push_out(self._collider, pose, positions, self._spacing, margin, self._aside)
+
+    def _by_face(self, pose: Pose) -> NDArray[np.bool_]:
+        """(C,) which nodes the face pushes."""
+        return np.asarray((self.push > 0.0) & (self.normal @ pose.rotation[:, 2] > _FORWARD))
 
     def follow(self, positions: NDArray[np.float64]) -> float:
         """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.

@@ -62,7 +62,7 @@ def push_out(
     points: NDArray[np.float64],
     spacing: float,
     skirt: NDArray[np.float64] | None = None,
-    flanks: NDArray[np.bool_] | None = None,
+    flanks: NDArray[np.bool_] | bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
@@ -95,7 +95,7 @@ def push_out(
     _pushing_gaps(
         collider.offset_box,
         only_forward(collider, spacing),
-        np.zeros(len(points), dtype=np.bool_) if flanks is None else flanks,
+        np.array(np.broadcast_to(flanks, len(points))),
         pose.rotation,
         np.array(pose.position),
         points,
