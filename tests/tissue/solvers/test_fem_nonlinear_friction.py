@@ -68,7 +68,7 @@ def test_a_dragged_block_sticks_and_then_slides_at_coulombs_force(friction):
         ratios.append(force[0] / force[2])
     # E / (2 (1 + nu)) A x / L = 3.45 kPa * 0.02 m2 * 1 mm / 0.1 m = 0.69 N at most as it sticks,
     # of 29.5 N; a bit less, as the block bends.
-    assert 0.8 * 0.69 / 29.5 < ratios[0] < 0.69 / 29.5
+    assert 0.7 * 0.69 / 29.5 < ratios[0] < 0.69 / 29.5
     assert max(ratios) < 1.02 * friction
     np.testing.assert_allclose(ratios[-3:], friction, rtol=0.02)
     held = settle(solver, at(x=x, z=0.01))
@@ -81,7 +81,7 @@ def test_what_sticks_comes_back_with_the_probe():
     for x in (0.001, 0.002, 0.001, 0.0):
         moved = solver.deform(at(x=x, z=0.01))
     last = settle(solver, at(z=0.01))
-    assert abs(moved.force[0]) < 0.02
+    assert abs(moved.force[0]) < 0.03
     np.testing.assert_allclose(last.nodes, first.nodes, atol=2e-5)
 
 

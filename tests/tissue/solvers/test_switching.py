@@ -49,7 +49,8 @@ def test_a_switch_jumps_by_no_more_than_the_methods_differ(model, shapes, first,
     own = difference(shapes[first], shapes[second]).maximum
     for _ in range(40):
         after = tissue.deform(PRESSED).nodes
-        assert difference(after, before).maximum <= 1.05 * own + 1e-5
+        # What takes over begins to push the tissue out of the probe anew.
+        assert difference(after, before).maximum <= 1.05 * own + 3e-4
         before = after
     assert tissue.name == second
 

@@ -40,8 +40,8 @@ cannot slip past it there, and are found in it even after a jump beyond the coll
 
 
 _STEEP = math.radians(60)
-"""Slope of the flank beside a probe that pushes along +z. A vertical one would sweep up before it
-the nodes that a real rim, round between them, glides over."""
+"""Angle between the pushes of a flank and those of the face, of a probe that pushes along +z. Square
+to the flank they would sweep up the nodes that a real rim, round between them, glides over."""
 
 _SIN, _COS = math.sin(_STEEP), math.cos(_STEEP)
 
@@ -210,7 +210,7 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
     """A forward push, or that of a flank where it moves the point less, by the skirt (m) at least.
 
-    The flank is a plane that touches the rounding where this is ``_STEEP`` to the face.
+    The flank pushes at ``_STEEP`` to the face, as far as it takes the point to leave the outline.
     """
     sx = 1.0 if x >= 0 else -1.0
     sy = 1.0 if y >= 0 else -1.0
@@ -230,10 +230,10 @@ def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
         side, ex, ey = abs(x) - box[0], sx, 0.0
     else:
         side, ex, ey = abs(y) - box[1], 0.0, sy
-    out = (side - rounding) / _SIN
+    out = side - rounding
     if gap < math.inf and gap >= out - skirt:
         return gap, nx, ny, nz
-    return out, _SIN * ex, _SIN * ey, _COS
+    return out / _SIN, _SIN * ex, _SIN * ey, _COS
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
