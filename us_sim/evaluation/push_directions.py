@@ -54,7 +54,7 @@ def push_directions(
         along /= np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
         sine, cosine = math.sin(_STEEP), math.cos(_STEEP)
         aside = np.column_stack([sine * along, np.full(len(points), cosine)])
-        to_flank = beside - rounding
+        to_flank = (beside - rounding) / sine
         by_flank = (ahead < 0.0) & (np.abs(to_flank) < np.abs(ahead - rise))
         return np.where(by_flank[:, None], aside, forward) @ pose.rotation.T
     behind = -(ahead + 2 * box[2] + _GRIP)

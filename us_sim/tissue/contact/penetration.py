@@ -40,8 +40,8 @@ cannot slip past it there, and are found in it even after a jump beyond the coll
 
 
 _STEEP = math.radians(60)
-"""Angle between the pushes of a flank and those of the face, of a probe that pushes along +z. Square
-to the flank they would sweep up the nodes that a real rim, round between them, glides over."""
+"""Angle between the pushes of a flank and those of the face, of a probe that pushes along +z.
+Square to the flank they would sweep up the nodes that a real rim, round there, glides over."""
 
 _SIN, _COS = math.sin(_STEEP), math.cos(_STEEP)
 
@@ -230,10 +230,10 @@ def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
         side, ex, ey = abs(x) - box[0], sx, 0.0
     else:
         side, ex, ey = abs(y) - box[1], 0.0, sy
-    out = side - rounding
-    if gap < math.inf and gap >= out - skirt:
+    out = (side - rounding) / _SIN
+    if gap < math.inf and gap >= out - skirt / _SIN:
         return gap, nx, ny, nz
-    return out / _SIN, _SIN * ex, _SIN * ey, _COS
+    return out, _SIN * ex, _SIN * ey, _COS
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
