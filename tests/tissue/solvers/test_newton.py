@@ -119,7 +119,7 @@ def test_augmenting_lets_the_probe_sink_in_no_more(name):
         if newton.augment() < 1e-8:
             break
     pushed = newton.contact.push > 0.0
-    assert pushed.sum() > 2
+    assert pushed.sum() >= 2
     assert abs(newton.contact.gap[pushed]).max() < 2e-8
 
 
