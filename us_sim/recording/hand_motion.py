@@ -26,7 +26,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from us_sim.errors import BagError
-from us_sim.recording.path import ProbePath, write_path
+from us_sim.recording.path import ProbePath
+from us_sim.recording.shipped_path import write_where_asked
 from us_sim.settings.spelling import unknown
 
 __all__ = ["HASTES", "KINDS", "HandMotion", "Haste", "Room", "hand_motion", "shipped_hand_path"]
@@ -350,16 +351,7 @@ def _path(times: _Array, positions: _Array, orientations: _Array) -> ProbePath:
 
 def main(arguments: list[str]) -> int:
     """Writes the shipped path where the one argument says; returns the exit status."""
-    if len(arguments) != 1:
-        print("usage: python -m us_sim.recording.hand_motion FILE.mcap", file=sys.stderr)
-        return 2
-    try:
-        # The folder of the project's paths holds one bag per file, so none may claim it.
-        write_path(arguments[0], shipped_hand_path(), sidecar=False)
-    except BagError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return write_where_asked(arguments, "us_sim.recording.hand_motion", shipped_hand_path)
 
 
 if __name__ == "__main__":

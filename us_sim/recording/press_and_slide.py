@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError
-from us_sim.recording.path import ProbePath, write_path
+from us_sim.recording.path import ProbePath
+from us_sim.recording.shipped_path import write_where_asked
 
 __all__ = ["press_and_slide"]
 
@@ -85,16 +86,7 @@ def _minimum_jerk(keys: NDArray[np.float64], times: NDArray[np.float64]) -> NDAr
 
 def main(arguments: list[str]) -> int:
     """Writes the path where the one argument says; returns the exit status."""
-    if len(arguments) != 1:
-        print("usage: python -m us_sim.recording.press_and_slide FILE.mcap", file=sys.stderr)
-        return 2
-    try:
-        # The folder of the project's paths holds one bag per file, so none may claim it.
-        write_path(arguments[0], press_and_slide(), sidecar=False)
-    except BagError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return write_where_asked(arguments, "us_sim.recording.press_and_slide", press_and_slide)
 
 
 if __name__ == "__main__":

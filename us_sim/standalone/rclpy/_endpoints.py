@@ -3,6 +3,7 @@
 Readers say from the transport's thread that data may be waiting; executors take it in their own.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -126,7 +127,7 @@ class Connected(Destroyable):
         return self._full_name
 
 
-class Receiver(Connected):
+class Receiver(Connected, ABC):
     """A subscription, client or service as executors see it: its inbox says when it is ready."""
 
     _executor_event = False
@@ -151,9 +152,9 @@ class Receiver(Connected):
         taken = self._inbox.take()
         return None if taken is None else self._call_for(*taken)
 
+    @abstractmethod
     def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
         """The call to be made for serialized data that came from somewhere."""
-        raise NotImplementedError
 
 
 def message_of(data: bytes, cls: Any) -> Any:

@@ -22,7 +22,14 @@ from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["free_stiffness", "lame_stiffness", "require_held", "shape_gradients", "stiffness"]
+__all__ = [
+    "free_stiffness",
+    "lame_stiffness",
+    "require_held",
+    "shape_gradients",
+    "shear_times_area",
+    "stiffness",
+]
 
 
 def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
@@ -105,3 +112,12 @@ def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
                 f"{np.flatnonzero(part)[0]} has {len(held)} fixed nodes; fix at least three "
                 f"that are not on one line, such as the face `bottom`"
             )
+
+
+def shear_times_area(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
+    """(N,) N, at each node the sum of its tetrahedra's shear modulus times a third of a face."""
+    shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
+    pulls = (shear * mesh.volumes)[:, None] * np.linalg.norm(shape_gradients(mesh), axis=2)
+    total = np.zeros(len(mesh.nodes))
+    np.add.at(total, mesh.tetrahedra, pulls)
+    return total

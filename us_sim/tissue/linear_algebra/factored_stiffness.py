@@ -12,6 +12,7 @@ elements the nodes' share of the bulk stiffness.
 >>> factored = FactoredStiffness(model)
 >>> none = np.zeros(0)
 >>> factored.prepare(np.zeros((3, 64)), np.zeros(0, np.int64), np.zeros((0, 3)), none)
+True
 >>> force, moved = np.zeros((3, 64)), np.empty((3, 64))
 >>> force[2, model.contact_nodes] = 1.0
 >>> factored.apply(force, moved)
@@ -70,9 +71,9 @@ class FactoredStiffness:
         nodes: NDArray[np.integer],
         normals: NDArray[np.floating],
         stiffness: NDArray[np.floating],
-    ) -> None:
+    ) -> bool:
         """Factor the stiffness at a displacement (3, N) m, with springs at ``nodes`` (K,) along
-        ``normals`` (K, 3) of ``stiffness`` (K,) N/m.
+        ``normals`` (K, 3) of ``stiffness`` (K,) N/m; returns whether it is regular to rounding.
         """
         self.nodes, self.normals, self.springs = nodes, normals, stiffness
         matrix = self._assembled(displacement.astype(np.float64))
@@ -81,12 +82,16 @@ class FactoredStiffness:
         row = np.broadcast_to(unknown[:, :, None], blocks.shape).ravel()
         column = np.broadcast_to(unknown[:, None, :], blocks.shape).ravel()
         springs = coo_array((blocks.ravel(), (row, column)), shape=matrix.shape)
-        self._factor = splu(
-            csc_array(matrix + springs),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        try:
+            self._factor = splu(
+                csc_array(matrix + springs),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError:  # singular
+            return False
+        return True
 
     def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         """Overwrite ``out`` with the displacement that balances ``residual``, both (3, N)."""

@@ -144,6 +144,7 @@ class FemNonlinear(TissueSolver):
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemNonlinearSettings
+    settings: FemNonlinearSettings
 
     def __init__(
         self,
@@ -154,7 +155,6 @@ class FemNonlinear(TissueSolver):
         require_held(model.mesh, model.fixed)
         settings = settings or FemNonlinearSettings()
         super().__init__(model, settings, progress)
-        self._own = settings
         self._surface = model.movable_contact_nodes
         smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
         self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
@@ -181,7 +181,7 @@ class FemNonlinear(TissueSolver):
         pushed = np.flatnonzero(contact.push > 0.0)
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
-        if self._own.contact != "frictionless":
+        if self.settings.contact != "frictionless":
             return None
         return contact_stiffness(
             self.model.collider,
@@ -202,7 +202,7 @@ class FemNonlinear(TissueSolver):
     def _has_relaxed(self) -> bool:
         """Whether viscous tissue will not creep any more."""
         overstress = self._newton.overstress
-        return overstress is None or overstress.load <= self._own.tolerance * self._reference()
+        return overstress is None or overstress.load <= self.settings.tolerance * self._reference()
 
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()
@@ -225,7 +225,7 @@ class FemNonlinear(TissueSolver):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         began = time.perf_counter()
-        newton, settings = self._newton, self._own
+        newton, settings = self._newton, self.settings
         newton.relax()
         if self._is_unloaded(pose):
             # Nothing reaches the undeformed tissue: it is the solution.
@@ -243,7 +243,7 @@ class FemNonlinear(TissueSolver):
         if pose is None:
             newton.lift()
             self._aimed = None
-        elif moved:
+        elif moved and len(self._surface):
             start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
@@ -331,7 +331,7 @@ class FemNonlinear(TissueSolver):
         self._heaviest = max(self._heaviest, newton.load)
         reference = self._reference() or newton.imbalance
         residual = newton.imbalance / reference if reference else 0.0
-        sunk = -float(contact.gap.min())
+        sunk = -float(contact.gap.min(initial=np.inf))
         if sunk > _SINKS:
             actions.append(f"the probe is {1e3 * sunk:.2g} mm inside the tissue")
         nodes = self.model.mesh.nodes + newton.displacement.T
@@ -342,7 +342,7 @@ class FemNonlinear(TissueSolver):
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[touched], forces)
         if self._inverted == 0:
-            balanced = residual <= self._own.tolerance and shifted <= self._sunk
+            balanced = residual <= self.settings.tolerance and shifted <= self._sunk
             self._settled = self._has_relaxed and (self._settled or balanced)
         elif self._inverted > _PATIENCE:
             actions.append("begun anew from rest")

@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
-from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.linear_tetrahedra import shear_times_area
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
@@ -136,7 +135,7 @@ class Newton:
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
         own = (rest[0] + rest[3] + rest[5])[self._surface] / 3
-        strongest = _GREATEST_PUSH * _shear_times_area(model)[self._surface]
+        strongest = _GREATEST_PUSH * shear_times_area(mesh, model.materials)[self._surface]
         law = (model.collider, model.contact_spacing, _FIRMNESS * own, strongest)
         self.contact = PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
         shape = (3, len(mesh.nodes))
@@ -320,17 +319,9 @@ class Newton:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)
             springs = nodes[active], directions, stiffness
-            preconditioner: Preconditioner = self._two_level
-            if self._factors and self.may_factor:
-                if self._factored is None:
-                    self._factored = FactoredStiffness(self._model)
-                self._factored.prepare(self.displacement, *springs)
-                preconditioner = self._factored
-            else:
-                self._two_level.prepare(blocks, *springs)
             solved = conjugate_gradients(
                 elastic,
-                preconditioner,
+                self._preconditioner(blocks, *springs),
                 (left / size).astype(self._dtype),
                 min(iterations - self.used, segment),
                 enough / size,
@@ -349,6 +340,24 @@ class Newton:
             image += bent
             if solved.curved:
                 return (step if step.any() else size * solved.direction.astype(np.float64)), True
+
+    def _preconditioner(
+        self,
+        blocks: NDArray[np.floating],
+        nodes: NDArray[np.integer],
+        directions: NDArray[np.float64],
+        stiffness: NDArray[np.float64],
+    ) -> Preconditioner:
+        """Of the tangent, whose blocks are (6, N) N/m, with springs: a factor where one is needed,
+        there is time to make it, and it can be made.
+        """
+        if self._factors and self.may_factor:
+            if self._factored is None:
+                self._factored = FactoredStiffness(self._model)
+            if self._factored.prepare(self.displacement, nodes, directions, stiffness):
+                return self._factored
+        self._two_level.prepare(blocks, nodes, directions, stiffness)
+        return self._two_level
 
     def _search(self, change: NDArray[np.float64]) -> float:
         """Move by the largest fraction of the change that lowers the energy; returns it."""
@@ -384,13 +393,3 @@ class Newton:
             image[:, self._fixed] = 0.0
             two_level.apply(image, vector)
         return largest
-
-
-def _shear_times_area(model: TissueModel) -> NDArray[np.float64]:
-    """(N,) N, at each node the sum of its tetrahedra's shear modulus times a third of a face."""
-    mesh = model.mesh
-    shear = volumetric_split(model.materials).shear
-    pulls = (shear * mesh.volumes)[:, None] * np.linalg.norm(shape_gradients(mesh), axis=2)
-    total = np.zeros(len(mesh.nodes))
-    np.add.at(total, mesh.tetrahedra, pulls)
-    return total

@@ -119,7 +119,8 @@ class SwitchableTissue:
     def limit_frames(self, duration: float | None) -> None:
         """Let no frame take longer than this (s) where the method can go on in the next."""
         self._frame_limit = duration
-        self._solver.frame_limit = duration
+        for solver in filter(None, (self._solver, self._beside)):
+            solver.frame_limit = duration
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
         """`TissueSolver.contact_stiffness` of the solver in use."""
@@ -167,6 +168,7 @@ class SwitchableTissue:
             self.difference = None
             if beside is not None:
                 beside.take_over(state)
+                beside.frame_limit = self._frame_limit
         self._beside = beside
 
     def use(self, name: str) -> None:
