@@ -13,17 +13,22 @@ from us_sim.errors import MaterialError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["DENSITY", "POISSON_RATIO", "YOUNG_MODULUS", "Material"]
+__all__ = ["DENSITY", "LUMEN_PRESSURE", "POISSON_RATIO", "YOUNG_MODULUS", "Material"]
 
 YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
 """Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""
 DENSITY = Quantity("density", 1e-3, 1e6)
+LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e6)
 
 
 @dataclass(frozen=True)
 class Material(Settings):
-    """Isotropic elastic constants.
+    """Isotropic elastic constants, and the pressure of blood that can leave.
+
+    With a ``lumen_pressure`` it is the inside of a vessel that empties (see
+    `us_sim.tissue.elasticity.lumen`), which methods of large deformation know. To the linear ones
+    it is a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
 
     Raises:
         MaterialError: a constant is out of its range.
@@ -36,3 +41,10 @@ class Material(Settings):
     young_modulus: float = setting(YOUNG_MODULUS, "Young's modulus")
     poisson_ratio: float = setting(POISSON_RATIO, "Poisson's ratio", default=0.45)
     density: float = setting(DENSITY, "mass per volume", default=1000.0)
+    lumen_pressure: float | None = setting(
+        LUMEN_PRESSURE,
+        "pressure of the blood in a vessel that empties when pressed by more, for `fem_nonlinear`; "
+        "to the other methods it is the solid of young_modulus and poisson_ratio. Not given: a "
+        "solid",
+        default=None,
+    )

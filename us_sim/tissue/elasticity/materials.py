@@ -15,7 +15,7 @@ array([12000., 12000., 12000., 12000., 12000.])
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -36,6 +36,11 @@ _SAMPLES = 1024
 """Samples of each tetrahedron: enough to measure a volume fraction to about one percent."""
 
 
+def _none() -> NDArray[np.float64]:
+    """As long as it has to be, of zeros."""
+    return np.zeros(0)
+
+
 @dataclass(frozen=True, eq=False)
 class TissueMaterials:
     """Constants of each tetrahedron of a mesh.
@@ -47,10 +52,14 @@ class TissueMaterials:
     young_modulus: NDArray[np.float64]  # (M,), Pa
     poisson_ratio: NDArray[np.float64]  # (M,)
     density: NDArray[np.float64]  # (M,), kg/m3
+    lumen_fraction: NDArray[np.float64] = field(default_factory=_none)  # (M,), of the volume
+    lumen_pressure: NDArray[np.float64] = field(default_factory=_none)  # (M,), Pa, 0 without lumen
 
     def __post_init__(self) -> None:
-        for name in ("young_modulus", "poisson_ratio", "density"):
+        for name in vars(self):
             values = np.array(getattr(self, name), dtype=np.float64)
+            if name.startswith("lumen") and values.size == 0:
+                values = np.zeros(len(self.young_modulus))
             if values.ndim != 1 or len(values) != len(self.young_modulus):
                 raise MaterialError(f"{name} needs one number for each tetrahedron")
             object.__setattr__(self, name, values)
@@ -68,15 +77,28 @@ class TissueMaterials:
                     f"{getattr(self, name)[where]:g}: moduli and densities are above zero, "
                     f"Poisson's ratio is above -1 and below 0.5"
                 )
+        hollow = self.lumen_fraction > 0
+        wrong = ~((self.lumen_fraction >= 0) & (self.lumen_fraction <= 1))
+        wrong |= ~(np.isfinite(self.lumen_pressure) & ((self.lumen_pressure > 0) == hollow))
+        if wrong.any():
+            where = int(np.flatnonzero(wrong)[0])
+            raise MaterialError(
+                f"tetrahedron {where} has a lumen of {self.lumen_fraction[where]:g} of its volume "
+                f"at {self.lumen_pressure[where]:g} Pa: fractions are 0 to 1, and pressures above "
+                f"zero where there is a lumen, and zero elsewhere"
+            )
 
 
 def uniform_material(mesh: TetrahedralMesh, material: Material) -> TissueMaterials:
     """The same material everywhere."""
     count = len(mesh.tetrahedra)
+    pressure = material.lumen_pressure
     return TissueMaterials(
         np.full(count, material.young_modulus),
         np.full(count, material.poisson_ratio),
         np.full(count, material.density),
+        np.full(count, float(pressure is not None)),
+        np.full(count, pressure or 0.0),
     )
 
 
@@ -150,12 +172,19 @@ def average_over_labels(
         )
     constants = np.array(
         [
-            (m.young_modulus, m.poisson_ratio, m.density)
+            (
+                m.young_modulus,
+                m.poisson_ratio,
+                m.density,
+                float(m.lumen_pressure is not None),
+                m.lumen_pressure or 0.0,
+            )
             for m in (materials[int(label)] for label in present)
         ]
     )
-    young_modulus, poisson_ratio, density = (fractions @ constants).T
-    return TissueMaterials(young_modulus, poisson_ratio, density)
+    young_modulus, poisson_ratio, density, lumen, pressure = (fractions @ constants).T
+    np.divide(pressure, lumen, out=pressure, where=lumen > 0)  # of the lumen alone
+    return TissueMaterials(young_modulus, poisson_ratio, density, lumen, pressure)
 
 
 def _simplex_points(count: int) -> NDArray[np.float64]:

@@ -31,11 +31,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.lumen import neo_hookean_constants
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
 from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["NeoHookean"]
@@ -67,7 +67,7 @@ class NeoHookean:
         self.count = len(mesh.nodes)
         kind = TetrahedraSums if mesh.planes is None else CellSums
         self._sums: NodalSums = kind(mesh, materials, self.dtype)
-        weight = volumetric_split(materials).nodal * mesh.volumes / 4
+        weight = neo_hookean_constants(mesh, materials).nodal * mesh.volumes / 4
         total = np.zeros(self.count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())

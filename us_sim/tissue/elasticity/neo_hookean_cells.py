@@ -40,6 +40,7 @@ from us_sim.tissue.elasticity.cell_lanes import (
     put_volumes,
 )
 from us_sim.tissue.elasticity.lanes import LANES, five, in_lanes, put_six, three
+from us_sim.tissue.elasticity.lumen import emptied, in_groups, neo_hookean_constants
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
     HALF,
@@ -57,8 +58,6 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
     volume_slope,
 )
 from us_sim.tissue.elasticity.nodal_sums import Kernels, NodalSums
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
-from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["CellSums"]
@@ -68,9 +67,9 @@ _WALL, _CONSTANTS = PER_WIDTH + 18, PER_WIDTH + 23
 """First rows of the constants behind the widths: V mu, V element, V nodal / 4 and V wall of each of
 the five tetrahedra; and the number of rows."""
 
-_K, _TANGENT = FIELD + 24, FIELD + 29
-"""First row of V (p - mu), which the tangent needs, behind the displacement; and the number of
-rows."""
+_K, _BULK, _TANGENT = FIELD + 24, FIELD + 29, FIELD + 34
+"""First rows of V (p - mu) and of V times the slope of p by J, which the tangent needs, behind the
+displacement; and the number of rows."""
 
 
 class CellSums(NodalSums):
@@ -91,12 +90,14 @@ class CellSums(NodalSums):
         for axis in range(3):
             rows[number, PER_WIDTH + axis] = 1 / widths[axis][cells[axis]]
         rows[number, PER_WIDTH] *= 1 - 2 * (cells.sum(axis=0) % 2)
-        split = volumetric_split(materials)
-        rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * split.shear).reshape(-1, 5)
-        rows[number, _ELEMENT:_NODAL] = (mesh.volumes * split.element).reshape(-1, 5)
-        rows[number, _NODAL:_WALL] = (mesh.volumes * split.nodal / 4).reshape(-1, 5)
-        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
-        rows[number, _WALL:] = (mesh.volumes * walls).reshape(-1, 5)
+        made = neo_hookean_constants(mesh, materials)
+        rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * made.shear).reshape(-1, 5)
+        rows[number, _ELEMENT:_NODAL] = (mesh.volumes * made.element).reshape(-1, 5)
+        rows[number, _NODAL:_WALL] = (mesh.volumes * made.nodal / 4).reshape(-1, 5)
+        rows[number, _WALL:] = (mesh.volumes * made.wall).reshape(-1, 5)
+        lumens = np.zeros((len(rows), 5, made.lumen.shape[1]))
+        lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, made.lumen.shape[1])
+        self._lumens = in_groups(lumens, dtype)
         self._constants = in_lanes(rows).astype(dtype)
         # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
         self._nodes = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
@@ -123,6 +124,19 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
         lanes[p + 4 * LANES] = rows[c + 4 * LANES] * ((s1 + s2) + (s4 + s7))
 
 
+@njit(**LOOP)
+def _add_lumens(field, rows, lumen, entry, row, lanes):
+    """Add to five rows from ``row`` on an entry of `emptied` of each tetrahedron."""
+    for w in range(LANES):
+        p, q, r, s, t = gradients(field, rows, w)
+        v = row * LANES + w
+        lanes[v] += emptied(p, lumen, 0, 5, w)[entry]
+        lanes[v + LANES] += emptied(q, lumen, 1, 5, w)[entry]
+        lanes[v + 2 * LANES] += emptied(r, lumen, 2, 5, w)[entry]
+        lanes[v + 3 * LANES] += emptied(s, lumen, 3, 5, w)[entry]
+        lanes[v + 4 * LANES] += emptied(t, lumen, 4, 5, w)[entry]
+
+
 @njit(**INLINED)
 def _pressure(h, element, wall, nodal):
     """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
@@ -141,7 +155,7 @@ def _tetrahedron_k(h, shear, element, wall, nodal):
 
 
 @njit(**LOOP)
-def _energy(displacement, grid, constants, lanes):
+def _energy(displacement, grid, constants, lumens, lanes):
     total = 0.0
     for chunk in range(len(constants)):
         rows = constants[chunk]
@@ -164,6 +178,11 @@ def _energy(displacement, grid, constants, lanes):
             )
         for w in range(min(LANES, grid[3] - first)):
             total += lanes[OUT * LANES + w]
+        if lumens[0][chunk] >= 0:
+            lanes[OUT * LANES : (OUT + 5) * LANES] = 0
+            _add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 0, OUT, lanes)
+            for w in range(5 * LANES):
+                total += lanes[OUT * LANES + w]
     return total
 
 
@@ -222,7 +241,7 @@ def _volume_changes(displacement, grid, constants, lanes, nodal):
 
 
 @njit(**LOOP)
-def _forces(displacement, nodal, grid, constants, lanes, forces):
+def _forces(displacement, nodal, grid, constants, lumens, lanes, forces):
     forces[:, :] = 0
     for chunk in range(len(constants)):
         rows = constants[chunk]
@@ -230,6 +249,9 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
         if len(nodal):
             _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, lanes)
+        lumen = lumens[0][chunk]
+        if lumen >= 0:
+            _add_lumens(lanes, rows, lumens[1][lumen], 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
@@ -245,11 +267,13 @@ def _forces(displacement, nodal, grid, constants, lanes, forces):
                 w,
                 lanes,
             )
+        if lumen >= 0:
+            lanes[PRESSURES * LANES : (PRESSURES + 5) * LANES] = 0
         add_field(lanes, grid, first, rows, forces)
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, grid, constants, lanes, tangent):
+def _linearise(displacement, nodal, grid, constants, lumens, lanes, tangent):
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * LANES
@@ -257,16 +281,28 @@ def _linearise(displacement, nodal, grid, constants, lanes, tangent):
         if len(nodal):
             _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, kept)
+        lumen = lumens[0][chunk]
+        if lumen >= 0:
+            _add_lumens(kept, rows, lumens[1][lumen], 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
             element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             mean = five(lanes, PRESSURES, w)
-            kept[_K * LANES + w] = _tetrahedron_k(p, shear[0], element[0], wall[0], mean[0])
-            kept[(_K + 1) * LANES + w] = _tetrahedron_k(q, shear[1], element[1], wall[1], mean[1])
-            kept[(_K + 2) * LANES + w] = _tetrahedron_k(r, shear[2], element[2], wall[2], mean[2])
-            kept[(_K + 3) * LANES + w] = _tetrahedron_k(s, shear[3], element[3], wall[3], mean[3])
-            kept[(_K + 4) * LANES + w] = _tetrahedron_k(t, shear[4], element[4], wall[4], mean[4])
+            k, bulk = _K * LANES + w, _BULK * LANES + w
+            kept[k] = _tetrahedron_k(p, shear[0], element[0], wall[0], mean[0])
+            kept[k + LANES] = _tetrahedron_k(q, shear[1], element[1], wall[1], mean[1])
+            kept[k + 2 * LANES] = _tetrahedron_k(r, shear[2], element[2], wall[2], mean[2])
+            kept[k + 3 * LANES] = _tetrahedron_k(s, shear[3], element[3], wall[3], mean[3])
+            kept[k + 4 * LANES] = _tetrahedron_k(t, shear[4], element[4], wall[4], mean[4])
+            kept[bulk] = bulk_slope(volume_change(p), element[0], wall[0])
+            kept[bulk + LANES] = bulk_slope(volume_change(q), element[1], wall[1])
+            kept[bulk + 2 * LANES] = bulk_slope(volume_change(r), element[2], wall[2])
+            kept[bulk + 3 * LANES] = bulk_slope(volume_change(s), element[3], wall[3])
+            kept[bulk + 4 * LANES] = bulk_slope(volume_change(t), element[4], wall[4])
+        if lumen >= 0:
+            _add_lumens(kept, rows, lumens[1][lumen], 2, _BULK, kept)
+            lanes[PRESSURES * LANES : (PRESSURES + 5) * LANES] = 0
 
 
 @njit(**LOOP)
@@ -306,16 +342,15 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
-            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
-            k = five(kept, _K, w)
+            bulk, k = five(kept, _BULK, w), five(kept, _K, w)
             mean = five(lanes, PRESSURES, w)
             dp, dq, dr, ds, dt = gradients(lanes, rows, w)
             put_forces(
-                stress_rise(p, dp, shear[0], element[0], wall[0], k[0], mean[0]),
-                stress_rise(q, dq, shear[1], element[1], wall[1], k[1], mean[1]),
-                stress_rise(r, dr, shear[2], element[2], wall[2], k[2], mean[2]),
-                stress_rise(s, ds, shear[3], element[3], wall[3], k[3], mean[3]),
-                stress_rise(t, dt, shear[4], element[4], wall[4], k[4], mean[4]),
+                stress_rise(p, dp, shear[0], bulk[0], k[0], mean[0]),
+                stress_rise(q, dq, shear[1], bulk[1], k[1], mean[1]),
+                stress_rise(r, dr, shear[2], bulk[2], k[2], mean[2]),
+                stress_rise(s, ds, shear[3], bulk[3], k[3], mean[3]),
+                stress_rise(t, dt, shear[4], bulk[4], k[4], mean[4]),
                 rows,
                 w,
                 lanes,
@@ -324,13 +359,12 @@ def _tangent_product(change, nodal, grid, constants, tangent, lanes, product):
 
 
 @njit(**INLINED)
-def _corner_blocks(h, i, j, k, shear, element, wall):
+def _corner_blocks(h, i, j, k, shear, bulk):
     """Blocks of a corner tetrahedron: at its corner, and at the ends of its edges along x, y, z.
 
     i, j and k are the shape gradient of its corner.
     """
     c = cofactor_change(h)
-    bulk = bulk_slope(h, element, wall)
     none = ONE - ONE
     return (
         block((i, j, k), c, shear, bulk),
@@ -349,22 +383,22 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
-            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
+            bulk = five(kept, _BULK, w)
             i, j, k = three(rows, PER_WIDTH, w)
-            p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], element[0], wall[0])
-            q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], element[1], wall[1])
-            r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], element[2], wall[2])
-            s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], element[3], wall[3])
+            p0, px, py, pz = _corner_blocks(p, -i, -j, -k, shear[0], bulk[0])
+            q0, qx, qy, qz = _corner_blocks(q, i, j, -k, shear[1], bulk[1])
+            r0, rx, ry, rz = _corner_blocks(r, i, -j, k, shear[2], bulk[2])
+            s0, sx, sy, sz = _corner_blocks(s, -i, j, k, shear[3], bulk[3])
             i, j, k = HALF * i, HALF * j, HALF * k
-            c, bulk = cofactor_change(t), bulk_slope(t, element[4], wall[4])
+            c = cofactor_change(t)
             put_six(p0, lanes, OUT, w)
-            put_sum(block((-i, -j, k), c, shear[4], bulk), pz, rx, sy, lanes, 1, w)
-            put_sum(block((-i, j, -k), c, shear[4], bulk), py, qx, sz, lanes, 2, w)
+            put_sum(block((-i, -j, k), c, shear[4], bulk[4]), pz, rx, sy, lanes, 1, w)
+            put_sum(block((-i, j, -k), c, shear[4], bulk[4]), py, qx, sz, lanes, 2, w)
             put_six(s0, lanes, OUT + 18, w)
-            put_sum(block((i, -j, -k), c, shear[4], bulk), px, qy, rz, lanes, 4, w)
+            put_sum(block((i, -j, -k), c, shear[4], bulk[4]), px, qy, rz, lanes, 4, w)
             put_six(r0, lanes, OUT + 30, w)
             put_six(q0, lanes, OUT + 36, w)
-            put_sum(block((i, j, k), c, shear[4], bulk), qz, ry, sx, lanes, 7, w)
+            put_sum(block((i, j, k), c, shear[4], bulk[4]), qz, ry, sx, lanes, 7, w)
         for entry in range(6):
             add_out(lanes, OUT + entry, 6, grid, chunk * LANES, rows, blocks[entry])
 

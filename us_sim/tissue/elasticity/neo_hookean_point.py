@@ -45,6 +45,7 @@ __all__ = [
     "cofactor_change",
     "cofactor_slope",
     "crowding",
+    "crowding_below",
     "energy_density",
     "inner",
     "stress",
@@ -137,24 +138,32 @@ def volume_change(h):
 
 
 @njit(**INLINED)
-def crowding(change):
-    """The term against being crushed, over its modulus, and its two slopes by J = change + 1."""
+def crowding_below(change, onset):
+    """The term against being crushed that begins at J = onset, over its modulus, and its two slopes
+    by J = change + 1.
+    """
     ratio = ONE + change
     held = _CRUSHED if ratio < _CRUSHED else ratio
     beyond = ratio - held
-    missing = _CROWDED - held
+    missing = onset - held
     missing = missing if missing > 0 else ONE - ONE
     per = ONE / held
-    scale = missing / (_THREE * _CROWDED)
+    scale = missing / (_THREE * onset)
     value = scale * missing * missing * per
-    slope = -scale * missing * (held + held + _CROWDED) * per * per
-    both = held * (held + _CROWDED) + _CROWDED * _CROWDED
+    slope = -scale * missing * (held + held + onset) * per * per
+    both = held * (held + onset) + onset * onset
     curvature = (scale + scale) * both * per * per * per
     return (
         value + beyond * (slope + HALF * curvature * beyond),
         slope + curvature * beyond,
         curvature,
     )
+
+
+@njit(**INLINED)
+def crowding(change):
+    """That of a solid."""
+    return crowding_below(change, _CROWDED)
 
 
 @njit(**INLINED)
@@ -211,19 +220,19 @@ def volume_slope(h, d):
 
 
 @njit(**INLINED)
-def bulk_slope(h, element, wall):
-    """How fast the pressure rises with J: element, and the term against being crushed."""
-    return element + wall * crowding(volume_change(h))[2]
+def bulk_slope(change, element, wall):
+    """How fast the pressure rises with J = change + 1: by element, and against being crushed."""
+    return element + wall * crowding(change)[2]
 
 
 @njit(**INLINED)
-def stress_rise(h, d, shear, element, wall, k, nodal):
+def stress_rise(h, d, shear, bulk, k, nodal):
     """The change of the stress for a small change d of h and a change nodal of the mean pressure.
 
-    k is p - mu.
+    bulk is the `bulk_slope` at h, and k is p - mu.
     """
     c = cofactor_change(h)
-    rise = bulk_slope(h, element, wall) * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
+    rise = bulk * (inner(c, d) + (d[0] + d[4] + d[8])) + nodal
     return _stress_slope(h, c, d, shear, k, rise)
 
 

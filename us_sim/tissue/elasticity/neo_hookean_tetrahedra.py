@@ -24,6 +24,7 @@ from numpy.typing import DTypeLike
 
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.lumen import emptied, in_groups, neo_hookean_constants
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
     INLINED,
@@ -52,8 +53,6 @@ from us_sim.tissue.elasticity.tetrahedron_lanes import (
     scatter,
     scatter_scalar,
 )
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
-from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TetrahedraSums"]
@@ -68,8 +67,9 @@ _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
 """Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
 number."""
 
-_GRADIENT, _K, _TANGENT = 0, 9, 10
-"""Rows that the tangent needs: the displacement's gradient, V (p - mu); and their number."""
+_GRADIENT, _K, _BULK, _TANGENT = 0, 9, 10, 11
+"""Rows that the tangent needs: the displacement's gradient, V (p - mu), V times the slope of p by
+J; and their number."""
 
 
 class TetrahedraSums(NodalSums):
@@ -77,14 +77,14 @@ class TetrahedraSums(NodalSums):
 
     def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
         count = len(mesh.tetrahedra)
-        split = volumetric_split(materials)
+        made = neo_hookean_constants(mesh, materials)
         rows = np.empty((count, _CONSTANTS))
         rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
-        rows[:, _SHEAR] = mesh.volumes * split.shear
-        rows[:, _ELEMENT] = mesh.volumes * split.element
-        rows[:, _NODAL] = mesh.volumes * split.nodal / 4
-        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
-        rows[:, _WALL] = mesh.volumes * walls
+        rows[:, _SHEAR] = mesh.volumes * made.shear
+        rows[:, _ELEMENT] = mesh.volumes * made.element
+        rows[:, _NODAL] = mesh.volumes * made.nodal / 4
+        rows[:, _WALL] = mesh.volumes * made.wall
+        self._lumens = in_groups(made.lumen_energies(mesh)[:, None], dtype)
         self._constants = in_lanes(rows).astype(dtype)
         # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
         self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
@@ -102,14 +102,14 @@ def _nodal_pressure(lanes, constants, w):
 
 @njit(**INLINED)
 def _pressure(h, lanes, rows, w):
-    """V times the slope by J of all energy but the shear's."""
+    """V times the slope by J of all energy but the shear's and lumens'."""
     change = volume_change(h)
     own = rows[_ELEMENT * LANES + w] * change + rows[_WALL * LANES + w] * crowding(change)[1]
     return own + _nodal_pressure(lanes, rows, w)
 
 
 @njit(**LOOP)
-def _energy(displacement, nodes, constants, lanes):
+def _energy(displacement, nodes, constants, lumens, lanes):
     total = 0.0
     for chunk in range(len(nodes)):
         gather(displacement, nodes[chunk], lanes)
@@ -119,6 +119,10 @@ def _energy(displacement, nodes, constants, lanes):
             lanes[OUT * LANES + w] = energy_density(
                 h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
             )
+        if lumens[0][chunk] >= 0:
+            lumen = lumens[1][lumens[0][chunk]]
+            for w in range(LANES):
+                lanes[OUT * LANES + w] += emptied(gradient(lanes, rows, w), lumen, 0, 1, w)[0]
         for w in range(LANES):
             total += lanes[OUT * LANES + w]
     return total
@@ -156,22 +160,29 @@ def _volume_changes(displacement, nodes, constants, lanes, nodal):
 
 
 @njit(**LOOP)
-def _forces(displacement, nodal, nodes, constants, lanes, forces):
+def _forces(displacement, nodal, nodes, constants, lumens, lanes, forces):
     forces[:, :] = 0
     for chunk in range(len(nodes)):
         gather(displacement, nodes[chunk], lanes)
         if len(nodal):
             gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
-        for w in range(LANES):
-            h = gradient(lanes, rows, w)
-            shear = rows[_SHEAR * LANES + w]
-            put_forces(stress(h, shear, _pressure(h, lanes, rows, w)), rows, w, lanes)
+        if lumens[0][chunk] >= 0:
+            lumen = lumens[1][lumens[0][chunk]]
+            for w in range(LANES):
+                h = gradient(lanes, rows, w)
+                pressure = _pressure(h, lanes, rows, w) + emptied(h, lumen, 0, 1, w)[1]
+                put_forces(stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
+        else:
+            for w in range(LANES):
+                h = gradient(lanes, rows, w)
+                shear = rows[_SHEAR * LANES + w]
+                put_forces(stress(h, shear, _pressure(h, lanes, rows, w)), rows, w, lanes)
         scatter(lanes, nodes[chunk], forces)
 
 
 @njit(**LOOP)
-def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
+def _linearise(displacement, nodal, nodes, constants, lumens, lanes, tangent):
     for chunk in range(len(nodes)):
         gather(displacement, nodes[chunk], lanes)
         if len(nodal):
@@ -182,6 +193,15 @@ def _linearise(displacement, nodal, nodes, constants, lanes, tangent):
             h = gradient(lanes, rows, w)
             put_nine(h, kept, _GRADIENT, w)
             kept[_K * LANES + w] = _pressure(h, lanes, rows, w) - rows[_SHEAR * LANES + w]
+            kept[_BULK * LANES + w] = bulk_slope(
+                volume_change(h), rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
+            )
+        if lumens[0][chunk] >= 0:
+            lumen = lumens[1][lumens[0][chunk]]
+            for w in range(LANES):
+                _, pressure, slope = emptied(gradient(lanes, rows, w), lumen, 0, 1, w)
+                kept[_K * LANES + w] += pressure
+                kept[_BULK * LANES + w] += slope
 
 
 @njit(**LOOP)
@@ -210,10 +230,9 @@ def _tangent_product(change, nodal, nodes, constants, tangent, lanes, product):
         for w in range(LANES):
             d = gradient(lanes, rows, w)
             h = nine(kept, _GRADIENT, w)
-            shear, element = rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w]
-            wall, k = rows[_WALL * LANES + w], kept[_K * LANES + w]
-            nodal_rise = _nodal_pressure(lanes, rows, w)
-            put_forces(stress_rise(h, d, shear, element, wall, k, nodal_rise), rows, w, lanes)
+            shear, nodal_rise = rows[_SHEAR * LANES + w], _nodal_pressure(lanes, rows, w)
+            bulk, k = kept[_BULK * LANES + w], kept[_K * LANES + w]
+            put_forces(stress_rise(h, d, shear, bulk, k, nodal_rise), rows, w, lanes)
         scatter(lanes, nodes[chunk], product)
 
 
@@ -227,7 +246,7 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
             h = nine(kept, _GRADIENT, w)
             c = cofactor_change(h)
             shear = rows[_SHEAR * LANES + w]
-            bulk = bulk_slope(h, rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w])
+            bulk = kept[_BULK * LANES + w]
             x, y, z = three(rows, SHAPE, w), three(rows, SHAPE + 3, w), three(rows, SHAPE + 6, w)
             o = (-(x[0] + y[0] + z[0]), -(x[1] + y[1] + z[1]), -(x[2] + y[2] + z[2]))
             put_six(block(o, c, shear, bulk), lanes, OUT, w)

@@ -45,13 +45,14 @@ class NodalSums:
     _kernels: ClassVar[Kernels]
     _nodes: NDArray[Any]  # how kernels find the nodes of a tetrahedron
     _constants: NDArray[Any]  # of each block of tetrahedra
+    _lumens: tuple[NDArray[Any], NDArray[Any]]  # of those blocks that have one, see `in_groups`
     _tangent: NDArray[Any]  # what `linearise` stores of each block
     _lanes: NDArray[Any]  # what kernels work in
 
     def energy(self, displacement: NDArray) -> float:
         """J, of each tetrahedron by itself, without the nodal part."""
         energy: float = self._kernels.energy(
-            displacement, self._nodes, self._constants, self._lanes
+            displacement, self._nodes, self._constants, self._lumens, self._lanes
         )
         return energy
 
@@ -68,12 +69,15 @@ class NodalSums:
 
     def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
         """(3, N) N, the energy's slope, where nodal is the nodes' mean volume change."""
-        self._kernels.forces(displacement, nodal, self._nodes, self._constants, self._lanes, out)
+        self._kernels.forces(
+            displacement, nodal, self._nodes, self._constants, self._lumens, self._lanes, out
+        )
 
     def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
         """Store what the slopes at this displacement need; nodal is the nodes' mean change."""
         self._kernels.linearise(
-            displacement, nodal, self._nodes, self._constants, self._lanes, self._tangent
+            *(displacement, nodal, self._nodes, self._constants),
+            *(self._lumens, self._lanes, self._tangent),
         )
 
     def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:

@@ -29,9 +29,8 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.lumen import emptying, neo_hookean_constants
 from us_sim.tissue.elasticity.neo_hookean_point import crowding
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
-from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["FactoredStiffness"]
@@ -46,13 +45,14 @@ class FactoredStiffness:
 
     def __init__(self, model: TissueModel) -> None:
         mesh = model.mesh
-        split = volumetric_split(model.materials)
+        made = neo_hookean_constants(mesh, model.materials)
         self._tetrahedra = mesh.tetrahedra
         self._gradients = shape_gradients(mesh)  # (M, 4, 3)
-        self._shear = mesh.volumes * split.shear
-        self._bulk = mesh.volumes * (split.element + split.nodal)
-        walls = wall_modulus(mesh.tetrahedra, split.shear, len(mesh.nodes))
-        self._wall = mesh.volumes * walls
+        self._shear = mesh.volumes * made.shear
+        self._bulk = mesh.volumes * (made.element + made.nodal)
+        self._wall = mesh.volumes * made.wall
+        self._hollow = np.flatnonzero(made.lumen[:, 0] > 0.0)
+        self._lumen = made.lumen_energies(mesh)[self._hollow]
         self.fixed: NDArray[np.integer] = np.flatnonzero(model.fixed)
         number = np.where(model.fixed, -1, np.cumsum(~model.fixed) - 1)
         self._free = np.flatnonzero(~model.fixed)
@@ -110,6 +110,7 @@ class FactoredStiffness:
         ratio = np.einsum("ei,ei->e", first, cofactor[:, :, 0])
         pull = np.einsum("eij,eaj->eai", cofactor, gradients).reshape(-1, 12)
         bulk = self._bulk + _wall_slopes(ratio - 1.0, self._wall)
+        bulk[self._hollow] += _lumen_slopes(ratio[self._hollow] - 1.0, self._lumen)
         values = bulk[:, None, None] * pull[:, :, None] * pull[:, None, :]
         alike = self._shear[:, None, None] * np.einsum("eai,ebi->eab", gradients, gradients)
         values += np.einsum("eab,ij->eaibj", alike, np.eye(3)).reshape(-1, 12, 12)
@@ -124,4 +125,14 @@ def _wall_slopes(change, modulus):
     slopes = np.empty_like(change)
     for e in range(len(change)):
         slopes[e] = modulus[e] * crowding(change[e])[2]
+    return slopes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lumen_slopes(change, table):
+    """(L,) how fast the pressures of lumens rise with the volume ratio 1 + change."""
+    slopes = np.empty_like(change)
+    for e in range(len(change)):
+        p, a, b, per, wall, onset = table[e]
+        slopes[e] = emptying(change[e], (p, a, b, per, wall, onset))[2]
     return slopes

@@ -40,6 +40,7 @@ from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
+from us_sim.tissue.elasticity.lumen import require_solid
 from us_sim.tissue.elasticity.overstress import PronyBranch
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.check import signed_volumes
@@ -153,6 +154,7 @@ class FemNonlinear(TissueSolver):
         progress: Callable[[float, str], None] | None = None,
     ) -> None:
         require_held(model.mesh, model.fixed)
+        require_solid(model.mesh, model.materials)
         settings = settings or FemNonlinearSettings()
         super().__init__(model, settings, progress)
         self._surface = model.movable_contact_nodes

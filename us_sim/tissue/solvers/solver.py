@@ -164,12 +164,15 @@ class TissueSolver(ABC):
         if self.model.mesh.planes is None:
             mesh = TetrahedralMesh(mesh.nodes, mesh.tetrahedra)
         own, count = self.model.materials, len(mesh.tetrahedra)
+        hollow = np.arange(count) == 0
         model = TissueModel(
             mesh,
             TissueMaterials(
                 np.linspace(own.young_modulus.min(), own.young_modulus.max(), count),
                 np.full(count, own.poisson_ratio.max()),
                 np.full(count, own.density.max()),
+                hollow * own.lumen_fraction.max(),
+                hollow * own.lumen_pressure.max(),
             ),
             mesh.nodes[:, 2] > 0.015,
             self.model.collider,
