@@ -24,6 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.crushed_pressure import (
+    LUMEN_SHEAR,
+    crowding,
+    emptied_fraction,
+    lumen_pressure,
+    wall_modulus,
+)
 from us_sim.evaluation.push_directions import push_directions
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
@@ -50,13 +57,6 @@ Array = NDArray[np.float64]
 
 _ELEMENT_BULK = 5.0
 """(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
-
-_CROWDED, _CRUSHED = 1 / 4, 1 / 50
-"""Volume ratios below which a nonlinear tetrahedron resists being crushed, and more simply so."""
-
-_WALL = 5.0
-"""Modulus of that resistance, over the geometric mean of a tetrahedron's own shear modulus and the
-largest among the tetrahedra with which it shares a node."""
 
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
@@ -222,8 +222,16 @@ def neo_hookean_forces(
     slope = _slopes(mesh, gradient, displacement)
     swelling = _swelling(slope)
     own, nodal = _bulk_parts(shear, whole)
+    hollow = materials.lumen_fraction > 0.0
+    empties = emptied_fraction(materials)
+    shear = shear * (1 - empties + LUMEN_SHEAR * empties)
+    nodal = np.where(hollow, 0.0, nodal)
     pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
-    pressure += _wall_modulus(mesh, shear) * _crowding(1 + swelling)
+    wall = wall_modulus(mesh, shear)
+    pressure += wall * crowding(1 + swelling)
+    pressure[hollow] = lumen_pressure(
+        *(part[hollow] for part in (swelling, empties, materials.lumen_pressure, own, wall))
+    )
     cofactor = _cofactors(slope + np.eye(3))
     # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
     difference = (
@@ -234,25 +242,6 @@ def neo_hookean_forces(
     )
     stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
     return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
-
-
-def _wall_modulus(mesh: TetrahedralMesh, shear: Array) -> Array:
-    """(M,) Pa, how firmly each tetrahedron resists being crushed."""
-    nodes, modulus = mesh.tetrahedra.ravel(), np.repeat(shear, 4)
-    order = np.argsort(modulus, kind="stable")
-    largest = np.zeros(len(mesh.nodes))
-    largest[nodes[order]] = modulus[order]  # of each node's values the last one written stays
-    return np.asarray(_WALL * np.sqrt(shear * largest[mesh.tetrahedra].max(axis=1)))
-
-
-def _crowding(ratio: Array) -> Array:
-    """Derivative by J of (J0 - J)**3 / 3 J0 J below J0, straight on from where J is tiny."""
-    held = np.clip(ratio, _CRUSHED, _CROWDED)
-    missing = _CROWDED - held
-    slope = -(missing**2) * (2 * held + _CROWDED) / (3 * _CROWDED * held**2)
-    square = held**2 + _CROWDED * held + _CROWDED**2
-    rise = 2 * missing * square / (3 * _CROWDED * held**3)
-    return slope + rise * np.minimum(ratio - _CRUSHED, 0)
 
 
 def spring_forces(

@@ -2,25 +2,25 @@
 
 Blood leaves a vein along it while its pressure stays the veins', p, so that the energy is local:
 pressure times the volume that left. At rest the tension of the vessel's wall carries p. As the
-lumen's volume ratio j falls, the tension falls with its square, as the wall's stiffness grows with
-its stretch (Y. C. Fung, Biomechanics: Circulation, 1997, 4.10), and is gone at 1 - e:
+lumen's volume ratio j falls, the tension falls with its square, since the wall is the stiffer the
+more it is stretched (Y. C. Fung, Biomechanics: Circulation, 2nd ed., 1997, chapter 4), and is gone
+at 1 - e:
 
     dU/dj = p (m^2 - 1),    m = max(1 - (1 - j) / e, 0).
 
 From there on the outside presses with p alone until the vessel is empty. A slack wall of thickness
-h and radius R resists its collapse with K = E h^3 / (12 (1 - nu^2) R^3) (A. H. Shapiro, Steady Flow
-in Collapsible Tubes, J. Biomech. Eng. 99, 1977, eq. 2.5) and buckles at 3 K: of a vein, 10 to 40 Pa
-of a kilopascal, which is left out. When it is empty, its walls touch: there the wall of
-`neo_hookean_point` begins.
+h and radius R would add K = E h^3 / (12 (1 - nu^2) R^3) (A. H. Shapiro, Steady Flow in Collapsible
+Tubes, J. Biomech. Eng. 99, 1977), and buckles at 3 K: 10 to 40 Pa for a vein of 3 mm radius and 0.3
+mm thickness, little beside p, and left out.
 
-A tetrahedron of which a fraction f is lumen bears one pressure q in both parts (A. Reuss, Berechnung
-der Fließgrenze von Mischkristallen, ZAMM 9, 1929). Of the solid's bulk modulus K,
+A tetrahedron of which a fraction f is lumen bears one pressure q in both parts (A. Reuss,
+Berechnung der Fließgrenze von Mischkristallen, ZAMM 9, 1929). With the solid's bulk modulus K,
 
     J - 1 = f (j - 1) + (1 - f) q / K,    q = dU/dj,
 
-which is a quadratic equation for m. Both in series have the convex energy U(J) with the pressure q;
-it has two continuous derivatives. All of J's change below 1 - f is the solid's, and there the wall
-begins, too.
+which is a quadratic equation for m. U(J) is convex and has two continuous derivatives. When the
+lumen is empty, its walls touch and the solid is pressed: there the wall of `neo_hookean_point`
+begins, as stiff as the solid.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.lumen import emptying, lumen_table
@@ -37,12 +37,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.lanes import LANES, in_lanes
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, ONE, crowding_below, volume_change
+from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, ONE, crowding_below
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -50,12 +49,11 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 __all__ = [
     "CONSTANTS",
     "NeoHookeanConstants",
-    "emptied",
     "emptying",
-    "in_groups",
     "lumen_table",
     "neo_hookean_constants",
     "require_solid",
+    "softness",
 ]
 
 CONSTANTS = 6
@@ -64,12 +62,17 @@ CONSTANTS = 6
 _SLACK = 0.2
 """Fraction of its volume, e above, that a vein has lost when its wall is slack."""
 
-_SHEAR = 0.1
-"""Shear modulus of a lumen over its pressure. Blood has none; this one keeps the mesh inside in
-shape, and flattening it takes a tenth of what emptying takes."""
+_SOFTNESS = 0.05
+"""Shear modulus of a lumen over that of the solid that stands in for it. Blood has none; this one
+keeps the mesh inside in shape. In the arm it is a tenth of the pressure, so that flattening the
+mesh takes a tenth of what emptying takes."""
 
-_TOUCHING = 0.1
+_TOUCHING = 0.2
 """Volume ratio at which the walls of an empty lumen begin to touch: they have a thickness."""
+
+_PRESSED = 5.0
+"""Modulus of the wall of a tetrahedron with an empty lumen, over the bulk modulus of the solid in
+it: pressed by a tenth of its volume it then resists about as the solid does."""
 
 _ALL = 0.99
 """Fraction of lumen from which a tetrahedron is no solid at all."""
@@ -99,23 +102,35 @@ class NeoHookeanConstants:
         return energies
 
 
-def neo_hookean_constants(
-    mesh: TetrahedralMesh, materials: TissueMaterials
-) -> NeoHookeanConstants:
+def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> NeoHookeanConstants:
     """The constants of solids, and of lumens where materials have them.
 
     A tetrahedron with a lumen takes no part in the averages of `volumetric_split`, so that it may
     lose its volume whatever its neighbours do.
     """
     split = volumetric_split(materials)
-    fraction, pressure = materials.lumen_fraction, materials.lumen_pressure
-    shear = (1 - fraction) * split.shear + fraction * _SHEAR * pressure
+    shear = split.shear * softness(materials)
     wall = wall_modulus(mesh.tetrahedra, shear, len(mesh.nodes))
-    lumen = lumen_table(fraction, pressure, split.element, wall)
-    solid = fraction == 0.0
+    lumen = lumen_table(_emptied(materials), materials.lumen_pressure, split.element, wall)
+    solid = materials.lumen_fraction == 0.0
     return NeoHookeanConstants(
         shear, split.element * solid, split.nodal * solid, wall * solid, lumen
     )
+
+
+def softness(materials: TissueMaterials) -> NDArray[np.float64]:
+    """(M,), shear modulus over that of the solid, 1 where there is no lumen."""
+    return np.asarray(1.0 - (1.0 - _SOFTNESS) * _emptied(materials))
+
+
+def _emptied(materials: TissueMaterials) -> NDArray[np.float64]:
+    """(M,), fraction of each tetrahedron that may leave it, somewhat more than that of its lumen.
+
+    What a tetrahedron contains moves as one. So of the lumen f in one that loses f of its volume,
+    f (1 - f) would stay to be seen: of the arm's vein, whose tetrahedra are almost as large as it
+    is, a fifth. With 1 - (1 - f)^2 it is half of that.
+    """
+    return np.asarray(1.0 - (1.0 - materials.lumen_fraction) ** 2)
 
 
 def lumen_table(
@@ -124,44 +139,22 @@ def lumen_table(
     bulk: NDArray[np.float64],
     wall: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(M, CONSTANTS): p (Pa), (1 - f) p / K, f e, and one over twice the former plus the latter;
-    the modulus of the wall (Pa), and the volume ratio at which it begins. Without lumen, zero.
+    """(M, CONSTANTS): p (Pa), a = (1 - f) p / K, b = f e, 1 / (2 a + b), the modulus of the wall
+    (Pa), and the volume ratio at which it begins; zero where there is no lumen.
 
     Args:
-        fraction: (M,), of lumen.
-        pressure: (M,) Pa, in the lumen.
-        bulk: (M,) Pa, lambda + mu of the solid beside it.
-        wall: (M,) Pa.
+        fraction: (M,), f.
+        pressure: (M,) Pa, p.
+        bulk: (M,) Pa, K.
+        wall: (M,) Pa, the least modulus of the wall.
     """
     there = fraction > 0.0
-    table = np.zeros((len(fraction), CONSTANTS))
-    given = np.where(there, (1 - fraction) * pressure / bulk, 0.0)
-    eased = _SLACK * fraction
-    table[:, 0] = np.where(there, pressure, 0.0)
-    table[:, 1] = given
-    table[:, 2] = eased
-    np.divide(1.0, 2 * given + eased, out=table[:, 3], where=there)
-    table[:, 4] = np.where(there, wall, 0.0)
-    table[:, 5] = np.where(there, np.maximum(1 - fraction, _TOUCHING), 0.0)
-    return table
-
-
-def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
-    """(C,) which row of the other array each group of `LANES` lines has, or -1 if it has no lumen;
-    and (L, CONSTANTS * K * LANES) the constants of those that have one.
-
-    Args:
-        table: (R, K, CONSTANTS), volumes times those of `lumen_table`, of K tetrahedra a line.
-        dtype: of the constants.
-    """
-    groups = -(-len(table) // LANES)
-    padded = np.zeros((groups * LANES, *table.shape[1:]))
-    padded[: len(table)] = table
-    padded[..., 5] = np.where(padded[..., 0] > 0, padded[..., 5], 1.0)  # no division by zero
-    there = padded[..., 0].reshape(groups, -1).any(axis=1)
-    row = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
-    lines = padded.transpose(0, 2, 1).reshape(len(padded), -1)
-    return row, in_lanes(lines).astype(dtype)[there]
+    solid = 1.0 - fraction
+    given, eased = solid * pressure / bulk, _SLACK * fraction
+    per = np.divide(1.0, 2 * given + eased, out=np.zeros_like(given), where=there)
+    firm = np.maximum(wall, _PRESSED * solid * bulk)
+    onset = np.maximum(solid - given, _TOUCHING)
+    return np.stack([pressure, given, eased, per, firm, onset], axis=1) * there[:, None]
 
 
 def require_solid(mesh: TetrahedralMesh, materials: TissueMaterials) -> None:
@@ -178,24 +171,6 @@ def require_solid(mesh: TetrahedralMesh, materials: TissueMaterials) -> None:
             f"lumen everywhere, so that nothing holds it: only materials without lumen_pressure "
             f"are solid"
         )
-
-
-@njit(**INLINED)
-def emptied(h, lumen, i, per, w):
-    """`emptying` of the i-th of ``per`` tetrahedra of lane w, times its volume."""
-    v = i * LANES + w
-    step = per * LANES
-    return emptying(
-        volume_change(h),
-        (
-            lumen[v],
-            lumen[v + step],
-            lumen[v + 2 * step],
-            lumen[v + 3 * step],
-            lumen[v + 4 * step],
-            lumen[v + 5 * step],
-        ),
-    )
 
 
 @njit(**INLINED)

@@ -40,7 +40,8 @@ from us_sim.tissue.elasticity.cell_lanes import (
     put_volumes,
 )
 from us_sim.tissue.elasticity.lanes import LANES, five, in_lanes, put_six, three
-from us_sim.tissue.elasticity.lumen import emptied, in_groups, neo_hookean_constants
+from us_sim.tissue.elasticity.lumen import CONSTANTS, neo_hookean_constants
+from us_sim.tissue.elasticity.lumen_lanes import add_lumens, in_groups
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
     HALF,
@@ -95,8 +96,8 @@ class CellSums(NodalSums):
         rows[number, _ELEMENT:_NODAL] = (mesh.volumes * made.element).reshape(-1, 5)
         rows[number, _NODAL:_WALL] = (mesh.volumes * made.nodal / 4).reshape(-1, 5)
         rows[number, _WALL:] = (mesh.volumes * made.wall).reshape(-1, 5)
-        lumens = np.zeros((len(rows), 5, made.lumen.shape[1]))
-        lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, made.lumen.shape[1])
+        lumens = np.zeros((len(rows), 5, CONSTANTS))
+        lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, CONSTANTS)
         self._lumens = in_groups(lumens, dtype)
         self._constants = in_lanes(rows).astype(dtype)
         # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
@@ -124,19 +125,6 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
         lanes[p + 4 * LANES] = rows[c + 4 * LANES] * ((s1 + s2) + (s4 + s7))
 
 
-@njit(**LOOP)
-def _add_lumens(field, rows, lumen, entry, row, lanes):
-    """Add to five rows from ``row`` on an entry of `emptied` of each tetrahedron."""
-    for w in range(LANES):
-        p, q, r, s, t = gradients(field, rows, w)
-        v = row * LANES + w
-        lanes[v] += emptied(p, lumen, 0, 5, w)[entry]
-        lanes[v + LANES] += emptied(q, lumen, 1, 5, w)[entry]
-        lanes[v + 2 * LANES] += emptied(r, lumen, 2, 5, w)[entry]
-        lanes[v + 3 * LANES] += emptied(s, lumen, 3, 5, w)[entry]
-        lanes[v + 4 * LANES] += emptied(t, lumen, 4, 5, w)[entry]
-
-
 @njit(**INLINED)
 def _pressure(h, element, wall, nodal):
     """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
@@ -147,11 +135,6 @@ def _pressure(h, element, wall, nodal):
 @njit(**INLINED)
 def _tetrahedron_stress(h, shear, element, wall, nodal):
     return stress(h, shear, _pressure(h, element, wall, nodal))
-
-
-@njit(**INLINED)
-def _tetrahedron_k(h, shear, element, wall, nodal):
-    return _pressure(h, element, wall, nodal) - shear
 
 
 @njit(**LOOP)
@@ -176,13 +159,14 @@ def _energy(displacement, grid, constants, lumens, lanes):
                 )
                 + energy_density(t, shear[4], element[4], wall[4])
             )
-        for w in range(min(LANES, grid[3] - first)):
-            total += lanes[OUT * LANES + w]
+        entries = 1
         if lumens[0][chunk] >= 0:
-            lanes[OUT * LANES : (OUT + 5) * LANES] = 0
-            _add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 0, OUT, lanes)
-            for w in range(5 * LANES):
-                total += lanes[OUT * LANES + w]
+            entries = 6
+            lanes[(OUT + 1) * LANES : (OUT + 6) * LANES] = 0
+            add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 0, OUT + 1, lanes)
+        for entry in range(OUT, OUT + entries):
+            for w in range(min(LANES, grid[3] - first)):
+                total += lanes[entry * LANES + w]
     return total
 
 
@@ -249,9 +233,8 @@ def _forces(displacement, nodal, grid, constants, lumens, lanes, forces):
         if len(nodal):
             _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, lanes)
-        lumen = lumens[0][chunk]
-        if lumen >= 0:
-            _add_lumens(lanes, rows, lumens[1][lumen], 1, PRESSURES, lanes)
+        if lumens[0][chunk] >= 0:
+            add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
@@ -267,7 +250,7 @@ def _forces(displacement, nodal, grid, constants, lumens, lanes, forces):
                 w,
                 lanes,
             )
-        if lumen >= 0:
+        if lumens[0][chunk] >= 0:
             lanes[PRESSURES * LANES : (PRESSURES + 5) * LANES] = 0
         add_field(lanes, grid, first, rows, forces)
 
@@ -281,27 +264,26 @@ def _linearise(displacement, nodal, grid, constants, lumens, lanes, tangent):
         if len(nodal):
             _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, kept)
-        lumen = lumens[0][chunk]
-        if lumen >= 0:
-            _add_lumens(kept, rows, lumens[1][lumen], 1, PRESSURES, lanes)
+        if lumens[0][chunk] >= 0:
+            add_lumens(kept, rows, lumens[1][lumens[0][chunk]], 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(kept, rows, w)
             shear = five(rows, _SHEAR, w)
             element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             mean = five(lanes, PRESSURES, w)
             k, bulk = _K * LANES + w, _BULK * LANES + w
-            kept[k] = _tetrahedron_k(p, shear[0], element[0], wall[0], mean[0])
-            kept[k + LANES] = _tetrahedron_k(q, shear[1], element[1], wall[1], mean[1])
-            kept[k + 2 * LANES] = _tetrahedron_k(r, shear[2], element[2], wall[2], mean[2])
-            kept[k + 3 * LANES] = _tetrahedron_k(s, shear[3], element[3], wall[3], mean[3])
-            kept[k + 4 * LANES] = _tetrahedron_k(t, shear[4], element[4], wall[4], mean[4])
+            kept[k] = _pressure(p, element[0], wall[0], mean[0]) - shear[0]
+            kept[k + LANES] = _pressure(q, element[1], wall[1], mean[1]) - shear[1]
+            kept[k + 2 * LANES] = _pressure(r, element[2], wall[2], mean[2]) - shear[2]
+            kept[k + 3 * LANES] = _pressure(s, element[3], wall[3], mean[3]) - shear[3]
+            kept[k + 4 * LANES] = _pressure(t, element[4], wall[4], mean[4]) - shear[4]
             kept[bulk] = bulk_slope(volume_change(p), element[0], wall[0])
             kept[bulk + LANES] = bulk_slope(volume_change(q), element[1], wall[1])
             kept[bulk + 2 * LANES] = bulk_slope(volume_change(r), element[2], wall[2])
             kept[bulk + 3 * LANES] = bulk_slope(volume_change(s), element[3], wall[3])
             kept[bulk + 4 * LANES] = bulk_slope(volume_change(t), element[4], wall[4])
-        if lumen >= 0:
-            _add_lumens(kept, rows, lumens[1][lumen], 2, _BULK, kept)
+        if lumens[0][chunk] >= 0:
+            add_lumens(kept, rows, lumens[1][lumens[0][chunk]], 2, _BULK, kept)
             lanes[PRESSURES * LANES : (PRESSURES + 5) * LANES] = 0
 
 

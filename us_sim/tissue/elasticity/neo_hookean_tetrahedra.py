@@ -24,7 +24,8 @@ from numpy.typing import DTypeLike
 
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.lumen import emptied, in_groups, neo_hookean_constants
+from us_sim.tissue.elasticity.lumen import neo_hookean_constants
+from us_sim.tissue.elasticity.lumen_lanes import emptied, in_groups
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import (
     INLINED,

@@ -1,0 +1,387 @@
+"""Lumens that empty: against the law's closed forms, a tube in tissue, and finite differences."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.optimize import brentq, minimize
+from tissue_block import block, block_mesh
+
+from us_sim.errors import MaterialError, SolverError
+from us_sim.evaluation.independent_residual import neo_hookean_forces
+from us_sim.geometry.collider import RoundedBox
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.lumen import emptying, lumen_table, require_solid
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import (
+    TissueMaterials,
+    average_over_labels,
+    uniform_material,
+)
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+
+CELLS = box_mesh([-0.02, -0.008, 0.004, 0.02], [0.0, 0.01, 0.03], [0.0, 0.005, 0.02, 0.03])
+TETRAHEDRA = TetrahedralMesh(CELLS.nodes, CELLS.tetrahedra)
+BOTH = pytest.mark.parametrize("mesh", [CELLS, TETRAHEDRA], ids=["cells", "tetrahedra"])
+VEIN = Material(5e3, 0.1, 1060.0, lumen_pressure=1000.0)
+MUSCLE = Material(15e3, 0.45, 1060.0)
+
+fractions = st.floats(0.01, 1.0)
+blood = st.floats(10.0, 1e4)
+bulks = st.floats(1e3, 1e6)
+
+
+def constants(fraction, pressure, bulk, wall=0.0):
+    return lumen_table(*(np.array([x]) for x in (fraction, pressure, bulk, wall)))[0]
+
+
+def vessels(mesh, seed=5):
+    """Solids and lumens of several fractions beside each other."""
+    rng = np.random.default_rng(seed)
+    count = len(mesh.tetrahedra)
+    fraction = rng.choice([0.0, 0.0, 0.02, 0.3, 0.7, 1.0], count)
+    return TissueMaterials(
+        10 ** rng.uniform(3, 5, count),
+        rng.choice([0.0, 0.3, 0.45, 0.499], count),
+        np.full(count, 1000.0),
+        fraction,
+        np.where(fraction > 0, rng.uniform(300, 3000, count), 0.0),
+    )
+
+
+def random_field(size, seed=1, mesh=CELLS):
+    return np.random.default_rng(seed).normal(size=(3, len(mesh.nodes))) * size
+
+
+@pytest.mark.parametrize("outside", [100.0, 500.0, 999.0])
+def test_a_block_of_lumen_under_a_pressure_has_the_area_of_the_law(outside):
+    # p (m^2 - 1) = -outside where m = 1 - (1 - j) / 0.2, of a block that keeps its length
+    ratio = 1 - 0.2 * (1 - np.sqrt(1 - outside / 1000.0))
+    mesh = block_mesh((3, 3, 3))
+    tissue = NeoHookean(mesh, uniform_material(mesh, VEIN), np.float64)
+
+    def excess(area):
+        """What the sides of the block, narrowed alike, are pressed with beyond ``outside``."""
+        narrow = np.sqrt(area) - 1
+        forces = tissue.forces(np.ascontiguousarray(mesh.nodes.T * [[0.0], [narrow], [narrow]]))
+        top = mesh.nodes[:, 2] > 0.1 - 1e-9
+        return -forces[2, top].sum() / (0.2 * 0.1 * (1 + narrow)) - outside
+
+    found = brentq(excess, 0.5, 1.1)
+    shear = 0.05 * 5e3 / 2.2  # of the mesh inside, narrowed by less than a tenth
+    slope = 2 * 1000.0 / 0.2 * np.sqrt(1 - outside / 1000.0)
+    assert found == pytest.approx(ratio, abs=0.2 * shear / max(slope, 5 * shear))
+
+
+def test_beyond_the_venous_pressure_nothing_holds_a_lumen_until_its_walls_touch():
+    law = constants(1.0, 1000.0, 1e4, 5e3)
+    changes = np.linspace(-0.79, -0.21, 50)
+    assert [emptying(change, law)[1] for change in changes] == pytest.approx([-1000.0] * 50)
+    assert max(emptying(change, law)[2] for change in changes) == 0.0
+    assert emptying(-0.9, law)[1] < -1500.0  # of the wall
+    assert emptying(0.1, law)[1] == pytest.approx(1250.0)  # distended: 1.5^2 - 1
+
+
+@given(fractions, blood, bulks, st.floats(0.1, 1.5))
+@settings(deadline=None)
+def test_lumen_and_solid_bear_one_pressure_and_their_volumes_add_up(f, p, k, ratio):
+    law = constants(f, p, k)
+    pressure = emptying(ratio - 1, law)[1]
+    lowest = 1 - (1 - f) * p / k - 0.2 * f  # where the lumen's wall is slack
+    if ratio > max(lowest, law[5]):
+        lumen = 1 - 0.2 * (1 - np.sqrt(max(1 + pressure / p, 0.0)))
+        solid = 1 + pressure / k
+        assert f * lumen + (1 - f) * solid == pytest.approx(ratio, abs=1e-6)
+    else:
+        assert pressure <= -p * (1 - 1e-9)
+
+
+@given(fractions, blood, bulks, st.floats(0.03, 1.5), st.floats(0.03, 1.5))
+@settings(deadline=None)
+def test_the_energy_is_the_integral_of_a_pressure_that_never_falls_with_the_volume(f, p, k, j, i):
+    law = constants(f, p, k, 2 * k)
+    low, high = min(i, j), max(i, j)
+    kinks = [1 - law[1] - law[2], law[5]]
+    work = quad(lambda x: emptying(x - 1, law)[1], low, high, points=kinks, limit=200)[0]
+    rise = emptying(high - 1, law)[0] - emptying(low - 1, law)[0]
+    largest = max(abs(emptying(x - 1, law)[1]) for x in (low, high))
+    assert work == pytest.approx(rise, abs=1e-6 * (largest + p))
+    assert emptying(low - 1, law)[1] <= emptying(high - 1, law)[1] + 1e-9 * largest
+    assert emptying(low - 1, law)[2] >= 0.0
+
+
+@given(bulks)
+@settings(deadline=None)
+def test_hardly_any_lumen_is_the_solid_as_long_as_it_is_pressed_by_less_than_blood(k):
+    law = constants(1e-7, 0.01 * k, k)
+    for change in (-0.008, 1e-4, 0.02):
+        assert emptying(change, law)[1] == pytest.approx(k * change, rel=1e-3)
+
+
+@BOTH
+@pytest.mark.parametrize("size", [1e-4, 3e-3, 1e-2])
+def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
+    tissue = NeoHookean(mesh, vessels(mesh), np.float64)
+    displacement, change = random_field(size), random_field(1.0, 2)
+    step = 1e-4 * size
+
+    def slope(function):
+        return (function(displacement + step * change) - function(displacement - step * change)) / (
+            2 * step
+        )
+
+    forces = tissue.forces(displacement)
+    assert np.vdot(forces, change) == pytest.approx(
+        slope(tissue.energy), abs=1e-7 * np.linalg.norm(forces) * np.linalg.norm(change)
+    )
+    tissue.linearise(displacement)
+    product = tissue.tangent_product(change)
+    error = np.linalg.norm(product - slope(tissue.forces))
+    assert error < 1e-6 * np.linalg.norm(product)
+    matrix = np.eye(3 * tissue.count).reshape(-1, 3, tissue.count)
+    blocks = np.array([tissue.tangent_product(np.ascontiguousarray(c)).ravel() for c in matrix])
+    blocks = blocks.reshape(3, tissue.count, 3, tissue.count)
+    # The nodes' part of the bulk stiffness is counted as it is at rest.
+    tissue.linearise(np.zeros_like(displacement))
+    nodal = volumetric_split(vessels(mesh)).nodal * (vessels(mesh).lumen_fraction == 0)
+    assert nodal.any()
+    assert abs(blocks - blocks.transpose(2, 3, 0, 1)).max() < 1e-12 * abs(blocks).max()
+
+
+@given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.02))
+@settings(max_examples=25, deadline=None)
+def test_cells_tetrahedra_and_the_formulas_written_again_agree(seed, size):
+    displacement, change = random_field(size, seed), random_field(1.0, seed + 1)
+    materials = vessels(CELLS, seed)
+    cells, tetrahedra = (NeoHookean(m, materials, np.float64) for m in (CELLS, TETRAHEDRA))
+
+    def near(got, expected, digits=1e-12):
+        assert abs(got - expected).max() <= digits * abs(expected).max() + 1e-18
+
+    near(cells.forces(displacement), tetrahedra.forces(displacement))
+    expected = neo_hookean_forces(CELLS, materials, displacement.T).T
+    assert abs(cells.forces(displacement) - expected).max() < 1e-6 * abs(expected).max() + 1e-12
+    assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)
+    cells.linearise(displacement)
+    tetrahedra.linearise(displacement)
+    near(cells.tangent_product(change), tetrahedra.tangent_product(change))
+    near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())
+
+
+@BOTH
+def test_at_rest_it_is_in_balance_and_no_change_lowers_its_energy(mesh):
+    tissue = NeoHookean(mesh, vessels(mesh), np.float64)
+    rest = np.zeros((3, tissue.count))
+    assert not tissue.forces(rest).any()
+    assert tissue.energy(rest) == 0.0
+    for seed in range(20):
+        assert tissue.energy(random_field(1e-4, seed)) > 0.0
+
+
+@BOTH
+def test_a_lumen_that_empties_does_not_move_its_neighbours_averages(mesh):
+    count = len(mesh.tetrahedra)
+    lumen = np.arange(count) == count // 2
+    nearly = TissueMaterials(
+        np.full(count, 1e4), np.full(count, 0.499), np.full(count, 1e3), lumen * 1.0, lumen * 1e3
+    )
+    tissue = NeoHookean(mesh, nearly, np.float64)
+    shrunk = 0.8 * mesh.nodes - mesh.nodes
+    deformed = np.einsum("tai,taj->tij", shrunk[mesh.tetrahedra], shape_gradients(mesh))
+    ratio = np.linalg.det(np.eye(3) + deformed)
+    assert ratio == pytest.approx(0.512)
+    # All are shrunk alike, so that averages are those of the solids: energies of both add up.
+    split = volumetric_split(nearly)
+    plain = 1.5 * (0.8**2 - 1) - (0.512 - 1)
+    solid = split.shear * plain + (split.element + split.nodal) / 2 * 0.488**2
+    hollow = 0.05 * split.shear * plain + 1000.0 * (0.2 * 2 / 3 + 0.8 - 0.512)
+    expected = (mesh.volumes * np.where(lumen, hollow, solid)).sum()
+    assert tissue.energy(np.ascontiguousarray(shrunk.T)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_fractions_are_those_of_the_labels_and_pressures_those_of_the_lumens():
+    labels = np.ones((20, 20, 20), dtype=np.uint8)
+    labels[:, :, 5:] = 2
+    mesh = box_mesh(*([0.0, 0.02],) * 3)
+    index = np.diag([1000.0, 1000.0, 1000.0, 1.0])
+    index[:3, 3] = -0.5
+    averaged = average_over_labels(mesh, labels, index, {1: MUSCLE, 2: VEIN})
+    assert averaged.lumen_fraction @ mesh.volumes / mesh.volumes.sum() == pytest.approx(
+        0.75, abs=0.01
+    )
+    np.testing.assert_allclose(averaged.lumen_pressure, 1000.0)
+    solid = average_over_labels(mesh, labels, index, {1: MUSCLE, 2: MUSCLE})
+    assert not solid.lumen_fraction.any()
+    assert not solid.lumen_pressure.any()
+    assert uniform_material(mesh, VEIN).lumen_pressure.tolist() == [1000.0] * 5
+
+
+OUTER, INNER = 0.012, 0.003  # m, radii of a cylinder of tissue and of the lumen along its axis
+
+
+def tube(inwards, poisson_ratio, across=25):
+    """Ratio of the lumen's cross-section and pressure (Pa) on a cylinder pressed in by so much.
+
+    One layer of tetrahedra between two planes that nothing leaves: plane strain.
+    """
+    planes = np.linspace(-OUTER, OUTER, across)
+    thick = planes[1] - planes[0]
+    mesh = box_mesh(planes, [0.0, thick], planes)
+    x, z = mesh.nodes[:, 0], mesh.nodes[:, 2]
+    # Each square around the axis becomes the circle in it.
+    square, round_ = np.maximum(abs(x), abs(z)), np.hypot(x, z)
+    scale = np.divide(square, round_, out=np.ones_like(x), where=round_ > 0)
+    nodes = np.column_stack([x * scale, mesh.nodes[:, 1], z * scale])
+    centres = np.abs(mesh.nodes[mesh.tetrahedra].mean(axis=1))[:, [0, 2]].max(axis=1)
+    mesh = TetrahedralMesh(nodes, mesh.tetrahedra)
+    lumen = 1.0 * (centres < INNER)
+    even = [np.full(len(lumen), value) for value in (15e3, poisson_ratio, 1e3)]
+    tissue = NeoHookean(mesh, TissueMaterials(*even, lumen, lumen * 1000.0), np.float64)
+    radius = np.hypot(nodes[:, 0], nodes[:, 2])
+    rim = radius > OUTER * (1 - 1e-9)
+    across_tube = -nodes.T / np.maximum(radius, 1e-12) * [[1.0], [0.0], [1.0]]
+    rest = np.where(rim, inwards * across_tube, inwards / OUTER * -nodes.T * [[1.0], [0.0], [1.0]])
+    free = np.zeros((3, len(nodes)), dtype=bool)
+    free[[0, 2]] = ~rim
+
+    def moved(unknown):
+        field = rest.copy()
+        field[free] = unknown * 1e-3
+        return field
+
+    found = minimize(
+        lambda u: (1e6 * tissue.energy(moved(u)), 1e3 * tissue.forces(moved(u))[free]),
+        rest[free] * 1e3,
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": 3000, "maxfun": 6000, "ftol": 1e-15, "gtol": 1e-6},
+    )
+    field = moved(found.x)
+    gradients = np.eye(3) + np.einsum(
+        "tai,taj->tij", field.T[mesh.tetrahedra], shape_gradients(mesh)
+    )
+    inside = mesh.volumes * lumen
+    push = (tissue.forces(field) * across_tube)[:, rim].sum()
+    area = 2 * np.pi * (OUTER - inwards) * thick
+    return inside @ np.linalg.det(gradients) / inside.sum(), push / area
+
+
+def lame(inwards):
+    """The same of a thick-walled cylinder by G. Lame and E. Clapeyron (1833), in plane strain.
+
+    u = c r + d / r, with sigma_r = 2 (lambda + mu) c - 2 mu d / r^2, which at the lumen is what
+    the law says of its ratio.
+    """
+    shear = 15e3 / 2.8
+    bulk = 5 * shear  # lambda + mu
+
+    def fields(d):
+        c = -(inwards + d / OUTER) / OUTER
+        return (1 + c + d / INNER**2) ** 2, [
+            2 * bulk * c - 2 * shear * d / r**2 for r in (INNER, OUTER)
+        ]
+
+    def excess(d):
+        ratio, (inner, _) = fields(d)
+        stretch = max(1 - (1 - ratio) / 0.2, 0.0)
+        return inner - 1000.0 * (stretch**2 - 1)
+
+    ratio, (_, outer) = fields(brentq(excess, -1e-5, 1e-5))
+    return ratio, -outer
+
+
+@pytest.mark.parametrize("inwards", [0.02e-3, 0.05e-3, 0.1e-3])
+def test_a_tube_in_tissue_narrows_as_lame_says(inwards):
+    ratio, outside = tube(inwards, 0.4)
+    expected_ratio, expected_outside = lame(inwards)
+    assert 1 - ratio == pytest.approx(1 - expected_ratio, rel=0.1)
+    assert outside == pytest.approx(expected_outside, rel=0.05)
+
+
+@pytest.mark.parametrize("inwards", [0.1e-3, 0.2e-3, 0.25e-3])
+def test_a_tube_in_incompressible_tissue_closes_at_the_pressure_of_the_blood_and_of_the_tissue(
+    inwards,
+):
+    ratio, outside = tube(inwards, 0.499)
+    left = OUTER**2 - (OUTER - inwards) ** 2  # m2 over pi, what has left the tube
+    assert ratio == pytest.approx(1 - left / INNER**2, abs=0.05)
+    # In a neo-Hookean cylinder in plane strain the radial stress rises by mu (k^2 - 1 / k^2) / r,
+    # where k = r / R is the stretch around the axis.
+    shear = 15e3 / 2.998
+
+    def rise(r):
+        square = r**2 / (r**2 + left)
+        return shear * (square - 1 / square) / r
+
+    tissue = -quad(rise, np.sqrt(INNER**2 - left), OUTER - inwards)[0]
+    blood_pressure = 1000.0 * (1 - max(1 - left / INNER**2 / 0.2, 0.0) ** 2)
+    assert blood_pressure == pytest.approx(1000.0)
+    assert outside == pytest.approx(blood_pressure + tissue, rel=0.1)
+
+
+def test_a_model_that_is_lumen_everywhere_is_refused():
+    mesh = block_mesh((4, 3, 3))
+    model = block((4, 3, 3), materials=uniform_material(mesh, VEIN))
+    with pytest.raises(SolverError, match="around node 0 is lumen everywhere, so that nothing"):
+        FemNonlinear(model)
+    require_solid(mesh, uniform_material(mesh, MUSCLE))
+
+
+def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
+    nodes = (13, 7, 9)
+    mesh = block_mesh(nodes)
+    centres = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    lumen = 1.0 * (np.hypot(centres[:, 0], centres[:, 2] - 0.03) < 0.02)
+    even = [np.full(len(lumen), value) for value in (10e3, 0.45, 1000.0)]
+    box = RoundedBox(0.06, 0.14, 0.04, 0.004)
+    model = block(nodes, box, materials=TissueMaterials(*even, lumen, 300.0 * lumen))
+    solver = FemNonlinear(model)
+    inside = mesh.volumes * lumen
+
+    def volume(deformed):
+        corners = deformed[mesh.tetrahedra]
+        ratio = np.linalg.det(corners[:, 1:] - corners[:, :1]) / (6 * mesh.volumes)
+        assert ratio.min() > 0.0
+        return inside @ ratio / inside.sum()
+
+    volumes, forces = [], []
+    for depth in np.linspace(0.0, 0.03, 31):
+        deformation = solver.deform(Pose(position=[0.0, 0.0, depth]))
+        volumes.append(volume(deformation.nodes))
+        forces.append(-deformation.force[2])
+        assert deformation.residual < 0.05
+    assert (np.diff(volumes) < 1e-3).all()
+    assert volumes[-1] < 0.6
+    assert (np.diff(forces) > -1e-3).all()
+    np.testing.assert_array_equal(solver.deform(None).nodes, mesh.nodes)
+
+
+@pytest.mark.parametrize(
+    ("pressure", "words"),
+    [
+        (-100.0, "material.lumen_pressure: -100 Pa is outside 1 to 1e.06 Pa"),
+        (np.nan, "material.lumen_pressure: nan is not finite; give 1 to 1e.06 Pa"),
+        ("8 mmHg", "material.lumen_pressure: '8 mmHg' is not a pressure"),
+    ],
+)
+def test_a_pressure_that_cannot_be_is_refused(pressure, words):
+    with pytest.raises(MaterialError, match=words):
+        Material(5e3, 0.1, 1000.0, lumen_pressure=pressure)
+    assert Material(5e3, lumen_pressure="1.3 kPa").lumen_pressure == 1300.0
+
+
+@pytest.mark.parametrize(
+    ("fraction", "pressure"),
+    [(1.5, 1e3), (-0.1, 1e3), (0.5, 0.0), (0.0, 1e3), (0.5, np.nan), (np.nan, 1e3)],
+)
+def test_constants_of_a_lumen_that_cannot_be_are_refused(fraction, pressure):
+    one = np.ones(2)
+    with pytest.raises(MaterialError, match="tetrahedron 1 has a lumen of .* fractions are 0 to 1"):
+        TissueMaterials(one, 0 * one, one, np.array([0.0, fraction]), np.array([0.0, pressure]))
+    with pytest.raises(MaterialError, match="lumen_fraction needs one number"):
+        TissueMaterials(one, 0 * one, one, np.ones(3), one)
