@@ -97,7 +97,7 @@ def test_lumen_and_solid_bear_one_pressure_and_their_volumes_add_up(f, p, k, rat
         lumen = 1 - 0.2 * (1 - np.sqrt(max(1 + pressure / p, 0.0)))
         solid = 1 + pressure / k
         assert f * lumen + (1 - f) * solid == pytest.approx(ratio, abs=1e-6)
-    else:
+    elif ratio < lowest:
         assert pressure <= -p * (1 - 1e-9)
 
 
@@ -364,8 +364,8 @@ def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
 @pytest.mark.parametrize(
     ("pressure", "words"),
     [
-        (-100.0, "material.lumen_pressure: -100 Pa is outside 1 to 1e.06 Pa"),
-        (np.nan, "material.lumen_pressure: nan is not finite; give 1 to 1e.06 Pa"),
+        (-100.0, "material.lumen_pressure: -100 Pa is outside 1 to 100000 Pa"),
+        (np.nan, "material.lumen_pressure: nan is not finite; give 1 to 100000 Pa"),
         ("8 mmHg", "material.lumen_pressure: '8 mmHg' is not a pressure"),
     ],
 )
@@ -381,7 +381,9 @@ def test_a_pressure_that_cannot_be_is_refused(pressure, words):
 )
 def test_constants_of_a_lumen_that_cannot_be_are_refused(fraction, pressure):
     one = np.ones(2)
-    with pytest.raises(MaterialError, match="tetrahedron 1 has a lumen of .* fractions are 0 to 1"):
+    with pytest.raises(
+        MaterialError, match=r"tetrahedron 1 has a lumen of .* fractions are 0 to 1"
+    ):
         TissueMaterials(one, 0 * one, one, np.array([0.0, fraction]), np.array([0.0, pressure]))
     with pytest.raises(MaterialError, match="lumen_fraction needs one number"):
         TissueMaterials(one, 0 * one, one, np.ones(3), one)

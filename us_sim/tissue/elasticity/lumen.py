@@ -53,7 +53,6 @@ __all__ = [
     "lumen_table",
     "neo_hookean_constants",
     "require_solid",
-    "softness",
 ]
 
 CONSTANTS = 6
@@ -109,18 +108,14 @@ def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
     lose its volume whatever its neighbours do.
     """
     split = volumetric_split(materials)
-    shear = split.shear * softness(materials)
+    emptied = _emptied(materials)
+    shear = split.shear * (1.0 - (1.0 - _SOFTNESS) * emptied)
     wall = wall_modulus(mesh.tetrahedra, shear, len(mesh.nodes))
-    lumen = lumen_table(_emptied(materials), materials.lumen_pressure, split.element, wall)
+    lumen = lumen_table(emptied, materials.lumen_pressure, split.element, wall)
     solid = materials.lumen_fraction == 0.0
     return NeoHookeanConstants(
         shear, split.element * solid, split.nodal * solid, wall * solid, lumen
     )
-
-
-def softness(materials: TissueMaterials) -> NDArray[np.float64]:
-    """(M,), shear modulus over that of the solid, 1 where there is no lumen."""
-    return np.asarray(1.0 - (1.0 - _SOFTNESS) * _emptied(materials))
 
 
 def _emptied(materials: TissueMaterials) -> NDArray[np.float64]:

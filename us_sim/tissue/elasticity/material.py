@@ -19,7 +19,7 @@ YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
 """Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""
 DENSITY = Quantity("density", 1e-3, 1e6)
-LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e6)
+LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e5)
 
 
 @dataclass(frozen=True)

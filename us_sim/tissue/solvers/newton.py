@@ -30,7 +30,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.elasticity.linear_tetrahedra import shear_times_area
-from us_sim.tissue.elasticity.lumen import softness
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
@@ -117,8 +116,7 @@ class Newton:
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
         bulk = 1 / (1 - 2 * model.materials.poisson_ratio.max())  # lambda + mu over mu
-        softest = float((modulus * softness(model.materials)).min())
-        single = modulus.max() <= _SINGLE_CONTRAST * softest and bulk <= _SINGLE_BULK
+        single = modulus.max() <= _SINGLE_CONTRAST * modulus.min() and bulk <= _SINGLE_BULK
         self._dtype: type[np.floating] = np.float32 if single else np.float64
         self.tissue = NeoHookean(mesh, model.materials, np.float64)
         # Conjugate gradients only correct; what they correct is in double precision.
