@@ -22,7 +22,7 @@ from numpy.typing import DTypeLike, NDArray
 from us_sim.tissue.elasticity.cell_lanes import gradients
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes
 from us_sim.tissue.elasticity.lumen import emptying
-from us_sim.tissue.elasticity.neo_hookean_point import INLINED, LOOP, volume_change
+from us_sim.tissue.elasticity.neo_hookean_point import INLINED, volume_change
 
 __all__ = ["add_lumens", "emptied", "in_groups"]
 
@@ -63,7 +63,7 @@ def emptied(h, lumen, i, per, w):
     )
 
 
-@njit(**LOOP)
+@njit(**INLINED)
 def add_lumens(field, rows, lumen, entry, row, lanes):
     """Add to the five rows from ``row`` on an entry of `emptied` of each tetrahedron of cells."""
     for w in range(LANES):
