@@ -210,6 +210,25 @@ def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, mo
     assert node.health.state == "fem"
 
 
+def test_a_vein_becomes_a_lumen_while_it_runs(pressed):
+    node, press = pressed(solver="fem_nonlinear", lockstep=True)
+    assert node.get_parameter("materials.vein.lumen_pressure").value == 0.0  # a solid
+    refused = attempt(node, "materials.vein.lumen_pressure", -5.0)
+    assert not refused.successful
+    assert "out of range" in refused.reason
+    forces = []
+    for pressure in (0.0, 50e3, 20.0, 0.0):
+        assert attempt(node, "materials.vein.lumen_pressure", pressure).successful
+        press(0.003)
+        for turn in range(4):  # until the forces balance
+            force = press(0.004 + 1e-9 * (turn % 2))
+        forces.append(force)
+        assert node.health.state == "fem_nonlinear"
+    # Blood at 50 kPa does not leave, at 20 Pa it does.
+    assert forces[1] < 1.001 * forces[2] < 0.0
+    assert forces[3] == pytest.approx(forces[0], rel=1e-3)
+
+
 def test_what_cannot_be_made_is_set_back_and_said(bench, pressed):
     node, press = pressed(solver="msds")
     reports = bench.collect(DiagnosticArray, "diagnostics")

@@ -6,8 +6,9 @@ resists the average change of volume around each node:
     sum over tetrahedra e of V (mu/2 (|F|^2 - 3) - mu (J - 1) + element/2 (J - 1)^2)
     + 1/2 sum over nodes a of C q^2,   C = sum of c over a's e,   q = sum of c (J - 1) / C,
 
-with c = V nodal / 4, plus the term of `neo_hookean_point` against being crushed. Linearised at rest
-it is linear elasticity with the same split.
+with c = V nodal / 4, plus the term of `neo_hookean_point` against being crushed. Tetrahedra with a
+lumen have the energy of `us_sim.tissue.elasticity.lumen` in place of all but the shear's. Without
+them, linearised at rest, it is linear elasticity with the same split.
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.material import Material

@@ -7,8 +7,9 @@ logarithmic barrier):
     mu/2 (|F|^2 - 3) - mu (J - 1) + bulk/2 (J - 1)^2,    bulk = lambda + mu.
 
 It is a polynomial, so it holds for inverted tissue too, and linearised at rest it is Hooke's law.
-But a finite force can press a tetrahedron to nothing, as where a vein closes. So below a quarter of
-its volume (J0) a term is added that begins with two continuous derivatives and grows without bound,
+But a finite force can press a tetrahedron to nothing, as under a probe's edge. So below a quarter
+of its volume (J0) a term is added that begins with two continuous derivatives and grows without
+bound,
 
     wall (J0 - J)^3 / (3 J0 J),
 
