@@ -8,6 +8,7 @@
 | `young_modulus` | 0.001 Pa to 10000 GPa | needed | Young's modulus |
 | `poisson_ratio` | -0.99 to 0.49999 | 0.45 | Poisson's ratio |
 | `density` | 0.001 to 1000000 kg/m3 | 1000 kg/m3 | mass per volume |
+| `lumen_pressure` | 1 Pa to 100 kPa | none | of a vessel's blood, which leaves if pressed by more |
 >>> from us_sim.scene.scene import TissueSettings
 >>> [section.title for section in sections_of(TissueSettings, "tissue")][:3]
 ['tissue', 'tissue.mesh', 'tissue.mesh.pose']

@@ -24,11 +24,11 @@ LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e5)
 
 @dataclass(frozen=True)
 class Material(Settings):
-    """Isotropic elastic constants, and the pressure of blood that can leave.
+    """Isotropic elastic constants; for `fem_nonlinear`, also the pressure of a vessel's blood.
 
     With a ``lumen_pressure`` it is the inside of a vessel that empties (see
-    `us_sim.tissue.elasticity.lumen`), which methods of large deformation know. To the linear ones
-    it is a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
+    `us_sim.tissue.elasticity.lumen`), which the solver ``fem_nonlinear`` knows. To the others it is
+    a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
 
     Raises:
         MaterialError: a constant is out of its range.
@@ -42,9 +42,5 @@ class Material(Settings):
     poisson_ratio: float = setting(POISSON_RATIO, "Poisson's ratio", default=0.45)
     density: float = setting(DENSITY, "mass per volume", default=1000.0)
     lumen_pressure: float | None = setting(
-        LUMEN_PRESSURE,
-        "pressure of the blood in a vessel that empties when pressed by more, for `fem_nonlinear`; "
-        "to the other methods it is the solid of young_modulus and poisson_ratio. Not given: a "
-        "solid",
-        default=None,
+        LUMEN_PRESSURE, "of a vessel's blood, which leaves if pressed by more", default=None
     )
