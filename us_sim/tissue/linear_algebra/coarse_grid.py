@@ -93,7 +93,12 @@ class CoarseGrid:
         normals: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> None:
-        """Keep ``nodes`` (K,) from moving along ``normals`` (K, 3); ``stiffness`` (K,) N/m."""
+        """Keep ``nodes`` (K,) from moving along ``normals`` (K, 3); ``stiffness`` (K,) N/m.
+
+        A stiffness that is not positive, or so small that it has no inverse, keeps nothing.
+        """
+        firm = stiffness > np.finfo(np.float64).tiny
+        nodes, normals, stiffness = nodes[firm], normals[firm], stiffness[firm]
         place = self._place[nodes]
         self._touched_corner = self._corner[self._cell_of[place]]
         self._touched_weight = self._weight[place]
