@@ -84,6 +84,7 @@ class Fem(TissueSolver):
     """
 
     name: ClassVar[str] = "fem"
+    must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemSettings

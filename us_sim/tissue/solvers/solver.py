@@ -65,6 +65,8 @@ class TissueSolver(ABC):
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
     """The class of this method's settings. A solver is made with the model, its settings, and a
     callback that is told the fraction done and what is being made, or None."""
+    must_be_held: ClassVar[bool] = False
+    """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
 
