@@ -114,7 +114,7 @@ def test_a_solver_is_not_compared_with_itself_nor_with_an_unknown_one(model):
 
 def test_tissue_that_is_not_held_is_refused_before_anything_is_compiled(model, monkeypatch):
     tissue = SwitchableTissue(replace(model, fixed=np.zeros_like(model.fixed)), "msds")
-    monkeypatch.setattr(switching, "compile_kernels", None)
+    monkeypatch.setattr(switching, "compiled_solver", None)
     for name in ("fem", "fem_cg", "fem_nonlinear"):
         with pytest.raises(SolverError, match="around node 0 has 0 fixed nodes"):
             tissue.use(name)

@@ -1,15 +1,15 @@
-"""Compiling a solver's kernels, where frames must go on meanwhile in a process of its own.
+"""Making a solver with its kernels compiled, where frames must go on in another process.
 
 Numba's compiler holds the interpreter's lock for most of its time, so that a frame in another
-thread takes many times as long. Another process has a lock of its own: it compiles the kernels into
-numba's cache on disk, from where this one loads them. Where that cache cannot be written, or the
-process fails, they are compiled here.
+thread takes many times as long. Another process has a lock of its own: it makes the same solver
+once, which leaves the kernels in numba's cache on disk, from where this one loads them. Where that
+cache cannot be written, or the process fails, they are compiled here.
 
 >>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.compilation import compile_kernels
+>>> from us_sim.tissue.solvers.compilation import compiled_solver
 >>> from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
->>> compile_kernels(FemCg, TissueModel.block(), FemCgSettings())
->>> compile_kernels(FemCg, TissueModel.block(), FemCgSettings(), print)  # nothing is left to do
+>>> compiled_solver(FemCg, TissueModel.block(), FemCgSettings()).name
+'fem_cg'
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from collections.abc import Callable, Iterator
 
 from numba.core import event
 
+from us_sim.errors import UsSimError
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.rehearsal import rehearsal_model
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["compile_kernels", "compiling_said"]
+__all__ = ["compiled_solver"]
 
 Progress = Callable[[float, str], None]
 
@@ -39,42 +40,59 @@ _NICENESS = 5
 _logger = logging.getLogger(__name__)
 
 
-def compile_kernels(
+def compiled_solver(
     solver: type[TissueSolver],
     model: TissueModel,
     settings: SolverSettings,
     progress: Progress | None = None,
     *,
     elsewhere: bool = False,
-) -> None:
-    """Compile what a solver needs for a model, or load it from numba's cache.
+) -> TissueSolver:
+    """A solver, none of whose frames will have to compile anything.
 
     Args:
         solver: the class of the method.
-        model: of the tissue that is to be deformed; another as small as can be stands in for it.
+        model: of the tissue.
         settings: of the solver.
-        progress: told what is being compiled.
-        elsewhere: compile in another process, so that other threads of this one are not held up.
+        progress: told the fraction done and what is being made or compiled.
+        elsewhere: what is not compiled yet is compiled in another process, so that other threads
+            of this one are not held up.
+
+    Raises:
+        SolverError: as `create_solver`.
     """
-    small = rehearsal_model(model)
-    if elsewhere and not _is_compiled(solver, small, settings):
-        _compile_elsewhere(solver, small, settings, progress)
-    with compiling_said(solver.name, progress):
-        solver.rehearse(small, settings)
+    if elsewhere:
+        try:
+            with event.install_listener("numba:compile", _Listener(_refuse)):
+                return _made(solver, model, settings, progress)
+        except _ColdError:
+            _make_elsewhere(solver, model, settings, progress)
+    with _compiling_said(solver.name, progress):
+        return _made(solver, model, settings, progress)
+
+
+def _made(
+    solver: type[TissueSolver],
+    model: TissueModel,
+    settings: SolverSettings,
+    progress: Progress | None,
+) -> TissueSolver:
+    solver.rehearse(rehearsal_model(model), settings)
+    return solver(model, settings, progress)
 
 
 @contextlib.contextmanager
-def compiling_said(method: str, progress: Progress | None) -> Iterator[None]:
+def _compiling_said(method: str, progress: Progress | None) -> Iterator[None]:
     """Tell ``progress`` of each kernel that this thread compiles within the context."""
 
     def say(number: int) -> None:
         if progress is not None:
-            progress(0.0, _sentence(method, number))
+            progress(0.0, f"compiling {method}, kernel {number}")
 
     with event.install_listener("numba:compile", _Listener(say)) as listener:
         yield
     if listener.count and progress is not None:
-        progress(1.0, _sentence(method, listener.count))
+        progress(1.0, f"compiling {method}, {listener.count} kernels")
 
 
 class _ColdError(Exception):
@@ -98,66 +116,58 @@ class _Listener(event.Listener):
         pass
 
 
-def _sentence(method: str, number: int) -> str:
-    return f"compiling {method}, kernel {number}"
+def _refuse(_: int) -> None:
+    raise _ColdError
 
 
-def _is_compiled(solver: type[TissueSolver], small: TissueModel, settings: SolverSettings) -> bool:
-    """Whether all kernels are in memory or in the cache; it ends at the first that is not."""
-
-    def refuse(_: int) -> None:
-        raise _ColdError
-
-    try:
-        with event.install_listener("numba:compile", _Listener(refuse)):
-            solver.rehearse(small, settings)
-    except _ColdError:
-        return False
-    return True
-
-
-def _compile_elsewhere(
+def _make_elsewhere(
     solver: type[TissueSolver],
-    small: TissueModel,
+    model: TissueModel,
     settings: SolverSettings,
     progress: Progress | None,
 ) -> None:
     """Let another process fill the cache; where it fails, why goes into the log only."""
     try:
-        task = pickle.dumps((solver, small, settings))
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        task = pickle.dumps((solver, model, settings))
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # an interrupt from the terminal is for this process
+        )
+    except (pickle.PicklingError, AttributeError, TypeError, OSError) as error:
         _logger.info("%s is compiled in this process: %s", solver.name, error)
         return
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        start_new_session=True,  # an interrupt from the terminal is for this process
-    )
     assert process.stdin is not None
     assert process.stdout is not None
     said = ""
-    with process, contextlib.suppress(BrokenPipeError):
-        process.stdin.write(task)
-        process.stdin.close()
+    with process:
+        with contextlib.suppress(BrokenPipeError), process.stdin:
+            process.stdin.write(task)
         for line in process.stdout:
             said = line.decode(errors="replace").strip() or said
-            if progress is not None and said.isdecimal():
-                progress(0.0, _sentence(solver.name, int(said)))
+            fraction, _, text = said.partition("\t")
+            with contextlib.suppress(ValueError):  # a warning, say
+                if progress is not None:
+                    progress(float(fraction), text)
     if process.returncode:
         _logger.warning("%s is compiled in this process: %s", solver.name, said)
 
 
 def _main() -> None:
-    """Compile what comes in at stdin; a line on stdout for each kernel."""
+    """Make what comes in at stdin; a line on stdout for each word of progress."""
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
-    solver, small, settings = pickle.load(sys.stdin.buffer)
-    # When nobody reads any more, the pipe breaks, and this ends.
-    with event.install_listener("numba:compile", _Listener(lambda n: print(n, flush=True))):
-        solver.rehearse(small, settings)
+    solver, model, settings = pickle.load(sys.stdin.buffer)
+
+    def show(fraction: float, text: str) -> None:
+        # When nobody reads any more, the pipe breaks, and this process ends.
+        print(f"{fraction:.3f}\t{text}", flush=True)
+
+    with contextlib.suppress(UsSimError):  # which the process that asked will find as well
+        compiled_solver(solver, model, settings, show)
 
 
 if __name__ == "__main__":

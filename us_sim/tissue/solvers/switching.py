@@ -27,8 +27,8 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.compilation import compile_kernels, compiling_said
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, create_solver
+from us_sim.tissue.solvers.compilation import compiled_solver
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 __all__ = ["Difference", "Plan", "Prepared", "SwitchableTissue", "difference"]
 
@@ -170,9 +170,7 @@ class SwitchableTissue:
         cls: type[TissueSolver] = SOLVERS.load(name)
         if cls.must_be_held:  # before a minute of compiling
             require_held(model.mesh, model.fixed)
-        compile_kernels(cls, model, settings or cls.Settings(), progress, elsewhere=beside)
-        with compiling_said(name, progress):  # what only a large model needs
-            return create_solver(name, model, settings, progress)
+        return compiled_solver(cls, model, settings or cls.Settings(), progress, elsewhere=beside)
 
     def adopt(self, prepared: Prepared) -> None:
         """Go on with the solvers made, from where the tissue is."""
