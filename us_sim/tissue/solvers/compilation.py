@@ -62,11 +62,13 @@ def compiled_solver(
         SolverError: as `create_solver`.
     """
     if elsewhere:
-        try:
-            with event.install_listener("numba:compile", _Listener(_refuse)):
-                return _made(solver, model, settings, progress)
-        except _ColdError:
-            _make_elsewhere(solver, model, settings, progress)
+        # What was made until then is let go before the other process makes it.
+        with (
+            contextlib.suppress(_ColdError),
+            event.install_listener("numba:compile", _Listener(_refuse)),
+        ):
+            return _made(solver, model, settings, progress)
+        _make_elsewhere(solver, model, settings, progress)
     with _compiling_said(solver.name, progress):
         return _made(solver, model, settings, progress)
 
