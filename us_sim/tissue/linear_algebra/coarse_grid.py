@@ -29,7 +29,6 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -148,7 +147,8 @@ class CoarseGrid:
             _restrict(response, self._node, self._start, self._corner, self._weight, matrix[i])
         matrix = (matrix + matrix.T) / 2
         scale = 1.0 / np.sqrt(np.diag(matrix))
-        values, vectors = eigh(scale[:, None] * matrix * scale)
+        # SciPy's would hold the interpreter's lock for a second, and with it frames beside this.
+        values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
         kept = values > _INDEPENDENT * (values[-1] if len(values) else 0.0)
         vectors = scale[:, None] * vectors[:, kept] / np.sqrt(values[kept])
         return np.ascontiguousarray(vectors @ vectors.T)
