@@ -183,9 +183,9 @@ def test_a_solver_s_setting_reaches_it(pressed):
 def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, monkeypatch):
     go, make = threading.Event(), SwitchableTissue.make
 
-    def slowly(self, plan, progress=None):
+    def slowly(self, plan, progress=None, **how):
         assert not plan.reason or go.wait(60)
-        return make(self, plan, progress)
+        return make(self, plan, progress, **how)
 
     monkeypatch.setattr(SwitchableTissue, "make", slowly)
     node, press = pressed()

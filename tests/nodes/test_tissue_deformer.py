@@ -1,5 +1,7 @@
 """The tissue node: mesh latched, nodes and wrench with the pose's stamp, solver switched live."""
 
+import threading
+
 import numpy as np
 import pytest
 from bench import pose_at
@@ -19,6 +21,7 @@ from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.structures import structures_of
 from us_sim.tissue.solvers.solver import create_solver
+from us_sim.tissue.solvers.switching import SwitchableTissue
 
 
 @pytest.fixture
@@ -76,6 +79,27 @@ def test_the_solver_is_switched_while_running_without_a_jump(bench, deformer):
     assert "magic" in refused.reason
     press(bench, publisher, nodes, 0.004, 21)
     assert node.health.state == "msds"
+
+
+def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is_in_use(
+    bench, small_scene, monkeypatch
+):
+    node = bench.make(TissueDeformer, scene=str(small_scene))
+    told, may_end, make = threading.Event(), threading.Event(), SwitchableTissue.make
+
+    def slow(tissue, plan, progress, *, beside):
+        progress(0.0, "compiling msds, kernel 7")
+        told.set()
+        assert may_end.wait(timeout=20)
+        return make(tissue, plan, progress, beside=beside)
+
+    monkeypatch.setattr(SwitchableTissue, "make", slow)
+    assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
+    assert told.wait(timeout=20)
+    bench.spin_until(lambda: node.health.state.startswith("fem, preparing for "))
+    assert node.health.state.endswith(" s, compiling msds, kernel 7")
+    may_end.set()
+    bench.spin_until(lambda: node.health.state == "msds")
 
 
 def test_two_methods_run_side_by_side_and_diagnostics_say_how_far_they_are_apart(bench, deformer):

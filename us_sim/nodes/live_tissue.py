@@ -62,11 +62,10 @@ class LiveTissue:
             f"preparing {values[OWN].solver} for {len(model.mesh.nodes)} nodes, "
             f"{len(model.mesh.tetrahedra)} tetrahedra"
         )
-        self.tissue = SwitchableTissue(
-            model, values[OWN].solver, _settings(values), late_progress("preparing the tissue")
-        )
+        show = late_progress("preparing the tissue")
+        self.tissue = SwitchableTissue(model, values[OWN].solver, _settings(values), show)
         if values[OWN].compare_with:
-            self.tissue.compare_with(values[OWN].compare_with)
+            self.tissue.compare_with(values[OWN].compare_with, show)
         self._current = dict(values)  # what the tissue is deformed by
         self._asked = dict(values)  # what is being made ready
         self._preparation = Preparation(self.tissue)
@@ -126,7 +125,7 @@ class LiveTissue:
 
     def _made(self, plan: Plan) -> Prepared | Failed:
         try:
-            return self.tissue.make(plan)
+            return self.tissue.make(plan, late_progress("preparing the tissue"))
         except UsSimError as error:
             return Failed(plan, str(error))
 
@@ -143,6 +142,10 @@ class LiveTissue:
             self._settle(outcome)
 
     def _settle(self, outcome: Prepared | Failed) -> None:
+        self._take(outcome)
+        self._node.health.state = self.tissue.name  # also while no pose comes
+
+    def _take(self, outcome: Prepared | Failed) -> None:
         if isinstance(outcome, Failed):
             self._node.health.problem(
                 "setting", f"{outcome.plan.reason}: {outcome.problem}; it is set back"

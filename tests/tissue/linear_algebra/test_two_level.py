@@ -84,6 +84,16 @@ def test_the_solution_is_that_of_a_dense_solve(coarse):
     np.testing.assert_allclose(solved.image, image, atol=1e-9 * abs(image).max())
 
 
+def test_a_spring_without_stiffness_changes_nothing():
+    force = np.random.default_rng(0).normal(size=(3, COUNT))
+    force[:, FIXED] = 0.0
+    with_it, without = np.empty_like(force), np.empty_like(force)
+    with np.errstate(all="raise"):
+        two_level(True, SPRINGS)[0].apply(force, with_it)
+    two_level(True, SPRINGS[:3])[0].apply(force, without)
+    np.testing.assert_array_equal(with_it, without)
+
+
 def test_the_coarse_level_saves_iterations_with_and_without_springs():
     force = np.zeros((3, COUNT))
     force[2, MODEL.movable_contact_nodes] = 1.0

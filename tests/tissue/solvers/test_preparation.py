@@ -18,7 +18,7 @@ class SlowTissue:
         self.has_begun = threading.Semaphore(0)
         self.may_end = threading.Semaphore(0)
 
-    def make(self, plan: Plan, progress: object = None) -> Plan:  # noqa: ARG002
+    def make(self, plan: Plan, progress: object = None, *, beside: bool) -> Plan:  # noqa: ARG002
         self.begun.append(plan.solver)
         self.has_begun.release()
         assert self.may_end.acquire(timeout=20)

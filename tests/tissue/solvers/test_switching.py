@@ -12,6 +12,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.solvers import switching
 from us_sim.tissue.solvers.fem_cg import FemCgSettings
 from us_sim.tissue.solvers.switching import Plan, SwitchableTissue, difference
 
@@ -109,3 +110,12 @@ def test_a_solver_is_not_compared_with_itself_nor_with_an_unknown_one(model):
     with pytest.raises(SolverError, match="magic"):
         tissue.use("magic")
     assert tissue.name == "fem_cg"
+
+
+def test_tissue_that_is_not_held_is_refused_before_anything_is_compiled(model, monkeypatch):
+    tissue = SwitchableTissue(replace(model, fixed=np.zeros_like(model.fixed)), "msds")
+    monkeypatch.setattr(switching, "compiled_solver", None)
+    for name in ("fem", "fem_cg", "fem_nonlinear"):
+        with pytest.raises(SolverError, match="around node 0 has 0 fixed nodes"):
+            tissue.use(name)
+    assert tissue.name == "msds"

@@ -14,6 +14,8 @@ True
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
@@ -97,20 +99,26 @@ def free_stiffness(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
 def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
     """Check that no part of the mesh can move as a rigid body.
 
+    Tetrahedra of a part hang together by faces (`us_sim.tissue.mesh.check.check_mesh` refuses
+    hinges), so that three of its nodes hold all of it.
+
     Raises:
         SolverError: a connected part has no three fixed nodes off one line.
     """
-    for i in range(mesh.parts.max() + 1):
-        part = mesh.parts == i
-        held = mesh.nodes[fixed & part]
+    nodes = np.flatnonzero(fixed)
+    nodes = nodes[np.argsort(mesh.parts[nodes], kind="stable")]
+    bounds = np.searchsorted(mesh.parts[nodes], np.arange(mesh.parts.max() + 2))
+    for part, (first, last) in enumerate(itertools.pairwise(bounds)):
+        held = mesh.nodes[nodes[first:last]]
         spread = np.zeros(3)
         if len(held) > 2:
             spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False)
         if spread[1] <= 1e-9 * spread[0]:
+            line = " on one line" if len(held) > 2 else ""
             raise SolverError(
                 f"the tissue can move as a whole: the part of the mesh around node "
-                f"{np.flatnonzero(part)[0]} has {len(held)} fixed nodes; fix at least three "
-                f"that are not on one line, such as the face `bottom`"
+                f"{np.argmax(mesh.parts == part)} has {len(held)} fixed nodes{line}; fix at least "
+                f"three that are not on one line, such as the face `bottom`"
             )
 
 

@@ -29,7 +29,6 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -93,7 +92,12 @@ class CoarseGrid:
         normals: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> None:
-        """Keep ``nodes`` (K,) from moving along ``normals`` (K, 3); ``stiffness`` (K,) N/m."""
+        """Keep ``nodes`` (K,) from moving along ``normals`` (K, 3); ``stiffness`` (K,) N/m.
+
+        A stiffness that is not positive, or so small that it has no inverse, keeps nothing.
+        """
+        firm = stiffness > np.finfo(np.float64).tiny
+        nodes, normals, stiffness = nodes[firm], normals[firm], stiffness[firm]
         place = self._place[nodes]
         self._touched_corner = self._corner[self._cell_of[place]]
         self._touched_weight = self._weight[place]
@@ -143,7 +147,8 @@ class CoarseGrid:
             _restrict(response, self._node, self._start, self._corner, self._weight, matrix[i])
         matrix = (matrix + matrix.T) / 2
         scale = 1.0 / np.sqrt(np.diag(matrix))
-        values, vectors = eigh(scale[:, None] * matrix * scale)
+        # SciPy's would hold the interpreter's lock for a second, and with it frames beside this.
+        values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
         kept = values > _INDEPENDENT * (values[-1] if len(values) else 0.0)
         vectors = scale[:, None] * vectors[:, kept] / np.sqrt(values[kept])
         return np.ascontiguousarray(vectors @ vectors.T)

@@ -70,6 +70,13 @@ class SurfaceCompliance:
     count: int  # N, nodes of the mesh
     rounding: float  # unbalanced force in a field by rounding or compression, over the force
 
+    def __post_init__(self) -> None:
+        # Read-only as from the cache, for which numba compiles kernels of their own; and those that
+        # a frame calls, which depend on the fields' kind and precision, are compiled now.
+        self.matrix.flags.writeable = False
+        self.add_field(np.zeros((len(self.nodes), 3)), np.zeros((3, self.count), np.float32))
+        self.field(np.zeros((len(self.nodes), 3)))
+
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add what forces (S, 3) N do to displacement (3, N) m; those without are not read."""
         self.fields.add(forces.ravel(), displacement.T)

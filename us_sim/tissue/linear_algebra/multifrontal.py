@@ -231,7 +231,7 @@ class _Elimination:
                 self._stored(factor.solve(np.eye(len(own)))) if loaded else None,
             )
         )
-        if self._report is not None:
+        if self._report is not None and self._total:  # there is nothing to do where all is fixed
             self._done += len(own) * float(len(own) + len(around)) ** 2
             self._report(self._done / self._total)
         return around, schur

@@ -84,6 +84,7 @@ class Fem(TissueSolver):
     """
 
     name: ClassVar[str] = "fem"
+    must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemSettings
@@ -112,8 +113,7 @@ class Fem(TissueSolver):
         imprecise = dense and self._compliance.rounding > _ROUNDING
         self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._watched = watched_tetrahedra(model)
-        # Compiles, too, what a frame calls.
-        self._displacement = self._compliance.field(np.zeros((len(self._reached), 3)))
+        self._displacement = np.zeros_like(model.mesh.nodes)
         super().__init__(model, settings, progress)
 
     @property

@@ -79,6 +79,7 @@ class FemCg(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_cg"
+    must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemCgSettings

@@ -142,6 +142,7 @@ class FemNonlinear(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_nonlinear"
+    must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemNonlinearSettings

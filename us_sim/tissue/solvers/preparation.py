@@ -65,7 +65,8 @@ class Preparation:
 
     def _show(self, fraction: float, text: str) -> None:
         with self._lock:
-            self._progress = f", {100 * fraction:.0f} % of {text}"
+            share = f"{100 * fraction:.0f} % of " if fraction > 0.0 else ""
+            self._progress = f", {share}{text}"
 
     def _work(self) -> None:
         while True:
@@ -76,7 +77,7 @@ class Preparation:
                     return
             outcome: Prepared | Failed
             try:
-                outcome = self._tissue.make(plan, self._show)
+                outcome = self._tissue.make(plan, self._show, beside=True)
             except UsSimError as error:
                 outcome = Failed(plan, str(error))
             except Exception as error:  # so that the thread does not end silently

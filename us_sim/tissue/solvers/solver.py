@@ -27,9 +27,8 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
 from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.rehearsal import rehearsal_model
 
 __all__ = ["COUNT", "TOLERANCE", "SolverSettings", "TissueSolver", "create_solver", "same_pose"]
 
@@ -66,6 +65,8 @@ class TissueSolver(ABC):
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
     """The class of this method's settings. A solver is made with the model, its settings, and a
     callback that is told the fraction done and what is being made, or None."""
+    must_be_held: ClassVar[bool] = False
+    """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
 
@@ -156,31 +157,21 @@ class TissueSolver(ABC):
     def warm_up(self) -> None:
         """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
 
-        It is like this one in what decides which kernels are used: a box mesh or another, the
-        highest Poisson's ratio, and how far moduli are apart.
+        See `us_sim.tissue.solvers.rehearsal`, and `us_sim.tissue.solvers.compilation` for doing it
+        in another process.
         """
-        side = np.linspace(-0.01, 0.01, 3)
-        mesh = box_mesh(side, side, side + 0.01)
-        if self.model.mesh.planes is None:
-            mesh = TetrahedralMesh(mesh.nodes, mesh.tetrahedra)
-        own, count = self.model.materials, len(mesh.tetrahedra)
-        hollow = np.arange(count) == 0
-        model = TissueModel(
-            mesh,
-            TissueMaterials(
-                np.linspace(own.young_modulus.min(), own.young_modulus.max(), count),
-                np.full(count, own.poisson_ratio.max()),
-                np.full(count, own.density.max()),
-                hollow * own.lumen_fraction.max(),
-                hollow * own.lumen_pressure.max(),
-            ),
-            mesh.nodes[:, 2] > 0.015,
-            self.model.collider,
-            np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
-        )
-        solver = type(self)(model)
+        self.rehearse(rehearsal_model(self.model), self.settings)
+
+    @classmethod
+    def rehearse(cls, model: TissueModel, settings: SolverSettings) -> None:
+        """Make a solver for `warm_up`, and call every kernel that its frames may need."""
+        try:
+            solver = cls(model, settings)
+        except SolverError:  # what suits the tissue need not suit one so small
+            solver = cls(model)
         for depth in (0.002, 0.004):
             solver.deform(Pose(position=np.array([depth, 0.0, depth])))
+            solver.contact_stiffness()
         solver._rehearse()
         solver.deform(None)
 

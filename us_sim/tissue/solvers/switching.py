@@ -23,9 +23,12 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, create_solver
+from us_sim.tissue.solvers.compilation import compiled_solver
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 __all__ = ["Difference", "Plan", "Prepared", "SwitchableTissue", "difference"]
 
@@ -126,14 +129,20 @@ class SwitchableTissue:
         """`TissueSolver.contact_stiffness` of the solver in use."""
         return self._solver.contact_stiffness()
 
-    def make(self, plan: Plan, progress: Callable[[float, str], None] | None = None) -> Prepared:
+    def make(
+        self,
+        plan: Plan,
+        progress: Callable[[float, str], None] | None = None,
+        *,
+        beside: bool = False,
+    ) -> Prepared:
         """Make and compile the solvers of a plan that are not there yet; nothing else changes.
-
-        It may be called in a thread of its own while another deforms the tissue.
 
         Args:
             plan: what is wanted.
-            progress: as for `create_solver`.
+            progress: as for `create_solver`, and told what is being compiled.
+            beside: it is called in a thread of its own while another deforms the tissue, which is
+                not to be held up.
 
         Raises:
             SolverError: no such solver, one compared with itself, or a model it cannot solve.
@@ -146,10 +155,22 @@ class SwitchableTissue:
             made = self._solvers.get(name)
             settings = plan.settings.get(name)
             if made is None or made.model is not model or settings not in (None, made.settings):
-                made = create_solver(name, model, settings, progress)
-                made.warm_up()
+                made = self._made(name, model, settings, progress, beside)
             solvers[name] = made
         return Prepared(plan, model, solvers)
+
+    def _made(
+        self,
+        name: str,
+        model: TissueModel,
+        settings: SolverSettings | None,
+        progress: Callable[[float, str], None] | None,
+        beside: bool,
+    ) -> TissueSolver:
+        cls: type[TissueSolver] = SOLVERS.load(name)
+        if cls.must_be_held:  # before a minute of compiling
+            require_held(model.mesh, model.fixed)
+        return compiled_solver(cls, model, settings or cls.Settings(), progress, elsewhere=beside)
 
     def adopt(self, prepared: Prepared) -> None:
         """Go on with the solvers made, from where the tissue is."""
@@ -180,13 +201,17 @@ class SwitchableTissue:
         compared = "" if name == self.compared else self.compared
         self.adopt(self.make(replace(self._plan, solver=name, compared=compared)))
 
-    def compare_with(self, name: str) -> None:
+    def compare_with(self, name: str, progress: Callable[[float, str], None] | None = None) -> None:
         """Run a second solver on the same poses from here on; '' ends it.
+
+        Args:
+            name: of the solver.
+            progress: as for `make`.
 
         Raises:
             SolverError: it is the one in use.
         """
-        self.adopt(self.make(replace(self._plan, compared=name)))
+        self.adopt(self.make(replace(self._plan, compared=name), progress))
 
     def deform(self, pose: Pose | None) -> Deformation:
         """One frame of the solver in use, and of the one beside it."""
