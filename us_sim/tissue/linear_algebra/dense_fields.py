@@ -32,6 +32,13 @@ class DenseFields:
     nodes: NDArray[np.integer]  # (F,)
     fields: NDArray[np.floating]  # (3S, 3, F), m/N
 
+    def __post_init__(self) -> None:
+        # Always read-only, as from the cache: numba would compile the kernel again for others.
+        for name in ("nodes", "fields"):
+            array = getattr(self, name).view()
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
     @classmethod
     def made(
         cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
