@@ -83,6 +83,7 @@ setup(
             "pyigtl>=0.3.1",
             "pytest>=7.4",
             "pytest-timeout>=2.2",
+            "pytest-xdist>=3.6",
             "ruff>=0.12",
             "scikit-fem>=10",
             "types-PyYAML",

@@ -1,13 +1,87 @@
-"""Fixtures shared by all tests."""
+"""How the whole suite runs, and fixtures shared by all tests."""
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+_WORKER = "PYTEST_XDIST_WORKER"
+
+_TISSUE = ("tissue", "evaluation/hand", "evaluation/stability", "evaluation/tissue")
+"""Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
+the other one what is beside them."""
+
+_BESIDE = ("slicing", "evaluation", "demo", "tracking", "volume", "skin", "geometry")
+
+_TWO_PROCESSES = pytest.StashKey[bool]()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Run everything in two processes, where nothing else was asked for."""
+    option = config.option
+    everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    chosen = option.keyword or option.markexpr or option.collectonly or option.usepdb
+    chosen = chosen or option.capture == "no"
+    if (
+        everything
+        and not chosen
+        and _WORKER not in os.environ
+        and config.pluginmanager.hasplugin("xdist")
+        and option.numprocesses is None
+        and (os.cpu_count() or 1) > 1
+    ):
+        config.stash[_TWO_PROCESSES] = True
+        option.numprocesses = 2
+        option.dist = "loadscope"
+        option.loadscopereorder = False
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Who gives groups of tests to the processes."""
+    if _TWO_PROCESSES not in config.stash:
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _group(nodeid)
+
+    return Groups(config, log)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those that compile most come first; of them a process gets a whole group."""
+    if _WORKER in os.environ:
+        items.sort(key=lambda item: _turn(item.nodeid))
+
+
+def _group(nodeid: str) -> str:
+    """What one process runs in a row: a file, or files that share kernels or a machine's time."""
+    file = _file(nodeid)
+    if file.startswith(_TISSUE):
+        return "tissue"
+    return "graph" if file.startswith("graph/") else file
+
+
+def _turn(nodeid: str) -> int:
+    file = _file(nodeid)
+    if file.startswith(_TISSUE):
+        return 0
+    if file.startswith(_BESIDE):
+        return 1
+    return 2 if file.startswith("graph/") else 3
+
+
+def _file(nodeid: str) -> str:
+    return nodeid.partition("::")[0].removeprefix("tests/")
 
 
 @pytest.fixture(scope="session")

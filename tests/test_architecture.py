@@ -1,6 +1,7 @@
 """The layers hold, and docs/architecture.md says what the code says."""
 
 import ast
+import functools
 import importlib.util
 import re
 from pathlib import Path
@@ -23,7 +24,9 @@ def drawing():
 
 @pytest.fixture(scope="module")
 def picture():
-    return drawing()
+    module = drawing()
+    module.arrows = functools.cache(module.arrows)  # reads every file
+    return module
 
 
 def test_every_room_has_its_place(picture):

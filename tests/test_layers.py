@@ -42,7 +42,8 @@ MESSAGES = [
 ]
 
 
-def imported(name: str, *, lazily: bool = True) -> Iterator[str]:
+@functools.cache
+def imported(name: str, *, lazily: bool = True) -> tuple[str, ...]:
     """What a module imports at run time: in functions too, or only while it is imported itself."""
 
     def within(nodes: list[ast.stmt]) -> Iterator[str]:
@@ -63,7 +64,7 @@ def imported(name: str, *, lazily: bool = True) -> Iterator[str]:
                 for block in ("body", "orelse", "handlers", "finalbody"):
                     yield from within(getattr(node, block, []))
 
-    return within(tree(name).body)
+    return tuple(within(tree(name).body))
 
 
 @functools.cache

@@ -25,6 +25,7 @@ VERBS = (
     *("demo", "run", "render", "play", "bag", "info"),
     *("evaluate", "tissue", "stability", "hand", "slice", "tracking"),
     *("calibrate", "camera", "pivot", "landmarks", "probe", "time", "print-marker", "reference"),
+    "compile",
 )
 
 COMMANDS = sorted(

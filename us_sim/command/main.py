@@ -10,6 +10,7 @@ from us_sim import __version__
 from us_sim.command.bag import add_bag
 from us_sim.command.calibrate import add_calibrate
 from us_sim.command.chosen_parser import ChosenParser
+from us_sim.command.compile import add_compile
 from us_sim.command.demo import add_demo
 from us_sim.command.evaluate import add_evaluate
 from us_sim.command.play import add_play
@@ -33,7 +34,7 @@ def main(args: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (add_demo, add_run, add_render, add_play, add_bag):
         add(commands)
-    for add in (add_calibrate, add_print_marker, add_evaluate, add_reference):
+    for add in (add_calibrate, add_print_marker, add_evaluate, add_reference, add_compile):
         add(commands)
     before = {number: signal.signal(number, _interrupt) for number in _ENDINGS}
     try:

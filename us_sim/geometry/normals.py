@@ -31,9 +31,11 @@ def vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_R
         triangles: (T, 3) indices into vertices.
     """
     normals = np.zeros(vertices.shape, dtype=vertices.dtype)
-    _sum_normals(
-        np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, dtype=np.int32), normals
-    )
+    whole = np.ascontiguousarray(vertices).view()
+    corners = np.ascontiguousarray(triangles, dtype=np.int32).view()
+    # Read-only always, since numba would compile the kernel again for what is not.
+    whole.flags.writeable = corners.flags.writeable = False
+    _sum_normals(whole, corners, normals)
     return normals
 
 

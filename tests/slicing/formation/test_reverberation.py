@@ -1,5 +1,7 @@
 """Lines without contact: decibels lost, bands a lens apart, nothing of the tissue."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,16 @@ from us_sim.slicing.probe.probe import LinearProbe
 
 PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=200, rows=400, lines=100)
 TISSUE = np.random.Generator(np.random.PCG64(1)).integers(0, 256, (400, 200), dtype=np.uint8)
-QUIET = Reverberation(PROBE, Imaging(contact=True, reverberation=-60.0))
-AIR = Reverberation(PROBE, Imaging(contact=True))
+
+
+@functools.cache
+def quiet():
+    return Reverberation(PROBE, Imaging(contact=True, reverberation=-60.0))
+
+
+@functools.cache
+def air():
+    return Reverberation(PROBE, Imaging(contact=True))
 
 
 def coupling(value):
@@ -19,24 +29,24 @@ def coupling(value):
 
 
 def test_full_contact_leaves_the_image_as_it_is():
-    assert AIR.shown(TISSUE, coupling(1.0)) is TISSUE
+    assert air().shown(TISSUE, coupling(1.0)) is TISSUE
 
 
 @pytest.mark.parametrize(("share", "decibels"), [(0.5, 6.02), (0.1, 20.0)])
 def test_a_badly_coupled_line_is_dimmer_by_decibels_at_every_depth(share, decibels):
     expected = np.maximum(TISSUE.astype(int) - round(4.25 * decibels), 0)
-    np.testing.assert_array_equal(QUIET.shown(TISSUE, coupling(share)), expected)
+    np.testing.assert_array_equal(quiet().shown(TISSUE, coupling(share)), expected)
 
 
 def test_air_shows_no_tissue():
-    shown = AIR.shown(TISSUE, coupling(0.0))
-    np.testing.assert_array_equal(shown, AIR.shown(np.zeros_like(TISSUE), coupling(0.0)))
-    np.testing.assert_array_equal(shown, AIR.shown(TISSUE, coupling(0.0)))  # every frame
+    shown = air().shown(TISSUE, coupling(0.0))
+    np.testing.assert_array_equal(shown, air().shown(np.zeros_like(TISSUE), coupling(0.0)))
+    np.testing.assert_array_equal(shown, air().shown(TISSUE, coupling(0.0)))  # every frame
     assert (shown[-100:] == 0).all()
 
 
 def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
-    mean = AIR.shown(TISSUE, coupling(0.0)).mean(axis=1)
+    mean = air().shown(TISSUE, coupling(0.0)).mean(axis=1)
     spacing = 0.04 / 400
     depths = (np.arange(400) + 0.5) * spacing
     bands = [i for i in range(1, 120) if mean[i - 1] < mean[i] >= mean[i + 1]]
@@ -50,7 +60,9 @@ def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
 
 def test_the_first_band_is_as_strong_as_was_set():
     weaker = Reverberation(PROBE, Imaging(contact=True, reverberation=-30.0))
-    difference = AIR.shown(TISSUE, coupling(0.0)).astype(int) - weaker.shown(TISSUE, coupling(0.0))
+    difference = air().shown(TISSUE, coupling(0.0)).astype(int) - weaker.shown(
+        TISSUE, coupling(0.0)
+    )
     np.testing.assert_allclose(difference[:20], 85, atol=1)
 
 
@@ -58,7 +70,7 @@ def test_the_first_band_is_as_strong_as_was_set():
 def test_a_shadow_is_as_soft_as_the_aperture_is_wide(row, aperture):
     half = (np.arange(100) < 50).astype(np.float32)  # the face's middle is the edge
     strong = np.full_like(TISSUE, 200)
-    shown = QUIET.shown(strong, half)[row].astype(int)
+    shown = quiet().shown(strong, half)[row].astype(int)
     x = (np.arange(200) - 99.5) * 0.2e-3  # m from the edge
     margin = 0.5 * aperture + 0.6e-3  # a step of depth, and a line
     assert (shown[x < -margin] == 200).all()

@@ -1,5 +1,7 @@
 """Conjugate gradients with springs, and what preconditions them, against dense solves."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,8 +16,6 @@ MODEL = block((7, 5, 5))
 COUNT = len(MODEL.mesh.nodes)
 FIXED = np.flatnonzero(MODEL.fixed)
 FREE = np.flatnonzero(~MODEL.fixed)
-TISSUE = NeoHookean(MODEL.mesh, MODEL.materials, np.float64)
-BLOCKS = TISSUE.diagonal_blocks()
 GRIDS = pytest.mark.parametrize("coarse", [False, True])
 
 springs_at = st.lists(
@@ -30,8 +30,13 @@ springs_at = st.lists(
 )
 
 
+@functools.cache
+def tissue():
+    return NeoHookean(MODEL.mesh, MODEL.materials, np.float64)
+
+
 def grid(dtype=np.float64):
-    return CoarseGrid(MODEL.mesh, MODEL.fixed, TISSUE.tangent_product, dtype)
+    return CoarseGrid(MODEL.mesh, MODEL.fixed, tissue().tangent_product, dtype)
 
 
 def two_level(coarse, springs, dtype=np.float64, made=None):
@@ -41,7 +46,7 @@ def two_level(coarse, springs, dtype=np.float64, made=None):
     normals = np.array([[s[1], s[2], 1.0] for s in springs]).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     stiffness = np.array([s[3] for s in springs], dtype=float)
-    made.prepare(BLOCKS.astype(dtype), nodes, normals, stiffness)
+    made.prepare(tissue().diagonal_blocks().astype(dtype), nodes, normals, stiffness)
     return made, nodes, normals, stiffness
 
 
@@ -54,12 +59,16 @@ def dense(function, count=COUNT):
     return np.array(columns).T
 
 
-STIFFNESS = dense(TISSUE.tangent_product)
+@functools.cache
+def stiffness_matrix():
+    return dense(tissue().tangent_product)
+
+
 MOVABLE = np.repeat(~MODEL.fixed[None], 3, axis=0).ravel()
 
 
 def with_springs(nodes, normals, stiffness):
-    whole = STIFFNESS.copy()
+    whole = stiffness_matrix().copy()
     for node, normal, k in zip(nodes, normals, stiffness, strict=True):
         rows = node + COUNT * np.arange(3)
         whole[np.ix_(rows, rows)] += k * np.outer(normal, normal)
@@ -74,13 +83,13 @@ def test_the_solution_is_that_of_a_dense_solve(coarse):
     made, *springs = two_level(coarse, SPRINGS)
     force = np.random.default_rng(0).normal(size=(3, COUNT))
     force[:, FIXED] = 0.0
-    solved = conjugate_gradients(TISSUE.tangent_product, made, force.copy(), 500, 1e-12)
+    solved = conjugate_gradients(tissue().tangent_product, made, force.copy(), 500, 1e-12)
     whole = with_springs(*springs)[np.ix_(MOVABLE, MOVABLE)]
     expected = np.zeros(3 * COUNT)
     expected[MOVABLE] = np.linalg.solve(whole, force.ravel()[MOVABLE])
     assert not solved.curved
     np.testing.assert_allclose(solved.solution.ravel(), expected, atol=1e-9 * abs(expected).max())
-    image = TISSUE.tangent_product(solved.solution)
+    image = tissue().tangent_product(solved.solution)
     np.testing.assert_allclose(solved.image, image, atol=1e-9 * abs(image).max())
 
 
@@ -100,7 +109,7 @@ def test_the_coarse_level_saves_iterations_with_and_without_springs():
     firm = [(i, 0.0, 0.0, 1e4) for i in range(12)]
     counts = [
         conjugate_gradients(
-            TISSUE.tangent_product, two_level(coarse, springs)[0], force.copy(), 500, 1e-6
+            tissue().tangent_product, two_level(coarse, springs)[0], force.copy(), 500, 1e-6
         ).iterations
         for coarse in (False, True)
         for springs in ([], firm)
@@ -114,21 +123,21 @@ def test_it_ends_at_the_tolerance_or_with_the_iterations():
     force = np.zeros((3, COUNT))
     force[:, FREE] = 1.0
     few, left = force.copy(), force.copy()
-    assert conjugate_gradients(TISSUE.tangent_product, made, few, 3, 1e-12).iterations == 3
-    solved = conjugate_gradients(TISSUE.tangent_product, made, left, 500, 1e-3)
+    assert conjugate_gradients(tissue().tangent_product, made, few, 3, 1e-12).iterations == 3
+    solved = conjugate_gradients(tissue().tangent_product, made, left, 500, 1e-3)
     assert np.linalg.norm(left) <= 1e-3 < np.linalg.norm(few)
     assert 3 < solved.iterations < 500
-    assert conjugate_gradients(TISSUE.tangent_product, made, force, 0, 1e-3).iterations == 0
+    assert conjugate_gradients(tissue().tangent_product, made, force, 0, 1e-3).iterations == 0
 
 
 def test_negative_curvature_ends_it_with_what_came_before():
     made, *_ = two_level(False, [])
     force = np.random.default_rng(1).normal(size=(3, COUNT))
     force[:, FIXED] = 0.0
-    shift = 2e-2 * np.linalg.eigvalsh(STIFFNESS)[-1]
+    shift = 2e-2 * np.linalg.eigvalsh(stiffness_matrix())[-1]
 
     def indefinite(field, image):
-        TISSUE.tangent_product(field, image)
+        tissue().tangent_product(field, image)
         image -= shift * field
 
     solved = conjugate_gradients(indefinite, made, force.copy(), 500, 1e-12)
@@ -145,7 +154,7 @@ def test_negative_curvature_ends_it_with_what_came_before():
 @settings(max_examples=25, deadline=None)
 @given(springs_at, st.booleans(), st.integers(0, 2**32 - 1))
 def test_the_preconditioner_is_symmetric_and_positive(springs, coarse, seed):
-    made, *_ = two_level(coarse, springs, made=MADE[coarse])
+    made, *_ = two_level(coarse, springs, made=kept(coarse))
     a, b = np.random.default_rng(seed).normal(size=(2, 3, COUNT))
     a[:, FIXED] = b[:, FIXED] = 0.0
     to_a, to_b = np.empty_like(a), np.empty_like(b)
@@ -157,7 +166,9 @@ def test_the_preconditioner_is_symmetric_and_positive(springs, coarse, seed):
     assert not to_a[:, FIXED].any()
 
 
-MADE = {coarse: TwoLevel(grid() if coarse else None, FIXED, 1.0) for coarse in (False, True)}
+@functools.cache
+def kept(coarse):
+    return TwoLevel(grid() if coarse else None, FIXED, 1.0)
 
 
 def test_without_a_grid_it_is_the_inverse_of_each_nodes_block_with_its_spring():
@@ -174,9 +185,9 @@ def test_without_a_grid_it_is_the_inverse_of_each_nodes_block_with_its_spring():
 
 def test_blocks_times_a_field():
     field = np.random.default_rng(3).normal(size=(3, COUNT))
-    own = STIFFNESS.reshape(3, COUNT, 3, COUNT)
+    own = stiffness_matrix().reshape(3, COUNT, 3, COUNT)
     expected = np.einsum("inj,jn->in", np.einsum("injn->inj", own), field)
-    product = apply_blocks(BLOCKS, field)
+    product = apply_blocks(tissue().diagonal_blocks(), field)
     np.testing.assert_allclose(product, expected, atol=1e-10 * abs(expected).max())
 
 

@@ -339,3 +339,17 @@ def test_a_port_in_use_says_so():
     with pytest.raises(TrackingError, match=f"port {server.port}"):
         OpenIGTLinkServer("127.0.0.1", server.port)
     server.close()
+
+
+def test_closing_waits_for_a_thread_that_has_ended_already(monkeypatch):
+    server = OpenIGTLinkServer("127.0.0.1", 0)
+    ring, thread = server._ring, server._thread
+
+    def late():
+        ring()
+        thread.join()
+        ring()
+
+    monkeypatch.setattr(server, "_ring", late)
+    server.close()
+    assert not thread.is_alive()

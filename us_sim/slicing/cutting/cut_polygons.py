@@ -88,8 +88,8 @@ def cut_tetrahedra(
     place = np.empty((4, 3))
     polygon = np.empty((4, 2))
     order = np.empty(4, dtype=np.uint64)
-    count = 0
-    pieces = 0
+    count = np.int64(0)  # a literal would have the callees compiled for it, too
+    pieces = np.int64(0)
     skipped = 0
     corner_on_image = False
     for e in near:

@@ -79,7 +79,9 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
         elements: (rows, columns) int32, set to the tetrahedron of each pixel, E outside all.
         outside: (rows,) bool, set where a pixel of the row is outside.
     """
-    none = len(barycentric)
+    # What is one kind of number everywhere has `_locate` compiled once.
+    none = np.int32(len(barycentric))
+    left = np.int64(0)
     columns = elements.shape[1]
     across = (columns + cell - 1) // cell
     stack = np.empty((64, 2), dtype=np.int64)
@@ -93,7 +95,7 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
         any_outside = False
         last = columns - 1
         line[0] = _locate(
-            barycentric, starts, members, lists, cell, 0, row, above[0] if hinted else none, none
+            barycentric, starts, members, lists, cell, left, row, above[0] if hinted else none, none
         )
         hint = above[last] if hinted else none
         line[last] = _locate(barycentric, starts, members, lists, cell, last, row, hint, line[0])

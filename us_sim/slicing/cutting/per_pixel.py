@@ -168,9 +168,11 @@ def _locate(corners, places, first, last, rest, first_row, end_row):
                 pixel[1] = row
                 # A barycentric coordinate is the fraction of the volume with the pixel as a corner.
                 for k in range(4):
-                    corner[k] = pixel
+                    for a in range(3):
+                        corner[k, a] = pixel[a]
                     weights[k] = _six_volumes(corner) / size
-                    corner[k] = corners[e, k]
+                    for a in range(3):
+                        corner[k, a] = corners[e, k, a]
                 if weights.min() >= INSIDE:
                     for a in range(3):
                         rest[row, column, a] = (weights * places[e, :, a]).sum()

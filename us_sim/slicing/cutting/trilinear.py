@@ -45,8 +45,8 @@ def sample_linear(voxels, shape, maps, elements, first_row, last_row, image):
     for row in range(first_row, last_row):
         line = image[row]
         # Pixels from here up to the current run are placed in the volume, but not yet loaded.
-        waiting = 0
-        first = 0
+        waiting = np.int64(0)  # a literal would have the callees compiled for it, too
+        first = np.int64(0)
         while first < columns:
             element = elements[row, first]
             last = first

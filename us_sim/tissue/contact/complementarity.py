@@ -101,7 +101,7 @@ def pivot(delassus, gap, push, active):
     tolerance = _ROUNDING * np.abs(gap).max()
     fewest, patience, single = k + 1, _PATIENCE, 0
     while single <= _SINGLE_PIVOTS * k:
-        count = 0
+        count = np.int64(0)  # a literal would have the callees compiled for it, too
         for i in range(k):
             if active[i]:
                 index[count] = i
@@ -144,7 +144,8 @@ def pivot(delassus, gap, push, active):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _open(delassus, gap, index, count, push, opened):
     """Fills opened (k,) with delassus push + gap, pushes being at ``index`` only."""
-    opened[:] = gap
+    for i in range(len(gap)):
+        opened[i] = gap[i]
     for m in range(count):
         value = push[index[m]]
         row = delassus[index[m]]

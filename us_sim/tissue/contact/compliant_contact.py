@@ -221,7 +221,8 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
     converged, sliding = False, 0.0
     for iteration in range(_ROUNDS):
         gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
-        was[:] = active
+        for m in range(k):
+            was[m] = active[m]
         _push(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
         same = iteration > 0
         for m in range(k):
@@ -240,16 +241,20 @@ def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, dis
             break
         if same:
             slot = remembered % _MEMORY
-            points[slot] = point - last_point
-            steps[slot] = step - last_step
+            for m in range(k):
+                for axis in range(3):
+                    points[slot, m, axis] = point[m, axis] - last_point[m, axis]
+                    steps[slot, m, axis] = step[m, axis] - last_step[m, axis]
             remembered += 1
         else:
             remembered = 0
         if iteration >= _MIXED:
             point += _SHORT * step
             continue
-        last_point[:] = point
-        last_step[:] = step
+        for m in range(k):
+            for axis in range(3):
+                last_point[m, axis] = point[m, axis]
+                last_step[m, axis] = step[m, axis]
         _mix(active, step, points, steps, min(remembered, _MEMORY), point)
     return converged, sliding
 
@@ -295,7 +300,8 @@ def yielded(block, active, forces, displacement):
     """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
     load = np.zeros(len(block))
     for m in np.flatnonzero(active):
-        load[3 * m : 3 * m + 3] = forces[m]
+        for axis in range(3):
+            load[3 * m + axis] = forces[m, axis]
     for i in range(len(block)):
         row = block[i]
         value = 0.0

@@ -142,7 +142,10 @@ def _coulomb(
     k = len(near)
     inverse = np.empty((k, 3, 3))
     for m in range(k):
-        inverse[m] = np.linalg.inv(block[3 * m : 3 * m + 3, 3 * m : 3 * m + 3].copy())
+        own = np.linalg.inv(block[3 * m : 3 * m + 3, 3 * m : 3 * m + 3].copy())
+        for axis in range(3):
+            for other in range(3):
+                inverse[m, axis, other] = own[axis, other]
     gap, normal, last = np.empty(k), np.empty((k, 3)), np.zeros((k, 3))
     skirt, slips = np.zeros(k), np.zeros(k, np.bool_)
     offset, goal = np.empty(k), np.empty((k, 3))
@@ -166,8 +169,9 @@ def _coulomb(
         converged = fits and turn <= _TURN and unsettled == 0.0
         if converged:
             break
-        last[:] = normal
         for m in range(k):
+            for axis in range(3):
+                last[m, axis] = normal[m, axis]
             if not anchored[m] and gap[m] < 0.0:
                 anchored[m] = True
                 for axis in range(3):
@@ -218,7 +222,8 @@ def _sweep(block, inverse, offset, normal, goal, anchored, friction, forces, sli
                 push, beside = _parts(force, normal[m], along)
                 if push <= 0.0 or beside > friction * push:
                     slips[m] = True
-                    force[:] = forces[m]
+                    for axis in range(3):
+                        force[axis] = forces[m, axis]
                     _project(own, alone, offset[m], normal[m], goal[m], friction, along, force)
             for axis in range(3):
                 step = force[axis] - forces[m, axis]

@@ -25,6 +25,7 @@ True
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from us_sim.tissue.elasticity.lanes import LANES, put_six, three
@@ -47,10 +48,10 @@ __all__ = [
     "put_volumes",
 ]
 
-PER_WIDTH = 0
+PER_WIDTH = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
 """Row of the constants: one over the width along x (negative where mirrored), then y and z."""
 
-FIELD = 0
+FIELD = np.int64(0)
 """First row of a buffer's field, row 3 corner + axis of it."""
 
 SUMS = FIELD + 24

@@ -14,6 +14,7 @@ array([3.5, 2.5, 1.5, 0.5])
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from us_sim.tissue.elasticity.lanes import LANES, nine, three
@@ -33,10 +34,10 @@ __all__ = [
     "scatter_scalar",
 ]
 
-SHAPE = 0
+SHAPE = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
 """First row of the constants' gradients of the shape functions of nodes 1, 2 and 3."""
 
-FIELD = 0
+FIELD = np.int64(0)
 """First row of a buffer's field, row 3 b + axis of it at the b-th node."""
 
 SUMS = FIELD + 12

@@ -34,8 +34,10 @@ class DenseFields:
 
     def __post_init__(self) -> None:
         # Always read-only, as from the cache: numba would compile the kernel again for others.
-        for array in vars(self).values():
+        for name in ("nodes", "fields"):
+            array = getattr(self, name).view()
             array.flags.writeable = False
+            object.__setattr__(self, name, array)
 
     @classmethod
     def made(

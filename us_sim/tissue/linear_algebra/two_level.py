@@ -92,7 +92,8 @@ class TwoLevel:
             stiffness: (K,) N/m.
         """
         dtype = blocks.dtype
-        self.nodes = nodes
+        # Of one size always, lest numba compile kernels twice.
+        self.nodes: NDArray[np.integer] = np.asarray(nodes, dtype=np.int64)
         self.normals = normals.astype(dtype)
         self.springs = stiffness.astype(dtype)
         own = np.empty(len(nodes))
@@ -137,7 +138,7 @@ def conjugate_gradients(
     shape, dtype = residual.shape, residual.dtype
     solution, image, search = np.zeros((3, *shape), dtype)
     elastic, conditioned, whole = np.empty((3, *shape), dtype)
-    fixed, nodes = preconditioner.fixed, preconditioner.nodes
+    fixed, nodes = preconditioner.fixed, np.asarray(preconditioner.nodes, dtype=np.int64)
     slope = 0.0
     for iteration in range(iterations):
         preconditioner.apply(residual, conditioned)
@@ -175,7 +176,8 @@ def _invert_blocks(blocks, scale, fixed, nodes, normals, springs, own, inverse):
         y = normals[k, 1]
         z = normals[k, 2]
         if k == 0 or nodes[k - 1] != i:
-            one[:] = blocks[:, i]
+            for entry in range(6):
+                one[entry] = blocks[entry, i]
         own[k] = (
             blocks[0, i] * x * x
             + blocks[3, i] * y * y
@@ -223,7 +225,9 @@ def _apply_blocks(blocks, field, out):
 @njit(**_LOOP)
 def _add_springs(elastic, field, nodes, normals, springs, fixed, out):
     """out = elastic + springs times field, zero at fixed nodes."""
-    out[:, :] = elastic
+    for d in range(3):
+        for i in range(elastic.shape[1]):
+            out[d, i] = elastic[d, i]
     for k in range(len(nodes)):
         i = nodes[k]
         s = field[0, i] * normals[k, 0] + field[1, i] * normals[k, 1] + field[2, i] * normals[k, 2]

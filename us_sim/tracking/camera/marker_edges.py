@@ -93,7 +93,8 @@ def _mended(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _refine(image, corners, cells, refined):
     """Fit four edges and intersect neighbours, from wide to narrow; returns success."""
-    refined[:] = corners
+    for k in range(4):
+        refined[k, 0], refined[k, 1] = corners[k, 0], corners[k, 1]
     edges = np.empty((4, 3))
     widths = np.full(4, 1.0)
     for _ in range(_ROUNDS):
@@ -245,7 +246,8 @@ def _fit_profile(place, length, reach, edge, widths, k):
             slopes[i, 6] = place[i, 2] - black - contrast * step
         squares = slopes.T @ slopes
         normal = squares[:6, :6]
-        right[:] = squares[6, :6]
+        for a in range(6):
+            right[a] = squares[6, a]
         normal[2, 2] += bow_weight
         right[2] -= bow_weight * edge[2]
         normal[5, 5] += width_weight

@@ -85,6 +85,8 @@ class OpenIGTLinkServer:
         self._closing = True
         self._ring()
         self._thread.join()
+        for end in (self._ear, self._bell):  # not by the thread, which may be done before the ring
+            end.close()
 
     def _ring(self) -> None:
         with contextlib.suppress(BlockingIOError):  # it has been rung often enough already
@@ -105,8 +107,7 @@ class OpenIGTLinkServer:
         for client in list(self._clients.values()):
             self._drop(client)
         self._selector.close()
-        for connection in (self._listener, self._ear, self._bell):
-            connection.close()
+        self._listener.close()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # gone again already

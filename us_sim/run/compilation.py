@@ -1,0 +1,121 @@
+"""Compiling all kernels ahead, so that no run waits for it.
+
+Numba compiles a kernel where it is first called, and keeps it in a cache that all processes of the
+user share (`NUMBA_CACHE_DIR` names another folder). So every part is made small, and used once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from us_sim.geometry.pose import Pose
+from us_sim.progress import Progress
+from us_sim.settings.registry import SLICERS, SOLVERS
+
+if TYPE_CHECKING:
+    from us_sim.tissue.model import TissueModel
+
+__all__ = ["compile_kernels", "parts"]
+
+Part = tuple[str, Callable[[], object]]
+"""What a person reads, and what compiles it."""
+
+
+def compile_kernels() -> int:
+    """Compile every kernel of a simulation, or find it in the cache; with a bar."""
+    work = list(parts())
+    with Progress("compiling", len(work), "parts") as bar:
+        for done, (name, compiled) in enumerate(work):
+            bar.update(done, name)
+            compiled()
+        bar.update(len(work))
+    return 0
+
+
+def parts() -> Iterator[Part]:
+    """What a simulation may be made of, what takes longest first."""
+    for solver in sorted(SOLVERS.importable, key=lambda name: name != "fem_nonlinear"):
+        yield solver, partial(_use_solver, solver, box=True)
+    for solver in SOLVERS.importable:
+        yield f"{solver} on any mesh", partial(_use_solver, solver, box=False)
+    for solver in ("fem", "fem_nonlinear"):
+        yield f"{solver} with friction", partial(_use_friction, solver)
+    yield "materials", _average_materials
+    yield "skin", _use_skin
+    for method in SLICERS:
+        yield method, partial(_make_image, method)
+    yield "camera", _track_marker
+
+
+def _block(*, box: bool) -> TissueModel:
+    from dataclasses import replace
+
+    from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+    from us_sim.tissue.model import TissueModel
+
+    block = TissueModel.block(nodes=(4, 4, 4))
+    mesh = block.mesh if box else TetrahedralMesh(block.mesh.nodes, block.mesh.tetrahedra)
+    return replace(block, mesh=mesh)
+
+
+def _use_solver(name: str, *, box: bool) -> None:
+    from us_sim.tissue.solvers.solver import create_solver
+
+    create_solver(name, _block(box=box)).warm_up()
+
+
+def _use_friction(name: str) -> None:
+    from us_sim.tissue.solvers.solver import create_solver
+
+    solver = create_solver(name, _block(box=True), contact="coulomb")
+    for across in (0.0, 0.001, 0.002):
+        solver.deform(Pose(np.array([across, 0.0, 0.005])))
+
+
+def _average_materials() -> None:
+    from us_sim.tissue.elasticity.material import Material
+    from us_sim.tissue.elasticity.materials import average_over_labels
+
+    labels = np.zeros((4, 4, 4), dtype=np.uint8)
+    average_over_labels(_block(box=True).mesh, labels, np.eye(4), {0: Material(10e3, 0.45, 1000.0)})
+
+
+def _use_skin() -> None:
+    from us_sim.geometry.collider import Sphere
+    from us_sim.skin.membrane import SkinMembrane
+    from us_sim.skin.surface import plane_surface
+
+    SkinMembrane(plane_surface((0.04, 0.04), 0.01), Sphere(0.03)).warm_up()
+
+
+def _make_image(method: str) -> None:
+    """With everything on that imaging can do."""
+    from us_sim.slicing.b_mode import BMode
+    from us_sim.slicing.formation.imaging import Imaging
+    from us_sim.slicing.probe.probe import LinearProbe
+    from us_sim.volume.volume import Volume
+
+    voxels = np.zeros((4, 4, 4), dtype=np.uint8)
+    volume = Volume(voxels, np.diag([0.01, 0.01, 0.01, 1.0]), voxels, {0: "nothing"})
+    probe = LinearProbe(aperture=0.02, depth=0.02, columns=16, rows=16)
+    imaging = Imaging(
+        gain=3.0,
+        time_gain=(0.0, 3.0),
+        elevation_planes=3,
+        lateral_resolution=2e-3,
+        axial_resolution=1e-3,
+        contact=True,
+    )
+    BMode(volume, probe, method=method).prepare(probe, Imaging(gain=3.0))
+    BMode(volume, probe, imaging, method=method).prepare(probe, imaging)
+
+
+def _track_marker() -> None:
+    from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.camera.warm_up import practice
+
+    practice(RigidBody.single("4X4_50", 7, 0.04))
