@@ -1,27 +1,32 @@
 """Forces that judge solvers, against hand-made numbers, scikit-fem, and derivatives of energies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import skfem
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from us_sim.evaluation.independent_residual import (
-    IndependentResidual,
+from us_sim.evaluation.independent_forces import (
     averaged_hooke_forces,
     hooke_forces,
     neo_hookean_forces,
-    push_directions,
     spring_forces,
     volume_forces,
 )
+from us_sim.evaluation.independent_residual import IndependentResidual
+from us_sim.evaluation.push_directions import flared_distance, push_directions
 from us_sim.evaluation.stability.cases import StabilityCase, model_of
 from us_sim.evaluation.stability.meshes import mesh_named
-from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
+from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
+from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penetration import push_out
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
 RANDOM = np.random.default_rng(2)
 
@@ -112,19 +117,36 @@ def test_push_directions_follow_the_rule_of_contact(collider):
     assert found[np.isfinite(gap)] == pytest.approx(normal[np.isfinite(gap)], abs=1e-12)
 
 
+@pytest.mark.parametrize("spacing", [0.001, 0.006, 0.012])
 @pytest.mark.parametrize(
-    "box", [RoundedBox(0.03, 0.02, 0.05, 0.002), RoundedBox(0.02, 0.03, 0.05, 1e-5)]
+    "collider",
+    [
+        Sphere(0.03),
+        Sphere(0.001),
+        Capsule(0.012, 0.04),
+        RoundedBox(0.06, 0.05, 0.05, 0.02),
+        RoundedBox(0.04, 0.014, 0.03, 0.004),
+        RoundedBox(0.02, 0.03, 0.05, 1e-5),
+        Convex(0.06, 0.06, 0.02, 0.05, 0.004),
+        Convex(0.06, 0.09, 0.02, 0.05, 0.004),  # 47 degrees steep at its ends
+        Convex(0.015, 0.025, 0.02, 0.05, 0.003),  # 52
+        Convex(0.02, 0.036, 0.02, 0.05, 0.003),  # 62: steeper than flanks lean
+    ],
 )
-def test_push_directions_know_the_flanks_of_a_probe_of_small_rounding(box):
+def test_the_flared_probe_is_what_its_outlines_say(collider, spacing):
     pose = Pose([0.002, -0.001, 0.01], [0.2, -0.1, 0.3, 0.9])
-    points = pose.apply(RANDOM.uniform([-0.02, -0.02, -0.03], [0.02, 0.02, 0.0], (400, 3)))
-    gap, normal = push_out(box, pose, points, 0.01, flanks=True)
-    inside = gap < 0
-    aside = normal @ pose.rotation[:, 2] < 0.9
-    assert (inside & aside).sum() > 10
-    assert (inside & ~aside).sum() > 10
-    found = push_directions(box, pose, points, 0.01, flanks=True)
-    assert found[inside] == pytest.approx(normal[inside], abs=1e-12)
+    points = pose.apply(RANDOM.uniform([-0.04, -0.04, -0.06], [0.04, 0.04, 0.01], (3000, 3)))
+    gap, normal = FlaredProbe(collider, spacing).distance(pose, points)
+    assert (gap < 0).sum() > 1 or collider == Sphere(0.001)
+    found, directions = flared_distance(collider, pose, points, spacing)
+    np.testing.assert_allclose(found, gap, atol=1e-12)
+    np.testing.assert_allclose(directions, normal, atol=1e-9)
+
+
+def test_a_probe_is_not_beyond_the_hand_that_holds_it():
+    box = RoundedBox(0.04, 0.014, 0.03, 0.004)  # its core is 22 mm high, and the hand 0.1 m
+    heights = np.array([[0.0, 0.0, -0.1259], [0.0, 0.0, -0.1261]])
+    assert np.isfinite(flared_distance(box, Pose(), heights, 0.006)[0]).tolist() == [True, False]
 
 
 def test_a_tetrahedron_resists_being_crushed_by_its_stiffest_neighbour():
@@ -162,6 +184,86 @@ def test_the_residual_is_unbalanced_over_contact_force():
     assert check.check(deformation, Pose())[0] == pytest.approx(0.5 / 4)
     force[node, 2] = -4.0  # a pull is not balanced, and refers to the push before
     assert check.check(deformation, Pose())[0] == pytest.approx(np.hypot(4.0, 0.5) / 4)
+
+
+# A probe with an edge that the nodes do not see, one with a rounding that they see, and a ball.
+PRESSING = [
+    (RoundedBox(0.05, 0.03, 0.05, 0.004), Pose([0.003, 0.001, 0.008], [0.05, 0.03, 0.1, 1.0])),
+    (RoundedBox(0.06, 0.06, 0.06, 0.028), Pose([0.003, 0.001, 0.008], [0.05, 0.03, 0.1, 1.0])),
+    (Sphere(0.03), Pose([0.003, 0.001, 0.02])),
+]
+
+
+@pytest.mark.parametrize(("collider", "pose"), PRESSING)
+def test_a_settled_press_is_balanced_by_pushes_on_the_surface(collider, pose):
+    model = TissueModel.block(nodes=(9, 9, 6), collider=collider)
+    solver = FemNonlinear(model)
+    for _ in range(60):
+        deformation = solver.deform(pose)
+    assert solver.is_settled
+    check = surface_check(model)
+    check.check(deformation, pose)  # a leap from rest
+    residual, rounding = check.check(deformation, pose)
+    assert 0.3 * deformation.residual < residual < 1.01 * deformation.residual < 1.1e-5
+    assert rounding < 1e-5
+    assert check.is_least
+
+    # Nothing is pushed but what is touched.
+    none = replace(deformation, contact_nodes=np.zeros(0, np.int32))
+    assert surface_check(model).check(none, pose)[0] == 1.0
+    # Away from the probe, what was pushed is not held.
+    away = Pose(pose.position - [0.0, 0.0, 0.03], pose.orientation)
+    assert surface_check(model).check(deformation, away)[0] == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("collider", "pose"), PRESSING)
+@pytest.mark.parametrize("along", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+def test_a_touched_node_that_is_moved_is_noticed(collider, pose, along):
+    model = TissueModel.block(nodes=(9, 9, 6), collider=collider)
+    solver = FemNonlinear(model)
+    for _ in range(60):
+        deformation = solver.deform(pose)
+    touched = deformation.contact_nodes
+    node = touched[np.argmin(np.linalg.norm(model.mesh.nodes[touched], axis=1))]
+    nodes = deformation.nodes.copy()
+    nodes[node] += 1e-3 * np.array(along)  # of 12.5 to its neighbours
+    residual, _ = surface_check(model).check(replace(deformation, nodes=nodes), pose)
+    assert residual > 0.015  # little, where a surface is bent: it is pushed in many directions
+
+
+def test_a_pull_at_the_surface_is_not_balanced():
+    model = TissueModel.block(collider=RoundedBox(0.4, 0.4, 0.1, 0.001))
+    touched = model.movable_contact_nodes[5:6]
+    force, pose = np.zeros_like(model.mesh.nodes), Pose([0.0, 0.0, 1e-4])
+    for held, unbalanced in (([0.3, 0.0, 4.0], 0.3), ([0.0, 0.0, -4.0], 4.0)):
+        force[touched] = held
+        check = IndependentResidual(model, lambda _: force, 0.0, surface=True)
+        deformation = Deformation(model.mesh.nodes, touched, np.zeros(3), np.zeros(3), 0.0)
+        expected = unbalanced / np.linalg.norm(held)
+        assert check.check(deformation, pose)[0] == pytest.approx(expected)
+
+
+def test_how_tissue_is_pushed_is_not_known_where_a_probe_came_down_deep():
+    model = TissueModel.block(collider=Sphere(0.03))
+    pose = Pose([0.0, 0.0, 0.02])
+    check = surface_check(model)
+
+    def rounding(residual, pose):
+        pressed = model.mesh.nodes + [0.0, 0.0, 0.02] * (1 - model.mesh.nodes[:, 2:] / 0.1)
+        zero, touched = np.zeros(3), model.contact_nodes
+        return check.check(Deformation(pressed, touched, zero, zero, residual), pose)[1]
+
+    assert rounding(1e-3, pose) == np.inf  # 20 mm of 30 at once
+    assert rounding(1e-6, pose) == np.inf  # settled on planes
+    assert rounding(1e-3, pose) < 1e-9  # these are gone now
+    assert rounding(1e-3, Pose([0.0, 0.0, 0.022])) < 1e-9  # 2 mm more
+
+
+def surface_check(model):
+    def forces(displacement):
+        return neo_hookean_forces(model.mesh, model.materials, displacement)
+
+    return IndependentResidual(model, forces, 1e-12, surface=True)
 
 
 def _energy(mesh, materials, displacement):

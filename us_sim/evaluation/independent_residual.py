@@ -1,18 +1,13 @@
 """How far a tissue is from balance, computed from what a solver returned and not by the solver.
 
-Everything here is NumPy in double precision on the formulas of each method, for meshes of some
-hundred nodes; it shares no kernel with a solver. A method's forces are derivatives of its energy at
-the returned nodes, so that what a solver rounds, or leaves out, shows.
+Forces are those of `independent_forces`, derivatives of a method's energy at the returned nodes, so
+that what a solver rounds, or leaves out, shows.
 
->>> import numpy as np
->>> from us_sim.evaluation.independent_residual import hooke_forces
->>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.evaluation.independent_forces import hooke_forces
+>>> from us_sim.evaluation.independent_residual import SpringSettings, solid_residual
 >>> from us_sim.tissue.model import TissueModel
->>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
->>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
->>> forces = hooke_forces(block.mesh, block.materials, pulled)
->>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
-'1.200 N'
+>>> solid_residual(hooke_forces)(TissueModel.block(), SpringSettings()).is_least
+False
 """
 
 from __future__ import annotations
@@ -23,15 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
-from us_sim.evaluation.crushed_pressure import (
-    LUMEN_SHEAR,
-    crowding,
-    emptied_fraction,
-    lumen_pressure,
-    wall_modulus,
+from us_sim.evaluation.independent_forces import (
+    rounding_of_forces,
+    spring_forces,
+    volume_forces,
 )
-from us_sim.evaluation.push_directions import push_directions
+from us_sim.evaluation.push_directions import flared_distance, push_directions
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.materials import TissueMaterials
@@ -39,27 +33,24 @@ from us_sim.tissue.elasticity.springs import fitted_springs, springs_of
 from us_sim.tissue.elasticity.volume_term import volume_term
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import same_pose
 
 __all__ = [
     "IndependentResidual",
+    "Residual",
     "SpringSettings",
-    "averaged_hooke_forces",
-    "hooke_forces",
-    "neo_hookean_forces",
-    "rounding_of_forces",
     "solid_residual",
-    "spring_forces",
     "spring_residual",
-    "volume_forces",
 ]
 
 Array = NDArray[np.float64]
 
-_ELEMENT_BULK = 5.0
-"""(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
+_PARTS = 12
+"""Parts of a triangle's sides, between which it is looked where a surface is pushed."""
 
-_YIELD = 1.5
-"""Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
+_ALIKE = 7  # decimals in which directions of pushes differ that are not the same
+
+_SETTLED = 1e-5  # residual
 
 
 @dataclass(frozen=True)
@@ -77,7 +68,9 @@ class IndependentResidual:
         model: of the solver.
         forces: (N, 3) N that hold the nodes at displacements (N, 3) m, by the method's equations.
         rounding: N, norm of the forces that the last digit of the nodes' coordinates makes.
-        flanks: whether the method knows flanks, as `push_directions` says.
+        surface: whether the probe pushes places on triangles, out of the shape of
+            `flared_distance`, and not the nodes, as `push_directions` says. By how much it pushes
+            is left open, so what is found is the least that the residual can be.
     """
 
     def __init__(
@@ -86,12 +79,18 @@ class IndependentResidual:
         forces: Callable[[Array], Array],
         rounding: float,
         *,
-        flanks: bool = False,
+        surface: bool = False,
     ) -> None:
         self._model = model
         self._forces = forces
         self._rounding = rounding
-        self._flanks = flanks
+        #: Whether a true residual may also be greater than what is found.
+        self.is_least = surface
+        self._surface = _touchable(model) if surface else np.zeros((0, 3), np.int32)
+        self._spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
+        self._last: tuple[Array, Pose | None] = model.mesh.nodes, None  # nodes that were returned
+        self._swept = False  # whether the probe, where it is, came down deep in tissue
+        self._settled = False  # as was reported last
         self._heaviest = 0.0
         self._scale = math.inf  # N, what the last residual referred to
 
@@ -102,35 +101,89 @@ class IndependentResidual:
     def check(self, deformation: Deformation, pose: Pose | None) -> tuple[float, float]:
         """Residual of the returned nodes, and the part of it that may be rounding of the nodes.
 
-        As defined for `Deformation`: unbalanced over contact forces, where what acts on touched
-        nodes along the probe's normal and pushes is balanced. Without contact it refers to the
-        heaviest contact before.
+        As defined for `Deformation`: unbalanced over contact forces, where of what acts on touched
+        nodes the part is balanced that is a sum of pushes by the probe. Without contact it refers
+        to the heaviest contact before. Where a probe has come down deep in tissue, it is not known
+        in which directions it pushes until the tissue has settled: the second is infinite then.
         """
         model = self._model
+        if self.is_least:
+            self._look_back(deformation, pose)
         with np.errstate(all="ignore"):
             holding = self._forces(deformation.nodes - model.mesh.nodes)
             unbalanced = np.where(model.fixed[:, None], 0.0, holding)
             touched = deformation.contact_nodes
+            touched = touched[~model.fixed[touched]]
             load = 0.0
             if pose is not None and len(touched):
-                normal = push_directions(
-                    model.collider,
-                    pose,
-                    deformation.nodes[touched],
-                    model.contact_spacing,
-                    flanks=self._flanks,
-                )
-                push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
-                push[model.fixed[touched]] = 0.0
-                unbalanced[touched] -= push[:, None] * normal
-                load = float(np.linalg.norm(push))
+                if self.is_least:
+                    push = self._on_triangles(pose, deformation.nodes, touched, holding)
+                    # If the reported residual is true, contact forces are at most so great.
+                    held, left = float(np.linalg.norm(holding[touched])), 1 - deformation.residual
+                    load = held / left if left > 0.0 else math.inf
+                else:
+                    push = self._at_nodes(pose, deformation.nodes, touched, holding)
+                    load = float(np.linalg.norm(push))
+                unbalanced[touched] -= push
             imbalance = float(np.linalg.norm(unbalanced))
         if load == 0.0 and imbalance <= self._rounding:
             self._heaviest = 0.0  # at rest, or as good as
             return 0.0, self._rounding / self._scale
         self._heaviest = max(self._heaviest, load) or imbalance
         self._scale = load or self._heaviest
-        return imbalance / self._scale, self._rounding / self._scale
+        rounding = math.inf if self._swept else self._rounding / self._scale
+        return imbalance / self._scale, rounding
+
+    def _look_back(self, deformation: Deformation, pose: Pose | None) -> None:
+        """Find out whether the probe came down deep in tissue where it is, and that has not settled
+        since.
+        """
+        (nodes, before), self._last = self._last, (deformation.nodes, pose)
+        if pose is None:
+            self._swept = False
+        elif not same_pose(pose, before):
+            box = self._model.collider.offset_box
+            deep = 0.5 * float(box[:2].min() + box[3])
+            places = _places(nodes, self._surface).reshape(-1, 3)
+            gap, _ = flared_distance(self._model.collider, pose, places, self._spacing)
+            self._swept = bool(gap.min(initial=np.inf) < -deep)
+        elif self._settled:
+            self._swept = False
+        self._settled = deformation.residual <= _SETTLED
+
+    def _at_nodes(
+        self, pose: Pose, nodes: Array, touched: NDArray[np.integer], holding: Array
+    ) -> Array:
+        """(K, 3) N, of the forces that hold the touched nodes, what pushes these nodes."""
+        model = self._model
+        normal = push_directions(model.collider, pose, nodes[touched], model.contact_spacing)
+        push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
+        return np.asarray(push[:, None] * normal)
+
+    def _on_triangles(
+        self, pose: Pose, nodes: Array, touched: NDArray[np.integer], holding: Array
+    ) -> Array:
+        """(K, 3) N, of the forces that hold the touched nodes, the greatest part that is a sum of
+        pushes square to the probe at places in it, on triangles of these nodes.
+        """
+        triangles = self._surface[np.isin(self._surface, touched).any(axis=1)]
+        corners, places = nodes[triangles], _places(nodes, triangles)
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        gap, normal = flared_distance(
+            self._model.collider, pose, places.reshape(-1, 3), self._spacing
+        )
+        # Within a part that is pushed at all, no corner is farther out than the part is long.
+        near = gap.reshape(places.shape[:2]) <= sides.max(axis=1)[:, None] / _PARTS
+        normal = normal.reshape(places.shape)
+        push = np.zeros((len(touched), 3))
+        for number, node in enumerate(touched):
+            own = (triangles == node).any(axis=1)
+            along = normal[own][near[own]]
+            size = float(np.linalg.norm(holding[node]))
+            if len(along) and size > 0.0:
+                along = along[np.unique(along.round(_ALIKE), axis=0, return_index=True)[1]]
+                push[number] = size * nnls(along.T, holding[node] / size)[0] @ along
+        return push
 
 
 Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
@@ -138,11 +191,11 @@ Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
 
 
 def solid_residual(
-    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array], *, flanks: bool = False
+    forces: Callable[[TetrahedralMesh, TissueMaterials, Array], Array], *, surface: bool = False
 ) -> Residual:
     """For a method of finite elements, whose nodes are held by those ``forces``.
 
-    ``flanks`` says whether it knows those of a probe, as `push_directions` says.
+    ``surface`` says whether its surface is pushed, or its nodes, as for `IndependentResidual`.
     """
 
     def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
@@ -153,7 +206,7 @@ def solid_residual(
             model,
             lambda displacement: forces(mesh, materials, displacement),
             rounding_of_forces(mesh, stiffest),
-            flanks=flanks,
+            surface=surface,
         )
 
     return residual
@@ -185,182 +238,24 @@ def spring_residual(*, yielding: bool) -> Residual:
     return residual
 
 
-def hooke_forces(mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array) -> Array:
-    """(N, 3) N that hold linear tetrahedra of Hooke's material at displacements (N, 3) m."""
-    shear, whole, volume, gradient = _elements(mesh, materials)
-    slope = _slopes(mesh, gradient, displacement)
-    stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
-    return _gathered(mesh, volume, gradient, stress, (whole - shear) * _trace(slope))
+def _touchable(model: TissueModel) -> NDArray[np.integer]:
+    """(T, 3) triangles that the probe can push; what is touched alone is one with no extent."""
+    reached = np.zeros(len(model.mesh.nodes), dtype=bool)
+    reached[model.contact_nodes] = True
+    triangles = model.mesh.boundary
+    held = model.fixed[triangles].all(axis=1)
+    triangles = triangles[reached[triangles].all(axis=1) & ~held]
+    alone = np.setdiff1d(model.contact_nodes, triangles)
+    return np.concatenate([triangles, np.repeat(alone[:, None], 3, axis=1)])
 
 
-def averaged_hooke_forces(
-    mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
-) -> Array:
-    """As `hooke_forces`, with the greater part of a high bulk stiffness averaged around nodes.
-
-    (J. Bonet and A. J. Burton, A simple average nodal pressure tetrahedral element for
-    incompressible and nearly incompressible dynamic explicit applications, Commun. Numer. Meth.
-    Engng. 14, 1998.)
-    """
-    shear, whole, volume, gradient = _elements(mesh, materials)
-    slope = _slopes(mesh, gradient, displacement)
-    own, nodal = _bulk_parts(shear, whole)
-    pressure = own * _trace(slope) + nodal * _around(mesh, nodal * volume / 4, _trace(slope))
-    stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
-    return _gathered(mesh, volume, gradient, stress, pressure - shear * _trace(slope))
+def _places(nodes: Array, triangles: NDArray[np.integer]) -> Array:
+    """(T, L, 3) m, places on triangles (T, 3) of nodes (N, 3) m."""
+    return np.asarray(np.einsum("lk,tkd->tld", _lattice(_PARTS), nodes[triangles]))
 
 
-def neo_hookean_forces(
-    mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
-) -> Array:
-    """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N.
-
-    (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
-    2018, without its logarithmic barrier.)
-    """
-    shear, whole, volume, gradient = _elements(mesh, materials)
-    slope = _slopes(mesh, gradient, displacement)
-    swelling = _swelling(slope)
-    own, nodal = _bulk_parts(shear, whole)
-    hollow = materials.lumen_fraction > 0.0
-    empties = emptied_fraction(materials)
-    shear = shear * (1 - empties + LUMEN_SHEAR * empties)
-    nodal = np.where(hollow, 0.0, nodal)
-    pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
-    wall = wall_modulus(mesh, shear)
-    pressure += wall * crowding(1 + swelling)
-    pressure[hollow] = lumen_pressure(
-        *(part[hollow] for part in (swelling, empties, materials.lumen_pressure, own, wall))
-    )
-    cofactor = _cofactors(slope + np.eye(3))
-    # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
-    difference = (
-        _trace(slope)[:, None, None] * np.eye(3)
-        - slope.transpose(0, 2, 1)
-        - slope
-        + _cofactors(slope)
-    )
-    stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
-    return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
-
-
-def spring_forces(
-    edges: NDArray[np.int32], stiffness: Array, rest: Array, displacement: Array
-) -> Array:
-    """(N, 3) N that hold springs of (E,) N/m along edges (E, 2), undeformed at ``rest`` (N, 3)."""
-    before = rest[edges[:, 1]] - rest[edges[:, 0]]
-    moved = displacement[edges[:, 1]] - displacement[edges[:, 0]]
-    now = before + moved
-    length, rest_length = np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1)
-    # The difference of the squares does not cancel.
-    longer = np.einsum("ij,ij->i", moved, now + before) / np.maximum(length + rest_length, 1e-300)
-    pull = stiffness * longer / np.maximum(length, 1e-300)
-    force = np.zeros_like(rest)
-    np.add.at(force, edges[:, 1], pull[:, None] * now)
-    np.add.at(force, edges[:, 0], -pull[:, None] * now)
-    return force
-
-
-def volume_forces(
-    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array, yielding: bool = False
-) -> Array:
-    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
-
-    ``yielding`` ones whose faces, squared and added, have grown to 1.5 times what they were keep
-    their strain and their stress in proportion to the square root of what is beyond.
-    """
-    gradient = _gradients(mesh)
-    slope = _slopes(mesh, gradient, displacement)
-    swelling = _swelling(slope)
-    cofactor = _cofactors(slope + np.eye(3))
-    left = np.ones(len(swelling))
-    if yielding:
-        faces = np.einsum("mij,maj->mai", cofactor, gradient)
-        grown = (faces**2).sum(axis=(1, 2)) / (gradient**2).sum(axis=(1, 2))
-        left = np.sqrt(np.minimum(_YIELD / np.maximum(grown, _YIELD), 1.0))
-    around = _around(mesh, nodal * mesh.volumes / 4, left * swelling)
-    pressure = left * (element * left * swelling + nodal * around)
-    stress = pressure[:, None, None] * cofactor
-    return _gathered(mesh, mesh.volumes, gradient, stress, np.zeros(len(pressure)))
-
-
-def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
-    """N, about the norm of the forces that arise when coordinates are rounded to doubles.
-
-    ``modulus`` is (M,) Pa, the stiffest of each tetrahedron.
-    """
-    steep = np.linalg.norm(_gradients(mesh), axis=2)
-    digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
-    each = modulus * mesh.volumes * steep.sum(axis=1) * digit
-    nodal = np.zeros(len(mesh.nodes))
-    np.add.at(nodal, mesh.tetrahedra, each[:, None] * steep)
-    return float(np.linalg.norm(nodal))
-
-
-def _elements(
-    mesh: TetrahedralMesh, materials: TissueMaterials
-) -> tuple[Array, Array, Array, Array]:
-    """mu and lambda + mu (M,) Pa, volumes (M,) m3 and shape gradients (M, 4, 3) 1/m."""
-    ratio = materials.poisson_ratio
-    shear = materials.young_modulus / (2 + 2 * ratio)
-    first = materials.young_modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
-    return shear, first + shear, mesh.volumes, _gradients(mesh)
-
-
-def _bulk_parts(shear: Array, whole: Array) -> tuple[Array, Array]:
-    own = np.minimum(whole, _ELEMENT_BULK * shear)
-    return own, whole - own
-
-
-def _gradients(mesh: TetrahedralMesh) -> Array:
-    """(M, 4, 3) 1/m: each shape function falls from its corner to the face opposite."""
-    corners = mesh.nodes[mesh.tetrahedra]
-    gradient = np.empty_like(corners)
-    for corner, (a, b, c) in enumerate(((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))):
-        face = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
-        height = np.einsum("ij,ij->i", corners[:, corner] - corners[:, a], face)
-        gradient[:, corner] = face / height[:, None]
-    return gradient
-
-
-def _slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Array:
-    """(M, 3, 3) gradient of the displacement, component by direction.
-
-    Relative to one corner, so that a displacement of a whole tetrahedron cancels exactly.
-    """
-    moved = displacement[mesh.tetrahedra]
-    return np.einsum("mai,maj->mij", moved - moved[:, :1], gradient)
-
-
-def _gathered(
-    mesh: TetrahedralMesh, volume: Array, gradient: Array, stress: Array, pressure: Array
-) -> Array:
-    whole = stress + pressure[:, None, None] * np.eye(3)
-    force = np.zeros((len(mesh.nodes), 3))
-    corners = np.einsum("m,mij,maj->mai", volume, whole, gradient)
-    np.add.at(force, mesh.tetrahedra, corners)
-    return force
-
-
-def _around(mesh: TetrahedralMesh, weight: Array, value: Array) -> Array:
-    """(M,) mean over a tetrahedron's nodes of the weighted means around each node."""
-    total, sum_of = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
-    np.add.at(total, mesh.tetrahedra, weight[:, None])
-    np.add.at(sum_of, mesh.tetrahedra, (weight * value)[:, None])
-    mean = np.divide(sum_of, total, out=np.zeros_like(total), where=total > 0)
-    return np.asarray(mean[mesh.tetrahedra].mean(axis=1))
-
-
-def _swelling(slope: Array) -> Array:
-    """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
-
-
-def _trace(matrices: Array) -> Array:
-    return np.asarray(np.trace(matrices, axis1=1, axis2=2))
-
-
-def _cofactors(matrices: Array) -> Array:
-    a, b, c = np.moveaxis(matrices, 1, 0)
-    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+def _lattice(count: int) -> Array:
+    """(L, 3) barycentric coordinates of the corners of a triangle's count^2 equal parts."""
+    row, column = np.divmod(np.arange((count + 1) ** 2), count + 1)
+    first = np.column_stack([row, column])[row + column <= count] / count
+    return np.column_stack([first, 1 - first.sum(axis=1)])

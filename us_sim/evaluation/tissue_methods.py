@@ -17,14 +17,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from us_sim.evaluation.independent_residual import (
-    Residual,
+from us_sim.evaluation.independent_forces import (
     averaged_hooke_forces,
     hooke_forces,
     neo_hookean_forces,
-    solid_residual,
-    spring_residual,
 )
+from us_sim.evaluation.independent_residual import Residual, solid_residual, spring_residual
 from us_sim.evaluation.named import Named
 
 __all__ = ["TISSUE_METHODS", "Setting", "TissueMethod"]
@@ -89,7 +87,7 @@ _ALL = (
         "fem_nonlinear",
         colour="#D55E00",
         mark="D",
-        residual=solid_residual(neo_hookean_forces, flanks=True),
+        residual=solid_residual(neo_hookean_forces, surface=True),
         is_judged_at_rest=True,
         patient={"frame_tolerance": 1e-7, "most_iterations": 4000, "tolerance": 1e-7},
         tried=(

@@ -17,6 +17,7 @@ from us_sim.evaluation.stability.points import Trial, agrees, equations_of, run_
 from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.tissue.solvers.fem_cg import FemCg
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
 CASE = StabilityCase("press", depth=0.2, contrast=10.0)
 
@@ -88,6 +89,26 @@ def test_a_solver_that_understates_its_residual_is_caught():
     assert not trial.truthful
     assert not trial.passed
     assert trial.residual_checked == pytest.approx(100 * trial.residual_reported, rel=1e-6)
+
+
+class LyingOfSurfaces(FemNonlinear):
+    """As `Lying`, of a method that pushes the surface; stops early, so that there is a residual."""
+
+    def __init__(self, model):
+        super().__init__(model, FemNonlinear.Settings(frame_tolerance=0.1))
+
+    def _advance(self, pose):
+        deformation = super()._advance(pose)
+        return replace(deformation, residual=deformation.residual / 100)
+
+
+def test_a_solver_that_understates_what_the_surface_leaves_is_caught():
+    trial, model = Trial(), model_of(CASE)
+    checked = equations_of("fem_nonlinear", CASE, model)
+    run_trial(LyingOfSurfaces(model), checked, CASE, trial)
+    assert not trial.truthful
+    assert trial.residual_checked > 20 * trial.residual_reported
+    assert try_case("fem_nonlinear", CASE).passed
 
 
 def test_a_solver_that_drifts_off_is_caught():
@@ -196,6 +217,12 @@ def test_residuals_agree_within_a_factor_of_two_or_both_are_negligible(
     reported, checked, rounding, true
 ):
     assert agrees(reported, checked, rounding) is true
+
+
+def test_what_was_found_at_least_may_be_more():
+    assert agrees(0.2, 0.01, 0.0, least=True)
+    assert not agrees(0.01, 0.2, 0.0, least=True)
+    assert not agrees(float("nan"), 0.2, 0.0, least=True)
 
 
 def test_what_can_move_as_a_whole_is_refused_by_quasi_static_methods():

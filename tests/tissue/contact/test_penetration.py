@@ -10,6 +10,7 @@ from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import only_forward, push_out, wrench_on_probe
+from us_sim.tissue.contact.surface_points import SurfacePoints, point_size
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
@@ -116,8 +117,8 @@ def test_beyond_the_ends_of_a_curved_face_an_unresolved_rounding_pushes_as_its_e
     assert gap_at(CONVEX, (0.0, 0.0, -0.14), COARSE)[0] == pytest.approx(-0.14)
 
 
-@pytest.mark.parametrize("method", ["fem", "fem_nonlinear"])
-def test_tissue_takes_the_shape_of_a_curved_face(method):
+def pressed_by_a_curved_face(method):
+    """A solver, the pose of the face 9 mm deep in a block 50 mm high, and the deformation."""
     mesh = box_mesh(
         *(uniform_planes(-0.05, 0.05, 13) for _ in range(2)), uniform_planes(0, 0.05, 6)
     )
@@ -131,10 +132,34 @@ def test_tissue_takes_the_shape_of_a_curved_face(method):
     touching = deformation.nodes[deformation.contact_nodes]
     assert np.ptp(touching[:, 0]) > 0.03
     assert np.ptp(touching[:, 2]) > 0.002  # it is bent
-    np.testing.assert_allclose(signed_distance(CONVEX, pressed, touching)[0], 0.0, atol=1e-5)
-    free = np.setdiff1d(np.arange(len(mesh.nodes)), deformation.contact_nodes)
-    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
     assert abs(deformation.force[0]) < 1e-3 * -deformation.force[2]
+    return model, pressed, deformation
+
+
+def test_tissue_takes_the_shape_of_a_curved_face():
+    model, pressed, deformation = pressed_by_a_curved_face("fem")
+    touching = deformation.nodes[deformation.contact_nodes]
+    np.testing.assert_allclose(signed_distance(CONVEX, pressed, touching)[0], 0.0, atol=1e-5)
+    free = np.setdiff1d(np.arange(len(model.mesh.nodes)), deformation.contact_nodes)
+    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
+
+
+def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
+    # Points of the flat triangles between the nodes lie on the face, on springs: it is in by up to
+    # a tenth of the nodes' spacing, and a node of a touched triangle is out by no more than the arc
+    # falls on the way to the next one: l^2 / (2 radius).
+    model, pressed, deformation = pressed_by_a_curved_face("fem_nonlinear")
+    spacing = model.contact_spacing
+    displacement = (deformation.nodes - model.mesh.nodes).T
+    points = SurfacePoints(model, point_size(CONVEX.rounding, spacing))
+    distance, _ = signed_distance(CONVEX, pressed, points.rest + points.moved(displacement))
+    assert -0.1 * spacing < distance.min() < 0.0
+    touching = deformation.nodes[deformation.contact_nodes]
+    off = signed_distance(CONVEX, pressed, touching)[0]
+    assert -0.1 * spacing < off.min()
+    assert off.max() < 0.1 * spacing + spacing**2 / (2 * CONVEX.radius)
+    free = np.setdiff1d(np.arange(len(model.mesh.nodes)), deformation.contact_nodes)
+    assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > 0.0
 
 
 @settings(deadline=None, max_examples=30)

@@ -1,292 +1,305 @@
 """Frictionless contact whose forces have an energy: springs between the surface and the probe.
 
-Each node that the probe has entered is pushed out along the probe's normal by a force that rises
-with its depth and ends at a greatest one, as a hand cannot push without end:
+Each point of the surface that the probe has entered is pushed out along the probe's normal by a
+force that rises with its depth, faster and faster, and ends at a greatest one, as a hand cannot
+push without end. With d = max(0, -gap) it is
 
-    energy k d^2 / 2 up to d = F / k, and F (d - F / (2 k)) beyond,    d = max(0, -gap).
+    k d (1 + (d / d1)^2) up to F,    energy k d^2 / 2 + k d^4 / (4 d1^2), and on at the slope F.
 
-It is convex in the gap and has one continuous derivative, so that tissue and contact together have
-one energy to minimise (P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section 5.1; the
-bounded form is P. J. Huber's loss, Robust Estimation of a Location Parameter, Ann. Math. Statist.
-35, 1964).
+So the state of tissue under a probe is a minimum of one energy that depends on the two alone, not
+on how the probe came there (P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section
+5.1). The price is that the probe sinks in a little, as it does into gel.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tissue.contact.flared_probe import FlaredProbe
 >>> from us_sim.tissue.contact.penalty_contact import PenaltyContact
->>> contact = PenaltyContact(Sphere(0.03), 0.01, np.array([1e4]), np.array([5.0]))
+>>> probe = FlaredProbe(Sphere(0.03), spacing=0.01)
+>>> contact = PenaltyContact(probe, np.array([1e4]), np.array([15.0]), stiffening=1e-3)
 >>> contact.aim(Pose(position=[0.0, 0.0, 1e-4]), np.zeros((1, 3)))
 >>> contact.push.round(9), contact.normal
-(array([1.]), array([[0., 0., 1.]]))
->>> contact.aim(Pose(position=[0.0, 0.0, 0.01]), np.zeros((1, 3)))
->>> contact.push.round(9), round(contact.energy, 9)
-(array([5.]), 0.04875)
+(array([1.01]), array([[0., 0., 1.]]))
+>>> contact.aim(Pose(position=[0.0, 0.0, 1e-3]), np.zeros((1, 3)))
+>>> contact.push
+array([15.])
 """
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import is_beside, only_forward, push_out
+from us_sim.tissue.contact.flared_probe import FlaredProbe
 
 __all__ = ["PenaltyContact"]
 
-_SKIRT = 0.25
-"""Fraction of the spacing by which a pushed node must be beside a probe of small rounding to be
-let go. Pressed down it moves sideways; let go at once, it would come up and get under the probe
-again."""
+_LEAP = 0.02
+"""Way in one move, m, beyond which a probe has not swept through tissue: it was lifted and came
+down anew."""
 
-_FORWARD = 0.99
-"""Cosine to the probe's axis above which a push is that of the face, and not of a flank."""
+_NEAR = 4.0
+"""Gap up to which a point may come to touch while a probe stays where it is, over the depth from
+which on it is deep."""
 
+_OVERSHOOT = 0.1
+"""Slope of the energy where a change ends, over the one where it begins, that does not matter."""
 
-_BESIDE = 0.1
-"""Depth in a flank, over the spacing, up to which a node counts as beside the probe."""
+_HALVINGS = 6
+"""Halvings of an interval of lengths in which the energy is least."""
 
-_ALIKE = 0.999
-"""Cosine between two normals of the same part of a probe."""
-
-_FOLLOWED = 40
-"""How often at one pose the planes are fixed anew where the nodes have moved to."""
-
-_FULLY = 6
-"""How often of these to the full: that converges in a few frames, or not at all."""
+_LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 class PenaltyContact:
-    """Gaps between C surface nodes and the probe, and the forces that these raise.
+    """Gaps between P points and the probe, and the forces that these raise.
 
     Args:
-        collider: the probe's shape.
-        spacing: m, between neighbours among the nodes.
-        stiffness: (C,) N/m, k above.
-        strongest: (C,) N, F above.
+        probe: the shape that presses.
+        stiffness: (P,) N/m, k above.
+        strongest: (P,) N, F above.
+        stiffening: m, d1 above.
     """
 
     def __init__(
         self,
-        collider: Collider,
-        spacing: float,
+        probe: FlaredProbe,
         stiffness: NDArray[np.float64],
         strongest: NDArray[np.float64],
+        stiffening: float,
     ) -> None:
-        self._collider = collider
-        self._spacing = spacing
-        self._stiffness = stiffness
+        self._probe = probe
+        self.stiffness = stiffness  # (P,) N/m, with which springs begin
         self._strongest = strongest
-        #: Whether the probe pushes along planes that `aim` fixes, not along its surface's normal.
-        self.forward = only_forward(collider, spacing)
+        self._stiffening = stiffening
+        # The real root of k d (1 + (d / d1)^2) = F, for d / d1, after Cardano.
+        half = strongest / (2 * stiffness * stiffening)
+        root = np.cbrt(half + np.sqrt(half * half + 1 / 27))
+        self._deepest = stiffening * (root - 1 / (3 * root))  # (P,) m, where the push is F
+        self._law = stiffness, self._deepest, stiffening
         self.clear()
-
-    @property
-    def softness(self) -> NDArray[np.float64]:
-        """(C,) m/N, how far the probe sinks in by its pushes, while these are not the greatest."""
-        return 1.0 / self._stiffness
 
     def clear(self) -> None:
         """No probe is near."""
-        count = len(self._stiffness)
+        count = len(self.stiffness)
         self._pose: Pose | None = None
-        self._followed = 0
-        self._aside = np.zeros(count, dtype=bool)  # (C,), which nodes flanks may push
-        self._height: NDArray[np.float64] | None = None  # (C,) m along the normal, of the surface
-        self._shift = np.zeros(count)  # (C,) m, how far before the probe the springs end
-        self.normal = np.zeros((count, 3))  # (C, 3), direction in which the probe pushes
+        self.near = np.zeros(0, dtype=np.int64)  # points that may come to touch
+        self._planar = np.zeros(0, dtype=np.int64)  # points that planes push, not the shape
+        self._height = np.zeros(0)  # m along the normal, of these planes
+        self.normal = np.zeros((count, 3))  # (P, 3), direction in which the probe pushes
         self._measure(np.full(count, np.inf))
 
-    def aim(self, pose: Pose, positions: NDArray[np.float64]) -> None:
-        """Put the probe at a pose, the nodes being at ``positions`` (C, 3) m, frame ``patient``.
+    def depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
+        """How deep (m) a probe would be in points (P, 3) m, at least 0."""
+        gap, _ = self._probe.distance(pose, positions)
+        return max(0.0, -float(gap.min(initial=np.inf)))
 
-        A probe whose rounding the nodes do not resolve pushes along fixed directions onto planes at
-        fixed heights, those of its surface where the nodes are now: at its rim the height changes
-        as a node slides, though the push is not along the surface's normal, and such a force has no
-        energy. With the planes fixed until the next aim it has one.
+    def aim(self, pose: Pose, positions: NDArray[np.float64]) -> None:
+        """Put the probe at a pose, the points being at ``positions`` (P, 3) m, frame ``patient``.
+
+        Where a move brings points deep into the probe, the nearest way out is no guide. They are
+        pushed back through where they came in, onto a plane; the next aim, or `release`, ends that.
         """
-        self._followed = 0
-        self._aside = np.zeros(len(positions), dtype=bool)
-        if self._pose is not None and self.forward:
-            # What comes in from the side, and not from before the face.
-            margin = _BESIDE * self._spacing
-            self._aside = is_beside(self._collider, self._pose, positions, margin)
-            self._aside &= ~self._by_face(self._pose)
-        before = self.normal
-        gap, self.normal = self._gaps(pose, positions)
-        likeness = np.einsum("ij,ij->i", before, self.normal)
-        self._shift *= np.where(np.isfinite(gap), np.maximum(likeness, 0.0), 0.0)
-        self._pose = pose
-        self._height = np.einsum("ij,ij->i", positions, self.normal) - gap if self.forward else None
+        last, self._pose = self._pose, pose
+        gap, self.normal = self._probe.distance(pose, positions)
+        self.near = np.flatnonzero(gap < _NEAR * self._probe.deep)
+        self._planar = np.flatnonzero(gap < -self._probe.deep)
+        if len(self._planar):
+            if last is not None and math.dist(last.position, pose.position) > _LEAP:
+                last = None
+            inside = positions[self._planar]
+            gap[self._planar], normal = self._probe.entered(last, pose, inside)
+            self.normal[self._planar] = normal
+            self._height = np.einsum("ij,ij->i", inside, normal) - gap[self._planar]
         self._measure(gap)
 
-    def _gaps(
-        self, pose: Pose, positions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        margin = np.where(self._by_face(pose), _SKIRT * self._spacing, 0.0)
-        return push_out(self._collider, pose, positions, self._spacing, margin, self._aside)
-
-    def _by_face(self, pose: Pose) -> NDArray[np.bool_]:
-        """(C,) which nodes the face pushes."""
-        return np.asarray((self.push > 0.0) & (self.normal @ pose.rotation[:, 2] > _FORWARD))
-
-    def follow(self, positions: NDArray[np.float64]) -> float:
-        """Fix the planes anew where the nodes have come to be, at ``positions`` (C, 3) m.
-
-        Only their heights: a node that the front pushes is not handed to a flank, nor the other way
-        round, as some would go to and fro without end.
+    def release(self, positions: NDArray[np.float64]) -> bool:
+        """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes.
 
         Returns:
-            m, the largest change of a pushed node's gap.
+            Whether that changes anything.
         """
-        if self._height is None or self._pose is None or self._followed == _FOLLOWED:
-            return 0.0
-        self._followed += 1
-        gap, normal = self._gaps(self._pose, positions)
-        alike = np.einsum("ij,ij->i", normal, self.normal) > _ALIKE
-        taken = np.isfinite(gap) & (alike | ~np.isfinite(self.gap))
-        self.normal = np.where(taken[:, None], normal, self.normal)
-        height = np.einsum("ij,ij->i", positions, normal) - gap
-        pushed, before = self.push > 0.0, self.gap
-        # Later half the way: at the rim heights change faster than nodes slide.
-        part = 1.0 if self._followed <= _FULLY else 0.5
-        old = np.where(np.isfinite(self._height), self._height, height)
-        with np.errstate(invalid="ignore"):
-            self._height = np.where(taken, old + part * (height - old), self._height)
+        if len(self._planar) == 0:
+            return False
+        self._planar = self._planar[:0]
         self.look(positions)
-        pushed |= self.push > 0.0
-        with np.errstate(invalid="ignore"):
-            change = np.abs(self.gap[pushed] - before[pushed])
-        return float(np.nan_to_num(change, posinf=self._spacing).max(initial=0.0))
+        return True
 
     def look(self, positions: NDArray[np.float64]) -> None:
-        """Measure gaps, normals and pushes at other positions (C, 3) m."""
+        """Measure gaps, normals and pushes at other positions (P, 3) m."""
         if self._pose is None:
             return
-        if self._height is not None:
-            gap = np.einsum("ij,ij->i", positions, self.normal) - self._height
-        else:
-            gap, self.normal = push_out(self._collider, self._pose, positions, self._spacing)
+        gap, normal = self._probe.distance(self._pose, positions, self.near)
+        if len(planar := self._planar):
+            normal[planar] = self.normal[planar]
+            gap[planar] = np.einsum("ij,ij->i", positions[planar], normal[planar]) - self._height
+        self.normal = normal
         self._measure(gap)
 
     def _measure(self, gap: NDArray[np.float64]) -> None:
-        self.gap = gap  # (C,) m, infinite where the probe cannot push
-        self.push = self.push_at(gap)  # (C,) N, along the normal
-
-    def augment(self, most: float) -> float:
-        """Let the springs end before the probe by as much as they are pressed together now.
-
-        So the same pushes come about without the probe sinking in (the method of multipliers; J. C.
-        Simo and T. A. Laursen, An augmented Lagrangian treatment of contact problems involving
-        friction, Computers & Structures 42, 1992).
-
-        Args:
-            most: fraction of the greatest push up to which this is done.
-
-        Returns:
-            m, the largest change of where a spring ends.
-        """
-        shift = np.minimum(self.push, most * self._strongest) / self._stiffness
-        change = float(np.abs(shift - self._shift).max(initial=0.0))
-        self._shift = shift
-        self._measure(self.gap)
-        return change
+        self.gap = gap  # (P,) m, infinite where the probe cannot push
+        self.push = self.push_at(gap)  # (P,) N, along the normal
 
     @property
     def energy(self) -> float:
         """J, of all springs."""
-        depth = np.maximum(self._shift - self.gap, 0.0)
-        return float((self.push * (depth - self.push / (2 * self._stiffness))).sum())
+        depth = np.maximum(-self.gap, 0.0)
+        held = np.minimum(depth, self._deepest)
+        energy = 0.5 * self.stiffness * held**2 * (1 + 0.5 * (held / self._stiffening) ** 2)
+        return float((energy + self._strongest * (depth - held)).sum())
 
     def push_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(C,) N, pushes at other gaps (C,) m."""
-        return np.clip(self._stiffness * (self._shift - gap), 0.0, self._strongest)
+        """(P,) N, pushes at other gaps (P,) m."""
+        push = np.zeros_like(gap)
+        _push(self.near, gap, *self._law, push)
+        return push
 
-    def slope_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(C,) N/m, how fast the pushes fall with gaps (C,) m."""
-        push = self._stiffness * (self._shift - gap)
-        return np.where((push > 0.0) & (push < self._strongest), self._stiffness, 0.0)
+    @property
+    def slope(self) -> NDArray[np.float64]:
+        """(P,) N/m, how fast the pushes fall with the gaps."""
+        slope, still = np.zeros_like(self.gap), np.zeros_like(self.normal)
+        _slopes(self.near, self.gap, self.normal, still, *self._law, slope)
+        return slope
+
+    def curvature(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, 3, 3) 1/m, how the push would turn as points (K, 3) m move; zero without a probe."""
+        if self._pose is None:
+            return np.zeros((len(positions), 3, 3))
+        return self._probe.curvature(self._pose, positions)
 
     @property
     def force(self) -> NDArray[np.float64]:
-        """(C, 3) N, on the tissue."""
+        """(P, 3) N, on the tissue."""
         force: NDArray[np.float64] = self.push[:, None] * self.normal
         return force
 
     def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(C, 3) N, `force` after nodes moved by ``change`` (C, 3) m, as normals are now."""
-        reached = self.gap + np.einsum("ij,ij->i", self.normal, change)
-        force: NDArray[np.float64] = self.push_at(reached)[:, None] * self.normal
+        """(P, 3) N, `force` after points moved by ``change`` (P, 3) m, as normals are now."""
+        force = np.zeros_like(self.normal)
+        _forces(self.near, self.gap, self.normal, change, *self._law, force)
         return force
 
     def springs_after(
         self, change: NDArray[np.float64]
     ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
-        """How that falls with the change: nodes (K,), each with all its springs in a row, the
-        springs' directions (K, 3) and stiffnesses (K,) N/m.
+        """How that falls with the change: points (K,), the springs' directions (K, 3) and
+        stiffnesses (K,) N/m.
         """
-        slope = self.slope_at(self.gap + np.einsum("ij,ij->i", self.normal, change))
-        active = np.flatnonzero(slope > 0.0)
+        slope = np.zeros_like(self.gap)
+        _slopes(self.near, self.gap, self.normal, change, *self._law, slope)
+        active = np.flatnonzero(slope)
         return active, self.normal[active], slope[active]
 
+    def turns(
+        self, positions: NDArray[np.float64], push: NDArray[np.float64]
+    ) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+        """How forces turn as points (P, 3) m, pushed by (P,) N, move along a bent surface: points
+        (K,), and (K, 3, 3) N/m.
+        """
+        bent = push > 0.0
+        bent[self._planar] = False
+        turned = np.flatnonzero(bent)
+        if self._pose is None or len(turned) == 0:
+            return turned[:0], np.zeros((0, 3, 3))
+        return turned, push[turned, None, None] * self.curvature(positions[turned])
+
     def expect(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
-        """Learn which pushes (C,) N are likely at the new pose; returns if forces change by it."""
+        """Learn which pushes (P,) N are likely at the new pose; returns if forces change by it."""
         return False
 
-    @property
-    def reach(self) -> NDArray[np.float64]:
-        """(C,) m, gaps to where the springs end."""
-        return self.gap - self._shift
+    def settle(self) -> float:
+        """Let a frame end; returns by how much what is pushed may still move for it, m."""
+        return 0.0
 
-    def curvature(
-        self, positions: NDArray[np.float64], nodes: NDArray[np.integer]
-    ) -> NDArray[np.float64]:
-        """(K, 3, 3) 1/m, how the surface's normal turns as each of ``nodes`` (K,) moves along it.
-
-        Where the collider is round about a point, a line or a plane, the normal turns in three, two
-        or no directions away from it, and along a curved face as that is bent; a push along a fixed
-        direction does not turn.
+    def work_along(
+        self, start: NDArray[np.float64], change: NDArray[np.float64], length: float
+    ) -> float:
+        """J, of the forces after points moved by ``start + length * change`` (P, 3) m, along the
+        change.
         """
-        if self.forward or self._pose is None:
-            return np.zeros((len(nodes), 3, 3))
-        rotation, box = self._pose.rotation, self._collider.offset_box
-        local = (positions[nodes] - self._pose.position) @ rotation
-        normal = self.normal[nodes] @ rotation
-        if len(box) > 4:
-            axes, round_about, bend = _on_curved_box(box, local, normal)
-        else:
-            local[:, 2] += box[2] + box[3]
-            axes, round_about = np.eye(3)[None], np.abs(local) >= box[:3]
-            bend = np.zeros(len(nodes))
-        axes = rotation @ axes
-        shape = (len(nodes), 3, 3)
-        turn = np.einsum("kij,kj,kmj->kim", np.broadcast_to(axes, shape), round_about, axes)
-        normal = self.normal[nodes]
-        turn -= normal[:, :, None] * normal[:, None, :]
-        along = axes[:, :, 0]
-        return turn / box[3] + bend[:, None, None] * along[:, :, None] * along[:, None, :]
+        return float(_work(self.near, self.gap, self.normal, start, change, length, *self._law))
+
+    def length_along(
+        self,
+        start: NDArray[np.float64],
+        change: NDArray[np.float64],
+        pull: float,
+        curvature: float,
+    ) -> float:
+        """How much of a change, along which the tissue's forces are linear, lowers the energy most.
+
+        It is less than all where points come to be touched, to stick, or turn back.
+
+        Args:
+            start: (P, 3) m, how far the points have moved before.
+            change: (P, 3) m, theirs.
+            pull: J, of the tissue's forces now along the change of all nodes.
+            curvature: J, of its tangent along that.
+        """
+
+        def slope(length: float) -> float:
+            return length * curvature - pull - self.work_along(start, change, length)
+
+        end = slope(1.0)
+        if end <= 0.0 or end <= _OVERSHOOT * abs(slope(0.0)):
+            return 1.0
+        low, high = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if slope(middle) > 0.0 else (middle, high)
+        return (low + high) / 2
 
 
-def _on_curved_box(
-    box: NDArray[np.float64], local: NDArray[np.float64], normal: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
-    """At points (K, 3) m in frame ``probe`` and normals there: axes, as the columns of (K, 3, 3),
-    along the curved front, along y and out of the front; about which of these directions' ends the
-    surface is round (K, 3); and how it is bent along the first (K,) 1/m.
-    """
-    radius, rounding = 1 / box[4], box[3]
-    steepest = np.arcsin(box[0] / radius)
-    above = local[:, 2] + rounding + radius
-    beyond = np.abs(local[:, 0]) > box[0]
-    side = beyond & (above < radius * np.cos(steepest))
-    angle = np.arctan2(local[:, 0], above)
-    end = np.abs(angle) >= steepest
-    angle = np.where(side, 0.0, np.clip(angle, -steepest, steepest))
-    axes = np.zeros((len(local), 3, 3))
-    axes[:, 0, 0] = axes[:, 2, 2] = np.cos(angle)
-    axes[:, 0, 2] = np.sin(angle)
-    axes[:, 2, 0] = -np.sin(angle)
-    axes[:, 1, 1] = 1.0
-    round_about = np.column_stack([end, np.abs(local[:, 1]) >= box[1], ~side])
-    out = np.einsum("ki,ki->k", normal, axes[:, :, 2])
-    return axes, round_about, np.where(end, 0.0, out / (radius + rounding * out))
+@njit(**_LOOP, inline="always")
+def _push_of(depth, stiffness, stiffening):
+    ratio = depth / stiffening
+    return stiffness * depth * (1.0 + ratio * ratio)
+
+
+@njit(**_LOOP)
+def _push(near, gap, stiffness, deepest, stiffening, push):
+    """Fills push (P,) of the points that are near."""
+    for i in near:
+        depth = min(max(-gap[i], 0.0), deepest[i])
+        push[i] = _push_of(depth, stiffness[i], stiffening)
+
+
+@njit(**_LOOP)
+def _forces(near, gap, normal, change, stiffness, deepest, stiffening, force):
+    """Fills force (P, 3) of the points that are near, after a change (P, 3)."""
+    for i in near:
+        n = normal[i]
+        reached = gap[i] + (n[0] * change[i, 0] + n[1] * change[i, 1] + n[2] * change[i, 2])
+        if reached < 0.0:
+            push = _push_of(min(-reached, deepest[i]), stiffness[i], stiffening)
+            for d in range(3):
+                force[i, d] = push * n[d]
+
+
+@njit(**_LOOP)
+def _slopes(near, gap, normal, change, stiffness, deepest, stiffening, slope):
+    """Fills slope (P,) of the points that are near, after a change (P, 3)."""
+    for i in near:
+        n = normal[i]
+        reached = gap[i] + (n[0] * change[i, 0] + n[1] * change[i, 1] + n[2] * change[i, 2])
+        if 0.0 < -reached < deepest[i]:
+            ratio = reached / stiffening
+            slope[i] = stiffness[i] * (1.0 + 3.0 * ratio * ratio)
+
+
+@njit(**_LOOP)
+def _work(near, gap, normal, start, change, length, stiffness, deepest, stiffening):
+    """The work of pushes along a change (P, 3), after a start and a length of it."""
+    total = 0.0
+    for i in near:
+        n, a, b = normal[i], start[i], change[i]
+        along = n[0] * b[0] + n[1] * b[1] + n[2] * b[2]
+        reached = gap[i] + (n[0] * a[0] + n[1] * a[1] + n[2] * a[2]) + length * along
+        if reached < 0.0:
+            total += along * _push_of(min(-reached, deepest[i]), stiffness[i], stiffening)
+    return total

@@ -24,7 +24,6 @@ from us_sim.geometry.pose import Pose
 
 __all__ = [
     "GAP_TOLERANCE",
-    "is_beside",
     "only_forward",
     "push_out",
     "pushing_gap",
@@ -37,13 +36,6 @@ GAP_TOLERANCE = 1e-5
 _GRIP = 0.1
 """Length by which a collider continues behind the face, m, as where a hand holds the probe. Nodes
 cannot slip past it there, and are found in it even after a jump beyond the collider's thickness."""
-
-
-_STEEP = math.radians(60)
-"""Angle between the pushes of a flank and those of the face, of a probe that pushes along +z.
-Square to the flank they would sweep up the nodes that a real rim, round there, glides over."""
-
-_SIN, _COS = math.sin(_STEEP), math.cos(_STEEP)
 
 
 def only_forward(collider: Collider, spacing: float) -> bool:
@@ -62,7 +54,6 @@ def push_out(
     points: NDArray[np.float64],
     spacing: float,
     skirt: NDArray[np.float64] | None = None,
-    flanks: NDArray[np.bool_] | bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap between points and the probe, along the direction in which it pushes them.
 
@@ -79,11 +70,7 @@ def push_out(
         points: (N, 3) m.
         spacing: m, between neighbouring points.
         skirt: (N,) m, how far beside the probe each point still counts as under its rim, for a
-            probe that pushes along +z only, and how much nearer a flank than the front it may be
-            before the flank pushes it; zero by default.
-        flanks: (N,), which points a probe that pushes along +z only may also push aside, where they
-            are nearer to leaving it there, or are beside it. Without, whatever comes in from the
-            side is thrown before the face at once, however deep that is.
+            probe that pushes along +z only; zero by default.
 
     Returns:
         (N,) m, negative inside, infinite where the probe cannot push, and (N, 3) unit directions in
@@ -95,7 +82,6 @@ def push_out(
     _pushing_gaps(
         collider.offset_box,
         only_forward(collider, spacing),
-        np.array(np.broadcast_to(flanks, len(points))),
         pose.rotation,
         np.array(pose.position),
         points,
@@ -104,20 +90,6 @@ def push_out(
         normal,
     )
     return gap, normal
-
-
-def is_beside(
-    collider: Collider, pose: Pose, points: NDArray[np.float64], margin: float
-) -> NDArray[np.bool_]:
-    """(N,) whether points (N, 3) m are behind the front of a probe, and beside its outline or
-    within a margin (m) of it.
-    """
-    box = collider.offset_box
-    local = (points - pose.position) @ pose.rotation
-    inside = box[:2] - np.abs(local[:, :2])
-    side = np.hypot(*np.maximum(-inside, 0.0).T)
-    side = np.where(side > 0.0, side, -inside.min(axis=1))
-    return np.asarray((local[:, 2] + box[3] < 0.0) & (side >= box[3] - margin))
 
 
 def wrench_on_probe(
@@ -207,37 +179,7 @@ def _curved_pushing_gap(box, forward, skirt, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _or_aside(box, skirt, gap, nx, ny, nz, x, y, z):
-    """A forward push, or that of a flank where it moves the point less, by the skirt (m) at least.
-
-    The flank pushes at ``_STEEP`` to the face, as far as it takes the point to leave the outline.
-    """
-    sx = 1.0 if x >= 0 else -1.0
-    sy = 1.0 if y >= 0 else -1.0
-    ox = max(abs(x) - box[0], 0.0)
-    oy = max(abs(y) - box[1], 0.0)
-    beside = math.sqrt(ox * ox + oy * oy)
-    rounding = box[3]
-    if z + rounding + 2 * box[2] + _GRIP <= 0.0:
-        return math.inf, 0.0, 0.0, 1.0  # behind the grip
-    inner, _, _, slope = pushing_gap(box, True, 0.0, x - sx * ox, y - sy * oy, z)
-    ahead = inner + rounding * slope
-    if ahead >= 0.0:  # before the front of the core
-        return gap, nx, ny, nz
-    if beside > 0.0:
-        side, ex, ey = beside, sx * ox / beside, sy * oy / beside
-    elif box[0] - abs(x) < box[1] - abs(y):
-        side, ex, ey = abs(x) - box[0], sx, 0.0
-    else:
-        side, ex, ey = abs(y) - box[1], 0.0, sy
-    out = (side - rounding) / _SIN
-    if gap < math.inf and gap >= out - skirt / _SIN:
-        return gap, nx, ny, nz
-    return out, _SIN * ex, _SIN * ey, _COS
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pushing_gaps(box, forward, flanks, rotation, origin, points, skirt, gap, normal):
+def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
     """Fills gap (N,), normal (N, 3) for points (N, 3) of the probe's parent frame, skirt (N,)."""
     r = rotation
     for i in range(len(points)):
@@ -248,8 +190,6 @@ def _pushing_gaps(box, forward, flanks, rotation, origin, points, skirt, gap, no
         y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
         z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
-        if forward and flanks[i]:
-            g, nx, ny, nz = _or_aside(box, skirt[i], g, nx, ny, nz, x, y, z)
         gap[i] = g
         normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
         normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz

@@ -39,6 +39,7 @@ def contact_stiffness(
     forces: NDArray[np.float64],
     compliance: NDArray[np.float64],
     spacing: float,
+    surface: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """The tangent of a frictionless contact on tissue of known compliance.
 
@@ -49,6 +50,8 @@ def contact_stiffness(
         forces: (K, 3) N, of the probe on the tissue there.
         compliance: (3K, 3K) m/N, between these points.
         spacing: m, between neighbours among the nodes that can be touched.
+        surface: (K, 3) directions of the pushes, and (K, 3, 3) 1/m how they turn as the points
+            move, where the probe does not push as `push_out` says.
 
     Returns:
         (6, 6) N/m, N, N m: how much the wrench on the probe, force and torque about its origin
@@ -61,7 +64,10 @@ def contact_stiffness(
     points = np.asarray(points, dtype=np.float64)
     count = len(points)
     push = np.linalg.norm(forces, axis=1)
-    slope, normal, turn = _surface(collider, pose, points, spacing)
+    if surface is None:
+        slope, normal, turn = _surface(collider, pose, points, spacing)
+    else:
+        slope, normal, turn = surface[0], *surface
     arms = points - pose.position
     # Of the six motions of the probe: where its points go (3K, 6), how normals turn with it.
     carried = np.zeros((count, 3, 6))

@@ -27,6 +27,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 __all__ = [
     "free_stiffness",
     "lame_stiffness",
+    "nodal_shear_stiffness",
     "require_held",
     "shape_gradients",
     "shear_times_area",
@@ -128,4 +129,13 @@ def shear_times_area(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArr
     pulls = (shear * mesh.volumes)[:, None] * np.linalg.norm(shape_gradients(mesh), axis=2)
     total = np.zeros(len(mesh.nodes))
     np.add.at(total, mesh.tetrahedra, pulls)
+    return total
+
+
+def nodal_shear_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
+    """(N,) N/m, how firmly each node resists a displacement of itself alone by shear."""
+    shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
+    resists = (shear * mesh.volumes)[:, None] * (shape_gradients(mesh) ** 2).sum(axis=2)
+    total = np.zeros(len(mesh.nodes))
+    np.add.at(total, mesh.tetrahedra, resists)
     return total

@@ -75,7 +75,6 @@ class FactoredStiffness:
         """Factor the stiffness at a displacement (3, N) m, with springs at ``nodes`` (K,) along
         ``normals`` (K, 3) of ``stiffness`` (K,) N/m; returns whether it is regular to rounding.
         """
-        self.nodes, self.normals, self.springs = nodes, normals, stiffness
         matrix = self._assembled(displacement.astype(np.float64))
         unknown = 3 * self._number[nodes][:, None] + np.arange(3)
         blocks = stiffness[:, None, None] * normals[:, :, None] * normals[:, None, :]

@@ -1,9 +1,9 @@
 """Conjugate gradients for tissue on springs, with a local and a coarse preconditioner.
 
-The matrix is a stiffness that is only known by its products, plus springs along given directions at
-some nodes. The preconditioner adds up the answers of each node by itself, its spring included, and
-of a coarse grid (additive Schwarz; B. Smith, P. Bjorstad and W. Gropp, Domain Decomposition, 1996,
-section 2.1). Fields are (3, N).
+The matrix is a stiffness and springs that are both only known by their products. The preconditioner
+knows springs that are nearly these, each at one node: it adds up the answers of each node by
+itself, its springs included, and of a coarse grid (additive Schwarz; B. Smith, P. Bjorstad and W.
+Gropp, Domain Decomposition, 1996, section 2.1). Fields are (3, N).
 
 >>> import numpy as np
 >>> from us_sim.tissue.linear_algebra.two_level import TwoLevel, conjugate_gradients
@@ -12,8 +12,10 @@ section 2.1). Fields are (3, N).
 >>> two_level.prepare(blocks, np.array([0]), np.array([[0.0, 0, 1]]), np.array([8.0]))
 >>> def double(field, image):
 ...     np.multiply(field, 2.0, out=image)
+>>> def spring(field, image):
+...     image[2, 0] += 8.0 * field[2, 0]
 >>> force = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
->>> solved = conjugate_gradients(double, two_level, force, 5, 1e-9)
+>>> solved = conjugate_gradients(double, two_level, force, 5, 1e-9, spring)
 >>> solved.iterations, solved.solution[:, 0], solved.solution[:, 1]
 (1, array([0., 0., 1.]), array([2., 0., 0.]))
 """
@@ -30,9 +32,19 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 
-__all__ = ["Preconditioner", "Solved", "TwoLevel", "apply_blocks", "conjugate_gradients"]
+__all__ = [
+    "Preconditioner",
+    "Solved",
+    "TwoLevel",
+    "apply_blocks",
+    "conjugate_gradients",
+    "largest_local_eigenvalue",
+]
 
-Product = Callable[[NDArray[np.floating], NDArray[np.floating]], None]
+Product = Callable[[NDArray[np.floating], NDArray[np.floating]], Any]
+
+_POWER = 20
+"""Power iterations towards an eigenvalue."""
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
 
@@ -49,19 +61,16 @@ class Solved:
 
 
 class Preconditioner(Protocol):
-    """An approximate inverse of a stiffness with springs, and these."""
+    """An approximate inverse of a stiffness with springs."""
 
     fixed: NDArray[np.integer]
-    nodes: NDArray[np.integer]  # (K,), where there are springs
-    normals: NDArray[np.floating]  # (K, 3), their directions
-    springs: NDArray[np.floating]  # (K,) N/m
 
     def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         """Overwrite ``out`` with the preconditioner times ``residual``."""
 
 
 class TwoLevel:
-    """The preconditioner, and the springs.
+    """The preconditioner.
 
     Args:
         grid: the coarse level, or None.
@@ -92,19 +101,16 @@ class TwoLevel:
             stiffness: (K,) N/m.
         """
         dtype = blocks.dtype
-        # Of one size always, lest numba compile kernels twice.
-        self.nodes: NDArray[np.integer] = np.asarray(nodes, dtype=np.int64)
-        self.normals = normals.astype(dtype)
-        self.springs = stiffness.astype(dtype)
+        nodes = np.asarray(nodes, dtype=np.int64)  # always, lest numba compile kernels twice
         own = np.empty(len(nodes))
         self._inverse = np.empty_like(blocks)
         _invert_blocks(
             blocks,
             self._weight,
             self.fixed,
-            self.nodes,
-            self.normals,
-            self.springs,
+            nodes,
+            normals.astype(dtype),
+            stiffness.astype(dtype),
             own,
             self._inverse,
         )
@@ -125,6 +131,7 @@ def conjugate_gradients(
     residual: NDArray[np.floating],
     iterations: int,
     tolerance: float,
+    add_springs: Product | None = None,
 ) -> Solved:
     """Solve for a displacement that balances ``residual``, starting from none.
 
@@ -134,20 +141,22 @@ def conjugate_gradients(
         residual: (3, N), zero at fixed nodes; overwritten with what is left.
         iterations: the most products.
         tolerance: norm of the residual at which to end.
+        add_springs: adds the springs' forces for its first argument to the second.
     """
     shape, dtype = residual.shape, residual.dtype
     solution, image, search = np.zeros((3, *shape), dtype)
     elastic, conditioned, whole = np.empty((3, *shape), dtype)
-    fixed, nodes = preconditioner.fixed, np.asarray(preconditioner.nodes, dtype=np.int64)
+    fixed = preconditioner.fixed
     slope = 0.0
     for iteration in range(iterations):
         preconditioner.apply(residual, conditioned)
         before, slope = slope, _dot(residual, conditioned)
         _renew(conditioned, slope / before if iteration else 0.0, search)
         product(search, elastic)
-        _add_springs(
-            elastic, search, nodes, preconditioner.normals, preconditioner.springs, fixed, whole
-        )
+        _copy(elastic, whole)
+        if add_springs is not None:
+            add_springs(search, whole)
+        _clear(whole, fixed)
         curvature = _dot(search, whole)
         if not curvature > 0.0:
             return Solved(solution, image, search, iteration + 1, True)
@@ -155,6 +164,26 @@ def conjugate_gradients(
         if left <= tolerance * tolerance:
             return Solved(solution, image, search, iteration + 1, False)
     return Solved(solution, image, search, iterations, False)
+
+
+def largest_local_eigenvalue(
+    blocks: NDArray[np.floating], product: Product, fixed: NDArray[np.integer]
+) -> float:
+    """The largest of a stiffness without springs, preconditioned by its blocks (6, N) N/m alone."""
+    local = TwoLevel(None, fixed, 1.0)
+    local.prepare(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+    vector = np.random.default_rng(0).standard_normal((3, blocks.shape[1]))
+    image = np.empty_like(vector)
+    largest = 0.0
+    for _ in range(_POWER):
+        vector[:, fixed] = 0.0
+        largest = float(np.linalg.norm(vector))
+        if largest == 0.0:
+            return 1.0
+        product(vector / largest, image)
+        image[:, fixed] = 0.0
+        local.apply(image, vector)
+    return largest
 
 
 def apply_blocks(blocks: NDArray[np.floating], field: NDArray[np.floating]) -> NDArray:
@@ -223,20 +252,19 @@ def _apply_blocks(blocks, field, out):
 
 
 @njit(**_LOOP)
-def _add_springs(elastic, field, nodes, normals, springs, fixed, out):
-    """out = elastic + springs times field, zero at fixed nodes."""
+def _copy(field, out):
     for d in range(3):
-        for i in range(elastic.shape[1]):
-            out[d, i] = elastic[d, i]
-    for k in range(len(nodes)):
-        i = nodes[k]
-        s = field[0, i] * normals[k, 0] + field[1, i] * normals[k, 1] + field[2, i] * normals[k, 2]
-        s *= springs[k]
-        for d in range(3):
-            out[d, i] += s * normals[k, d]
-    for k in range(len(fixed)):
-        for d in range(3):
-            out[d, fixed[k]] = 0
+        a = field[d]
+        b = out[d]
+        for i in range(len(a)):
+            b[i] = a[i]
+
+
+@njit(**_LOOP)
+def _clear(field, nodes):
+    for d in range(3):
+        for k in range(len(nodes)):
+            field[d, nodes[k]] = 0
 
 
 @njit(**_LOOP)

@@ -32,10 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import interpolate
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
-from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out, wrench_on_probe
+from us_sim.tissue.contact.penetration import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
@@ -63,11 +64,18 @@ _RESTING = 30
 """Frames of a probe at rest after which one may take longer than it should, if that is needed."""
 
 _SUNK = 10.0
-"""Depth to which the probe may sink into settled tissue, over the spacing of the nodes that it can
-touch, for a tolerance of 1."""
+"""Change of what springs hold that settled tissue may still see, over the spacing of the nodes that
+the probe can touch, for a tolerance of 1."""
 
-_SINKS = 3e-4
-"""Depth of the probe in the tissue, m, that is worth saying."""
+_SINKS = 0.5
+"""Depth of the probe in the tissue, over that spacing, that is worth saying."""
+
+_STRIDE, _MOST_STRIDES = 3e-3, 8
+"""Way of a probe in tissue that is gone at once, m; and how many of them are gone in a frame, a
+longer one being a leap."""
+
+_LOOSE, _STEPS = 0.2, 5
+"""Residual with which a stride ends, and the most steps that it may take."""
 
 _PATIENCE = 10
 """Frames in a row that may end inside out before the tissue is begun anew from rest."""
@@ -161,6 +169,9 @@ class FemNonlinear(TissueSolver):
         self._surface = model.movable_contact_nodes
         smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
         self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
+        self._sinks = _SINKS * (model.contact_spacing or smallest)
+        box = model.collider.offset_box
+        self._arm = math.hypot(box[0], box[1])
         self._touching = _TOUCHING * smallest
         laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
         branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
@@ -180,19 +191,30 @@ class FemNonlinear(TissueSolver):
         """Approximate: computed with the tissue's compliance at rest. With friction, how much a
         node may be dragged is not known.
         """
-        contact = self._newton.contact
-        pushed = np.flatnonzero(contact.push > 0.0)
+        newton, contact = self._newton, self._newton.contact
+        gap, normal, softness = newton.points.nodal_springs(
+            contact.slope, contact.gap, contact.normal
+        )
+        pushed = np.flatnonzero(np.isfinite(gap[self._surface]))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
         if self.settings.contact != "frictionless":
             return None
+        nodes = self._surface[pushed]
+        places = self.model.mesh.nodes[nodes] + newton.displacement.T[nodes]
+        # The springs of the contact and the tissue give way one after the other.
+        compliance = compliance_between(self._compliance.matrix, pushed) / self._stiffer
+        for k, node in enumerate(nodes):
+            block = slice(3 * k, 3 * k + 3)
+            compliance[block, block] += softness[node] * np.outer(normal[node], normal[node])
         return contact_stiffness(
             self.model.collider,
             self._pose,
-            self._newton.surface[pushed],
-            contact.push[pushed, None] * contact.normal[pushed],
-            compliance_between(self._compliance.matrix, pushed) / self._stiffer,
+            places,
+            newton.pushes[:, nodes].T,
+            compliance,
             self.model.contact_spacing,
+            (normal[nodes], np.zeros((len(nodes), 3, 3))),
         )
 
     @property
@@ -238,15 +260,14 @@ class FemNonlinear(TissueSolver):
         budget = settings.frame_budget or self.frame_limit
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
-        # Where they did not balance, pushes are still those of being hit.
-        shifted = np.inf
-        if self._balanced:
-            shifted = newton.augment() if moved else newton.follow()
-        start = None
+        shifted, start = np.inf, None
         if pose is None:
             newton.lift()
             self._aimed = None
-        elif moved and len(self._surface):
+        elif not moved:
+            shifted = newton.settle() if self._balanced else np.inf
+        elif len(self._surface):
+            self._approach(pose)
             start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
@@ -281,34 +302,58 @@ class FemNonlinear(TissueSolver):
         overstress = self._newton.overstress
         if overstress is not None and np.abs(overstress.relaxed).max() > self._sunk:
             return False
-        rest = self.model.mesh.nodes[self._surface]
-        return pose is None or self._depth(pose, rest) <= GAP_TOLERANCE
+        return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
-    def _depth(self, pose: Pose, points: NDArray[np.float64]) -> float:
-        """How deep (m) the probe is in points (C, 3), at least 0."""
-        if len(points) == 0:
-            return 0.0
-        gap, _ = push_out(self.model.collider, pose, points, self.model.contact_spacing)
-        return max(0.0, -float(gap.min()))
+    def _approach(self, pose: Pose) -> None:
+        """Go most of a long way in strides: tissue that is hit or swept aside at once may end
+        elsewhere than if the probe had moved there.
+        """
+        for nearer in self._strides(pose):
+            start: NDArray[np.float64] | None = self._predicted(nearer)
+            for _ in range(_STEPS):
+                self._newton.step(self._newton.patience, 0.0, start)
+                start = None
+                if self._newton.imbalance <= _LOOSE * self._newton.load:
+                    break
+
+    def _strides(self, pose: Pose) -> list[Pose]:
+        """Poses on the way to one: from the last, or after a leap from before the tissue."""
+        newton, last = self._newton, self._aimed
+        if last is not None and newton.load > 0.0:
+            turned = 2 * math.acos(min(1.0, abs(float(last.orientation @ pose.orientation))))
+            way = math.dist(last.position, pose.position) + self._arm * turned
+            count = math.ceil(way / _STRIDE)
+            if count <= _MOST_STRIDES:
+                return [interpolate(last, pose, k / count) for k in range(1, count)]
+        depth = newton.depth(pose)
+        count = min(math.ceil(depth / _STRIDE), _MOST_STRIDES)
+        backs = [(1 - k / count) * depth for k in range(1, count)]
+        return [Pose(pose.position - x * pose.rotation[:, 2], pose.orientation) for x in backs]
 
     def _predicted(self, pose: Pose) -> NDArray[np.float64]:
         """(3, N) m, aim at a new pose and return the linear answer to it."""
-        newton, contact = self._newton, self._newton.contact
-        held = contact.push[:, None] * contact.normal
+        newton, contact, points = self._newton, self._newton.contact, self._newton.points
+        held, before = newton.pushes[:, self._surface].T.copy(), contact.push
         newton.aim(pose)
         self._aimed = pose
+        # As if each node had the springs of its points to itself.
+        firm = np.where(contact.gap < 0.0, contact.stiffness, 0.0)
+        gap, normal, softness = points.nodal_springs(firm, contact.gap, contact.normal)
         change = predict_forces(
             self._compliance.matrix,
-            contact.reach,
-            contact.normal,
+            gap[self._surface],
+            normal[self._surface],
             held / self._stiffer,
-            contact.softness * self._stiffer,
+            softness[self._surface] * self._stiffer,
             self._touching,
         )
-        newton.expect(np.einsum("ij,ij->i", held + self._stiffer * change, contact.normal))
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
-        return field.astype(np.float64)
+        start = field.astype(np.float64)
+        moved = points.moved(start)
+        pushed = contact.push_at(contact.gap + np.einsum("ij,ij->i", contact.normal, moved))
+        newton.expect(np.where(before > 0.0, before, pushed))
+        return start
 
     def _obstacle(self) -> str:
         """What holds up a tissue that cannot be balanced."""
@@ -335,12 +380,12 @@ class FemNonlinear(TissueSolver):
         reference = self._reference() or newton.imbalance
         residual = newton.imbalance / reference if reference else 0.0
         sunk = -float(contact.gap.min(initial=np.inf))
-        if sunk > _SINKS:
+        if sunk > self._sinks:
             actions.append(f"the probe is {1e3 * sunk:.2g} mm inside the tissue")
         nodes = self.model.mesh.nodes + newton.displacement.T
-        forces = contact.force
+        forces = newton.pushes[:, self.model.contact_nodes].T
         pushed = forces.any(axis=1)
-        touched, forces = self._surface[pushed], forces[pushed]
+        touched, forces = self.model.contact_nodes[pushed], forces[pushed]
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[touched], forces)

@@ -1,6 +1,6 @@
 """Newton's method for the energy of tissue and contact together: every step lowers it.
 
-The energy is that of `neo_hookean` and of `penalty_contact`, and where they are asked for those of
+The energy is that of `neo_hookean` and of `penalty_contact`, where asked for also of
 `penalty_friction` and `overstress`. A step minimises its quadratic model, in which nodes come to
 touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a
 line search takes as much of it as lowers the energy itself. Where the tangent is indefinite or a
@@ -27,9 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penalty_contact import PenaltyContact
-from us_sim.tissue.contact.penalty_friction import PenaltyFriction
-from us_sim.tissue.elasticity.linear_tetrahedra import shear_times_area
+from us_sim.tissue.contact.surface_contact import surface_contact
+from us_sim.tissue.contact.surface_points import add_springs, add_turns
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
@@ -39,6 +38,7 @@ from us_sim.tissue.linear_algebra.two_level import (
     TwoLevel,
     apply_blocks,
     conjugate_gradients,
+    largest_local_eigenvalue,
 )
 from us_sim.tissue.model import TissueModel
 
@@ -49,17 +49,6 @@ _SINGLE_CONTRAST = 1e4
 
 _SINGLE_BULK = 1e3
 """Bulk over shear modulus beyond which rounding in single precision hides the shear's forces."""
-
-_FIRMNESS = 8.0
-"""Stiffness of a contact spring, over the tissue's own at that node: the probe sinks in by a
-thirtieth of what one node alone would give way. More makes the equations worse conditioned."""
-
-_GREATEST_PUSH = 30.0
-"""Greatest contact force of a node, over shear modulus times area there. It is less than what a
-crushed tetrahedron resists, so that a probe cannot turn one inside out."""
-
-_AUGMENTED = 0.3
-"""Fraction of that up to which the probe does not sink in at all."""
 
 _LEAST_PATIENCE = 12
 """Iterations of the first step: solved further, a step after a large change overshoots. Those after
@@ -87,12 +76,9 @@ _ROUNDING = 1e-12
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.01, 0.001, 1e3
 """Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
 
-_LOCAL_WEIGHT = 6.0
+_LOCAL_WEIGHT = 12.0
 """Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
-stiffness at rest; 1 to 6 were tried."""
-
-_POWER = 20
-"""Power iterations towards the largest eigenvalue of the locally preconditioned stiffness."""
+stiffness at rest; 1 to 25 were tried."""
 
 
 class Newton:
@@ -122,8 +108,6 @@ class Newton:
         # Conjugate gradients only correct; what they correct is in double precision.
         self._tangent = NeoHookean(mesh, model.materials, self._dtype)
         self._fixed = np.flatnonzero(model.fixed)
-        self._surface = model.movable_contact_nodes
-        self._surface_rest = mesh.nodes[self._surface]
         self.overstress: Overstress | None = None
         if branch is not None:
             single = NeoHookean(mesh, model.materials, self._dtype)
@@ -133,11 +117,9 @@ class Newton:
         grid = CoarseGrid(mesh, model.fixed, product, self._dtype)
         rest = self.tissue.diagonal_blocks()
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
-        self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / self._largest(rest))
-        own = (rest[0] + rest[3] + rest[5])[self._surface] / 3
-        strongest = _GREATEST_PUSH * shear_times_area(mesh, model.materials)[self._surface]
-        law = (model.collider, model.contact_spacing, _FIRMNESS * own, strongest)
-        self.contact = PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
+        most = largest_local_eigenvalue(rest, self.tissue.tangent_product, self._fixed)
+        self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / most)
+        self.points, self.contact = surface_contact(model, friction)
         shape = (3, len(mesh.nodes))
         self.displacement = np.zeros(shape)  # m
         self._force = np.zeros(shape)  # N, the slope of the tissue's energy
@@ -147,6 +129,8 @@ class Newton:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
         self.contact.clear()
+        self._carried = 0.0  # N, contact forces of that state, until a step is taken from there
+        self._held = self.contact.push  # (P,) N, pushes of the last state that was not just hit
         if self.overstress is not None:
             self.overstress.forget(self.displacement)
         self._damping = 0.0
@@ -155,22 +139,33 @@ class Newton:
         self._weigh()
 
     @property
-    def surface(self) -> NDArray[np.float64]:
-        """(C, 3) m, where the nodes are that the probe can touch."""
-        return self._surface_rest + self.displacement[:, self._surface].T
+    def _surface(self) -> NDArray[np.float64]:
+        """(P, 3) m, where the points near the probe are."""
+        return self.points.rest + self.points.moved(self.displacement, self.contact.near)
+
+    def depth_at_rest(self, pose: Pose) -> float:
+        """How deep (m) a probe would be in the undeformed tissue."""
+        return self.contact.depth(pose, self.points.rest)
+
+    def depth(self, pose: Pose) -> float:
+        """How deep (m) a probe would be in the tissue as it is."""
+        return self.contact.depth(pose, self.points.rest + self.points.moved(self.displacement))
 
     def aim(self, pose: Pose) -> None:
         """Put the probe at a pose, and weigh the forces; nothing moves."""
-        self.contact.aim(pose, self.surface)
-        self._damping = 0.0
+        self._held = self.contact.push
+        self._carried = self.load
+        self.contact.aim(pose, self.points.rest + self.points.moved(self.displacement))
+        self._damping = _DAMPING
         self.patience = _LEAST_PATIENCE
-        self._weigh()
+        self._press()
 
     def lift(self) -> None:
         """Take the probe away, and weigh the forces; nothing moves."""
         self.contact.clear()
+        self._held = self.contact.push
         self._damping = 0.0
-        self._weigh()
+        self._press()
 
     def relax(self) -> None:
         """Let the time from frame to frame pass; nothing moves."""
@@ -178,50 +173,52 @@ class Newton:
             self.overstress.relax(self.displacement)
             self._weigh()
 
-    def augment(self) -> float:
-        """Push the tissue out of the probe further; returns by how much at most, m."""
-        change = self.contact.augment(_AUGMENTED)
-        self._weigh()
-        return change
-
-    def follow(self) -> float:
-        """As `augment`, and fix the planes of contact where the nodes have come to be."""
-        change = self.contact.augment(_AUGMENTED)
-        change = max(change, self.contact.follow(self.surface))
-        self._weigh()
+    def settle(self) -> float:
+        """End a frame with the probe at rest; returns by how much tissue may move for it, m."""
+        change = self.contact.settle()
+        if self.contact.release(self._surface):
+            change = np.inf
+        self._press()
         return change
 
     def expect(self, push: NDArray[np.float64]) -> None:
-        """Learn which pushes (C,) N on the surface are likely at the pose; nothing moves."""
+        """Learn which pushes (P,) N on the surface are likely at the pose; nothing moves."""
         if self.contact.expect(push):
-            self._weigh()
+            self._press()
 
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
         self.displacement = displacement
-        self.contact.look(self.surface)
+        self.contact.look(self._surface)
         self._weigh()
 
     def _weigh(self, energy: float | None = None) -> None:
         """The energy, unless it is known, and its slope at the displacement."""
-        contact = self.contact
         self.tissue.forces(self.displacement, self._force)
         self.energy = self._energy() if energy is None else energy  # J
         if self.overstress is not None:
             self.overstress.add_forces(self.displacement, self._force)
+        self._press(self.energy)
+
+    def _press(self, energy: float | None = None) -> None:
+        """As `_weigh`, where only the contact has changed."""
+        contact = self.contact
+        self.energy = self._inner + contact.energy if energy is None else energy
         self._slope = self._force.copy()
-        force = contact.force
-        self._slope[:, self._surface] -= force.T
+        self.pushes = np.zeros_like(self._slope)  # (3, N) N, contact forces on the nodes
+        self.points.add(contact.force, self.pushes, contact.near)
+        self._slope -= self.pushes
         self._slope[:, self._fixed] = 0.0
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
-        self.load = float(np.linalg.norm(force))  # N, of the contact forces
+        free = ~self._model.fixed
+        self.load = float(np.linalg.norm(self.pushes[:, free]))  # N, of the contact forces
 
     def _energy(self) -> float:
         """J, of tissue and contact at the displacement."""
-        energy = self.tissue.energy(self.displacement) + self.contact.energy
+        self._inner = self.tissue.energy(self.displacement)  # of the tissue alone
         if self.overstress is not None:
-            energy += self.overstress.energy(self.displacement)
-        return energy
+            self._inner += self.overstress.energy(self.displacement)
+        return self._inner + self.contact.energy
 
     def rehearse(self) -> None:
         """Take a step with a factor and with damping, as only some frames do."""
@@ -249,6 +246,9 @@ class Newton:
         """
         change, curved = self._minimise_model(iterations, goal, start)
         length = self._search(change)
+        self._carried = 0.0
+        if length > 0.0:
+            self._held = self.contact.push
         if length < 1.0:
             self.patience = _LEAST_PATIENCE
         elif self.used >= iterations:
@@ -271,7 +271,7 @@ class Newton:
     ) -> tuple[NDArray[np.float64], bool]:
         """The step (3, N) m, and whether the tangent was found to be indefinite."""
         self.used = 0  # iterations
-        contact, nodes, tangent = self.contact, self._surface, self._tangent
+        contact, points, tangent = self.contact, self.points, self._tangent
         tangent.linearise(self.displacement.astype(self._dtype))
         blocks = tangent.diagonal_blocks()
         damped = None
@@ -280,11 +280,9 @@ class Newton:
             blocks += damped
         if (overstress := self.overstress) is not None:
             blocks += self._dtype(overstress.stiffness) * self._rest_blocks
-        pushed = np.flatnonzero(contact.push > 0.0)
-        turn = np.zeros((0, 3, 3))
-        if not contact.forward and len(pushed):
-            turn = contact.push[pushed, None, None] * contact.curvature(self.surface, pushed)
-        turned = nodes[pushed] if len(turn) else nodes[:0]
+        # Just hit, points are pushed far more than they will be.
+        turned, turn = contact.turns(self._surface, np.minimum(contact.push, self._held))
+        bend = points.nodes[turned], points.weights[turned], -turn
 
         def elastic(change: NDArray, image: NDArray) -> None:
             """The tangent without springs, of which there are more or fewer as nodes touch."""
@@ -294,7 +292,7 @@ class Newton:
             if overstress is not None:
                 overstress.add_product(change, image)
             if len(turned):
-                image[:, turned] -= np.einsum("kij,jk->ik", turn, change[:, turned])
+                add_turns(*bend, change, image)
 
         step: NDArray[np.float64] = np.zeros_like(self.displacement)
         image: NDArray[np.float64] = np.zeros_like(step)  # of the step
@@ -305,41 +303,66 @@ class Newton:
             elastic((step / scale).astype(self._dtype), product)
             image = scale * product.astype(np.float64)
             self.used += 1
+            none = np.zeros_like(contact.normal)
+            length = self._best_length(none, step, image, np.zeros_like(image))
+            step *= length
+            image *= length
         enough: float | None = None
         segment = _SEGMENT
         while True:
-            moved = step[:, nodes].T
+            moved = points.moved(step, contact.near)
             left = -self._force - image
-            left[:, nodes] += contact.force_after(moved).T
+            points.add(contact.force_after(moved), left, contact.near)
             left[:, self._fixed] = 0.0
             size = float(np.linalg.norm(left))
             if enough is None:
-                enough = max(_FORCING * max(size, self.imbalance * (start is None)), _AIM * goal)
+                begun = max(size, self.imbalance * (start is None))
+                # Just hit, the forces are far more than they will be.
+                begun = min(begun, self._carried or begun)
+                enough = max(_FORCING * begun, _AIM * goal)
             if size <= enough or self.used >= iterations:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)
-            springs = nodes[active], directions, stiffness
+            springs = points.nodes[active], points.weights[active], directions, stiffness
+
+            def pressed(change: NDArray, image: NDArray, springs: tuple = springs) -> None:
+                """The springs' forces, added."""
+                add_springs(*springs, change, image)
+
             solved = conjugate_gradients(
                 elastic,
-                self._preconditioner(blocks, *springs),
+                self._preconditioner(blocks, *points.lumped(active, directions, stiffness)),
                 (left / size).astype(self._dtype),
                 min(iterations - self.used, segment),
                 enough / size,
+                pressed,
             )
             self.used += solved.iterations
             segment *= 2
             change = size * solved.solution.astype(np.float64)
             bent = size * solved.image.astype(np.float64)
-            if isinstance(contact, PenaltyFriction):
-                pull = -float(np.vdot(change, self._force + image))
-                length = contact.length_along(
-                    moved, change[:, nodes].T, pull, float(np.vdot(change, bent))
-                )
-                change, bent = length * change, length * bent
+            length = self._best_length(moved, change, bent, image)
+            change, bent = length * change, length * bent
             step += change
             image += bent
             if solved.curved:
                 return (step if step.any() else size * solved.direction.astype(np.float64)), True
+
+    def _best_length(
+        self,
+        moved: NDArray[np.float64],
+        change: NDArray[np.float64],
+        bent: NDArray[np.float64],
+        image: NDArray[np.float64],
+    ) -> float:
+        """How much of a change (3, N) m lowers the model's energy most, the points having moved by
+        (P, 3) m; the tangent's products with the change and before it are (3, N) N.
+        """
+        pull = -float(np.vdot(change, self._force + image))
+        curvature = float(np.vdot(change, bent))
+        contact = self.contact
+        along = self.points.moved(change, contact.near)
+        return contact.length_along(moved, along, pull, curvature)
 
     def _preconditioner(
         self,
@@ -366,7 +389,7 @@ class Newton:
         length = 1.0
         for _ in range(_BACKTRACKS):
             self.displacement = start + length * change
-            self.contact.look(self.surface)
+            self.contact.look(self._surface)
             tried = self._energy()
             if tried <= bound:
                 self._weigh(tried)
@@ -375,21 +398,3 @@ class Newton:
             length /= 2
         self.put(start)
         return 0.0
-
-    def _largest(self, blocks: NDArray[np.float64]) -> float:
-        """The largest eigenvalue of the stiffness at rest, preconditioned by its blocks."""
-        two_level = TwoLevel(None, self._fixed, 1.0)
-        none = np.zeros(0)
-        two_level.prepare(blocks, np.zeros(0, np.int64), np.zeros((0, 3)), none)
-        vector = np.random.default_rng(0).standard_normal((3, blocks.shape[1]))
-        image = np.empty_like(vector)
-        largest = 0.0
-        for _ in range(_POWER):
-            vector[:, self._fixed] = 0.0
-            largest = float(np.linalg.norm(vector))
-            if largest == 0.0:
-                return 1.0
-            self.tissue.tangent_product(vector / largest, image)
-            image[:, self._fixed] = 0.0
-            two_level.apply(image, vector)
-        return largest

@@ -1,0 +1,255 @@
+"""The points of a surface: what they share with its nodes, and what the two agree on."""
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skfem import ElementTriP1, InteriorBasis, LinearForm, MeshTri
+from tissue_block import block
+
+from us_sim.tissue.contact.surface_contact import surface_contact
+from us_sim.tissue.contact.surface_points import (
+    SurfacePoints,
+    add_springs,
+    add_turns,
+    point_size,
+)
+from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import TissueModel
+
+MODEL = block((5, 4, 3))
+COUNT = len(MODEL.mesh.nodes)
+SIZES = st.sampled_from([0.01, 0.02, 0.05, 1.0])  # m, of a mesh whose sides are 33 to 60 mm
+seeds = st.integers(0, 2**32 - 1)
+EXAMPLES = settings(deadline=None, max_examples=30)
+
+
+@functools.cache
+def points_of(size):
+    return SurfacePoints(MODEL, size)
+
+
+def top_triangles(model):
+    mesh = model.mesh
+    return mesh.boundary[np.isin(mesh.boundary, model.contact_nodes).all(axis=1)]
+
+
+def with_contact_nodes(nodes):
+    nodes = np.asarray(nodes, dtype=int)
+    return TissueModel(MODEL.mesh, MODEL.materials, MODEL.fixed, MODEL.collider, nodes)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.02, 0.05, 1.0])
+def test_points_stand_for_equal_parts_no_longer_than_the_size(size):
+    points, corners = points_of(size), MODEL.mesh.nodes[top_triangles(MODEL)]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.ceil(longest / size - 1e-9)
+    assert (longest / parts <= size * (1 + 1e-9)).all() or size == 1.0
+    assert len(points.rest) == (parts**2).sum() + 20  # and one at each node
+    np.testing.assert_allclose(points.weights.sum(axis=1), 1.0)
+    assert points.weights.min() >= 0.0
+    # The top of the block is 0.2 by 0.1 m, where z is 0.
+    assert points.at_nodes(points.spread(np.ones(COUNT))).sum() == pytest.approx(5 * 4)
+    np.testing.assert_array_equal(points.rest[:, 2], 0.0)
+
+
+def test_the_middles_of_a_divided_triangle_are_known():
+    # Two parts a side: three upright ones at its corners, one the other way up.
+    points = points_of(0.05)
+    assert len(points.rest) == 4 * len(top_triangles(MODEL)) + 20
+    found = np.sort(points.weights[points.weights.max(axis=1) < 1.0].round(12) * 6, axis=1)
+    first = {tuple(row) for row in found.reshape(-1, 3).round(6)}
+    assert first == {(1.0, 1.0, 4.0), (2.0, 2.0, 2.0)}
+
+
+@EXAMPLES
+@given(SIZES, seeds)
+def test_what_is_spread_has_the_same_sum(size, seed):
+    values = np.random.default_rng(seed).normal(size=COUNT)
+    spread = points_of(size).spread(values)
+    assert spread.sum() == pytest.approx(values[MODEL.contact_nodes].sum(), abs=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.05, 1.0])
+def test_a_uniform_pressure_gives_the_nodal_forces_of_linear_shape_functions(size):
+    points, triangles = points_of(size), top_triangles(MODEL)
+    nodes, local = np.unique(triangles, return_inverse=True)
+    mesh = MeshTri(MODEL.mesh.nodes[nodes, :2].T, local.reshape(-1, 3).T)
+    load = LinearForm(lambda v, _: 1.0 * v)
+    exact = np.zeros(COUNT)
+    exact[nodes] = load.assemble(InteriorBasis(mesh, ElementTriP1()))
+    triangle = MODEL.mesh.nodes[points.nodes]
+    normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    whole = 0.5 * np.linalg.norm(normal, axis=1)
+    _, which, count = np.unique(points.nodes, axis=0, return_inverse=True, return_counts=True)
+    pressure = whole / count[which.ravel()]  # of 1 Pa, on equal parts
+    np.testing.assert_allclose(points.at_nodes(pressure), exact, atol=1e-15)
+
+
+@EXAMPLES
+@given(SIZES, seeds)
+def test_force_and_torque_of_the_points_are_those_of_the_nodes(size, seed):
+    points, rng = points_of(size), np.random.default_rng(seed)
+    displacement, force = rng.normal(size=(3, COUNT)), rng.normal(size=points.rest.shape)
+    places = points.rest + points.moved(displacement)
+    nodes, pushes = MODEL.mesh.nodes + displacement.T, np.zeros((3, COUNT))
+    points.add(force, pushes, np.arange(len(force)))
+    np.testing.assert_allclose(pushes.sum(axis=1), force.sum(axis=0), atol=1e-9)
+    torque = np.cross(nodes, pushes.T).sum(axis=0)
+    np.testing.assert_allclose(torque, np.cross(places, force).sum(axis=0), atol=1e-9)
+    np.testing.assert_allclose(points.at_nodes(force), pushes.T, atol=1e-12)
+
+
+@EXAMPLES
+@given(SIZES, seeds)
+def test_moving_and_adding_are_adjoint_for_some_points_too(size, seed):
+    points, rng = points_of(size), np.random.default_rng(seed)
+    some = np.flatnonzero(rng.random(len(points.rest)) < 0.5)
+    field, vectors = rng.normal(size=(3, COUNT)), rng.normal(size=points.rest.shape)
+    moved, image = points.moved(field, some), np.zeros((3, COUNT))
+    points.add(vectors, image, some)
+    assert (moved * vectors).sum() == pytest.approx((field * image).sum())
+    assert not np.delete(moved, some, axis=0).any()
+
+
+@EXAMPLES
+@given(seeds)
+def test_springs_and_turns_are_dense_matrices_of_the_points(seed):
+    points, rng = points_of(0.05), np.random.default_rng(seed)
+    active = rng.choice(len(points.rest), 20, replace=False)
+    directions = rng.normal(size=(20, 3))
+    stiffness, turn = rng.uniform(0.0, 1e4, 20), rng.normal(size=(20, 3, 3))
+    field = rng.normal(size=(3, COUNT))
+    moved = points.moved(field)[active]
+    own = points.nodes[active], points.weights[active]
+    for tensors, add, given_ in [
+        (np.einsum("k,ki,kj->kij", stiffness, directions, directions), add_springs, directions),
+        (turn, add_turns, turn),
+    ]:
+        forces = np.zeros_like(points.rest)
+        forces[active] = np.einsum("kij,kj->ki", tensors, moved)
+        expected, image = np.ones((3, COUNT)), np.ones((3, COUNT))
+        points.add(forces, expected, active)
+        add(*own, given_, *([stiffness] if add is add_springs else []), field, image)
+        np.testing.assert_allclose(image, expected, atol=1e-9 * abs(expected).max())
+
+
+@EXAMPLES
+@given(seeds)
+def test_one_spring_is_lumped_with_half_of_its_weights(seed):
+    points, rng = points_of(0.05), np.random.default_rng(seed)
+    inside = np.flatnonzero(points.weights.max(axis=1) < 1.0)
+    point, normal = rng.choice(inside, size=1), rng.normal(size=(1, 3))
+    normal /= np.linalg.norm(normal)
+    nodes, directions, firm = points.lumped(point, normal, np.array([600.0]))
+    order = np.argsort(points.nodes[point[0]])
+    np.testing.assert_array_equal(nodes, points.nodes[point[0]][order])
+    np.testing.assert_allclose(firm, 300.0 * points.weights[point[0]][order])
+    np.testing.assert_allclose(np.abs(directions @ normal[0]), 1.0)
+
+
+@EXAMPLES
+@given(seeds)
+def test_lumped_springs_are_a_little_less_than_the_tensors_of_the_nodes(seed):
+    points, rng = points_of(0.05), np.random.default_rng(seed)
+    active = rng.choice(len(points.rest), 20, replace=False)
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    stiffness = rng.uniform(1.0, 1e4, 20)
+    tensors, lumped = np.zeros((2, COUNT, 3, 3))
+    for p, n, k in zip(active, directions, stiffness, strict=True):
+        for node, weight in zip(points.nodes[p], points.weights[p], strict=True):
+            tensors[node] += 0.5 * k * weight * np.outer(n, n)
+    nodes, along, firm = points.lumped(active, directions, stiffness)
+    for node, n, k in zip(nodes, along, firm, strict=True):
+        lumped[node] += k * np.outer(n, n)
+    assert (np.diff(np.flatnonzero(np.diff(nodes, prepend=-1))) <= 3).all()  # of a node in a row
+    for node in range(COUNT):
+        left = np.linalg.eigvalsh(tensors[node] - lumped[node])
+        size = np.trace(tensors[node])
+        assert left.min() >= -1e-9 * size
+        assert left.sum() <= 0.4 * size + 1e-12  # two that are weaker than a fifth of all
+
+
+def test_a_node_that_is_no_triangles_is_a_point_by_itself():
+    lone = MODEL.contact_nodes[7]
+    points = SurfacePoints(with_contact_nodes([lone]), 0.01)
+    np.testing.assert_array_equal(points.rest, MODEL.mesh.nodes[[lone]])
+    values = np.arange(COUNT, dtype=float)
+    np.testing.assert_allclose(points.spread(values), [lone])
+    np.testing.assert_allclose(points.at_nodes(np.array([2.0]))[lone], 2.0)
+    gap, normal, softness = points.nodal_springs(
+        np.array([50.0]), np.array([-0.001]), np.array([[0.0, 0.6, 0.8]])
+    )
+    assert gap[lone] == pytest.approx(-0.001)
+    assert softness[lone] == pytest.approx(1 / 50)
+    np.testing.assert_allclose(normal[lone], [0.0, 0.6, 0.8])
+    assert np.isinf(np.delete(gap, lone)).all()
+
+
+def test_the_springs_of_nodes_are_the_weighted_means_of_their_points():
+    points = points_of(1.0)
+    rng = np.random.default_rng(0)
+    stiffness, gap = rng.uniform(1.0, 9.0, (2, len(points.rest)))
+    stiffness[::3] = 0.0
+    normal = np.broadcast_to([0.0, 0.6, 0.8], points.rest.shape)
+    gaps, normals, softness = points.nodal_springs(stiffness, gap, normal)
+    firm = points.at_nodes(stiffness)
+    some = firm > 0.0
+    np.testing.assert_allclose(1 / softness[some], firm[some])
+    np.testing.assert_allclose(gaps[some], points.at_nodes(stiffness * gap)[some] / firm[some])
+    np.testing.assert_allclose(normals[some], np.broadcast_to([0, 0.6, 0.8], (some.sum(), 3)))
+    assert np.isinf(gaps[~some]).all()
+
+
+def test_triangles_that_cannot_move_at_all_have_no_points():
+    everything = np.unique(MODEL.mesh.boundary)
+    some = SurfacePoints(with_contact_nodes(everything), 1.0)
+    model = with_contact_nodes(everything)
+    bottom = model.fixed[model.mesh.boundary].all(axis=1)
+    assert bottom.any()
+    inside = some.weights.max(axis=1) < 1.0
+    assert inside.sum() == (~bottom).sum()
+    assert not model.fixed[some.nodes].all(axis=1).any()
+    # Nor have fixed nodes by themselves.
+    assert len(SurfacePoints(with_contact_nodes(np.flatnonzero(model.fixed)), 1.0).rest) == 0
+
+
+def test_where_nothing_can_be_touched_there_are_no_points():
+    points = SurfacePoints(with_contact_nodes([]), 1.0)
+    assert points.moved(np.ones((3, COUNT))).shape == (0, 3)
+    assert not points.at_nodes(np.zeros(0)).any()
+
+
+def test_parts_are_as_large_as_the_rounding_between_the_spacing_and_a_quarter_of_it():
+    assert point_size(0.004, 0.01) == pytest.approx(0.004)
+    assert point_size(0.05, 0.01) == pytest.approx(0.01)
+    assert point_size(1e-5, 0.01) == pytest.approx(0.0025)
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0])
+def test_a_triangle_of_any_shape_keeps_its_area_and_its_middle(size):
+    nodes = np.array([[0.0, 0, 0], [0.07, 0.01, 0.0], [0.02, 0.05, -0.01], [0.02, 0.02, 0.06]])
+    mesh = TetrahedralMesh(nodes, np.array([[0, 1, 2, 3]]))
+    model = block((2, 2, 2))
+    materials = type(model.materials)(*(value[:1] for value in vars(model.materials).values()))
+    fixed = np.array([False, False, False, True])
+    touched = TissueModel(mesh, materials, fixed, model.collider, np.arange(3))
+    points = SurfacePoints(touched, size)
+    share = points.spread(np.ones(4))
+    assert share.sum() == pytest.approx(3.0)
+    at_nodes = points.weights.max(axis=1) == 1.0
+    assert share[at_nodes].sum() == pytest.approx(0.25 * 3.0)
+    for those in (at_nodes, ~at_nodes):
+        np.testing.assert_allclose(share[those], share[those][0])
+    np.testing.assert_allclose(points.rest.mean(axis=0), nodes[:3].mean(axis=0), atol=1e-15)
+
+
+def test_the_springs_of_a_contact_are_as_firm_as_the_tissues_shear():
+    points, contact = surface_contact(MODEL)
+    own = nodal_shear_stiffness(MODEL.mesh, MODEL.materials)
+    assert contact.stiffness.sum() == pytest.approx(30 * own[MODEL.contact_nodes].sum())
+    assert len(contact.gap) == len(points.rest)

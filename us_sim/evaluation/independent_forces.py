@@ -1,0 +1,228 @@
+"""The forces that hold tissue where it is, by the equations of each method, written a second time.
+
+Everything here is NumPy in double precision, for meshes of some hundred nodes; it shares no kernel
+with a solver.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.independent_forces import hooke_forces
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.model import TissueModel
+>>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
+>>> pulled = block.mesh.nodes * [0.0, 0.0, 0.01]  # one percent of strain along z
+>>> forces = hooke_forces(block.mesh, block.materials, pulled)
+>>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
+'1.200 N'
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.evaluation.crushed_pressure import (
+    LUMEN_SHEAR,
+    crowding,
+    emptied_fraction,
+    lumen_pressure,
+    wall_modulus,
+)
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = [
+    "averaged_hooke_forces",
+    "hooke_forces",
+    "neo_hookean_forces",
+    "rounding_of_forces",
+    "spring_forces",
+    "volume_forces",
+]
+
+Array = NDArray[np.float64]
+
+_ELEMENT_BULK = 5.0
+"""(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
+
+_YIELD = 1.5
+"""Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
+
+
+def hooke_forces(mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array) -> Array:
+    """(N, 3) N that hold linear tetrahedra of Hooke's material at displacements (N, 3) m."""
+    shear, whole, volume, gradient = _elements(mesh, materials)
+    slope = _slopes(mesh, gradient, displacement)
+    stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
+    return _gathered(mesh, volume, gradient, stress, (whole - shear) * _trace(slope))
+
+
+def averaged_hooke_forces(
+    mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
+) -> Array:
+    """As `hooke_forces`, with the greater part of a high bulk stiffness averaged around nodes.
+
+    (J. Bonet and A. J. Burton, A simple average nodal pressure tetrahedral element for
+    incompressible and nearly incompressible dynamic explicit applications, Commun. Numer. Meth.
+    Engng. 14, 1998.)
+    """
+    shear, whole, volume, gradient = _elements(mesh, materials)
+    slope = _slopes(mesh, gradient, displacement)
+    own, nodal = _bulk_parts(shear, whole)
+    pressure = own * _trace(slope) + nodal * _around(mesh, nodal * volume / 4, _trace(slope))
+    stress = shear[:, None, None] * (slope + slope.transpose(0, 2, 1))
+    return _gathered(mesh, volume, gradient, stress, pressure - shear * _trace(slope))
+
+
+def neo_hookean_forces(
+    mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array
+) -> Array:
+    """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N.
+
+    (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
+    2018, without its logarithmic barrier.)
+    """
+    shear, whole, volume, gradient = _elements(mesh, materials)
+    slope = _slopes(mesh, gradient, displacement)
+    swelling = _swelling(slope)
+    own, nodal = _bulk_parts(shear, whole)
+    hollow = materials.lumen_fraction > 0.0
+    empties = emptied_fraction(materials)
+    shear = shear * (1 - empties + LUMEN_SHEAR * empties)
+    nodal = np.where(hollow, 0.0, nodal)
+    pressure = own * swelling + nodal * _around(mesh, nodal * volume / 4, swelling)
+    wall = wall_modulus(mesh, shear)
+    pressure += wall * crowding(1 + swelling)
+    pressure[hollow] = lumen_pressure(
+        *(part[hollow] for part in (swelling, empties, materials.lumen_pressure, own, wall))
+    )
+    cofactor = _cofactors(slope + np.eye(3))
+    # mu F - mu cof F, again without cancelling: cof F - F = tr(H) I - H' - H + cof H.
+    difference = (
+        _trace(slope)[:, None, None] * np.eye(3)
+        - slope.transpose(0, 2, 1)
+        - slope
+        + _cofactors(slope)
+    )
+    stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
+    return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
+
+
+def spring_forces(
+    edges: NDArray[np.int32], stiffness: Array, rest: Array, displacement: Array
+) -> Array:
+    """(N, 3) N that hold springs of (E,) N/m along edges (E, 2), undeformed at ``rest`` (N, 3)."""
+    before = rest[edges[:, 1]] - rest[edges[:, 0]]
+    moved = displacement[edges[:, 1]] - displacement[edges[:, 0]]
+    now = before + moved
+    length, rest_length = np.linalg.norm(now, axis=1), np.linalg.norm(before, axis=1)
+    # The difference of the squares does not cancel.
+    longer = np.einsum("ij,ij->i", moved, now + before) / np.maximum(length + rest_length, 1e-300)
+    pull = stiffness * longer / np.maximum(length, 1e-300)
+    force = np.zeros_like(rest)
+    np.add.at(force, edges[:, 1], pull[:, None] * now)
+    np.add.at(force, edges[:, 0], -pull[:, None] * now)
+    return force
+
+
+def volume_forces(
+    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array, yielding: bool = False
+) -> Array:
+    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
+
+    ``yielding`` ones whose faces, squared and added, have grown to 1.5 times what they were keep
+    their strain and their stress in proportion to the square root of what is beyond.
+    """
+    gradient = _gradients(mesh)
+    slope = _slopes(mesh, gradient, displacement)
+    swelling = _swelling(slope)
+    cofactor = _cofactors(slope + np.eye(3))
+    left = np.ones(len(swelling))
+    if yielding:
+        faces = np.einsum("mij,maj->mai", cofactor, gradient)
+        grown = (faces**2).sum(axis=(1, 2)) / (gradient**2).sum(axis=(1, 2))
+        left = np.sqrt(np.minimum(_YIELD / np.maximum(grown, _YIELD), 1.0))
+    around = _around(mesh, nodal * mesh.volumes / 4, left * swelling)
+    pressure = left * (element * left * swelling + nodal * around)
+    stress = pressure[:, None, None] * cofactor
+    return _gathered(mesh, mesh.volumes, gradient, stress, np.zeros(len(pressure)))
+
+
+def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
+    """N, about the norm of the forces that arise when coordinates are rounded to doubles.
+
+    ``modulus`` is (M,) Pa, the stiffest of each tetrahedron.
+    """
+    steep = np.linalg.norm(_gradients(mesh), axis=2)
+    digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
+    each = modulus * mesh.volumes * steep.sum(axis=1) * digit
+    nodal = np.zeros(len(mesh.nodes))
+    np.add.at(nodal, mesh.tetrahedra, each[:, None] * steep)
+    return float(np.linalg.norm(nodal))
+
+
+def _elements(
+    mesh: TetrahedralMesh, materials: TissueMaterials
+) -> tuple[Array, Array, Array, Array]:
+    """mu and lambda + mu (M,) Pa, volumes (M,) m3 and shape gradients (M, 4, 3) 1/m."""
+    ratio = materials.poisson_ratio
+    shear = materials.young_modulus / (2 + 2 * ratio)
+    first = materials.young_modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
+    return shear, first + shear, mesh.volumes, _gradients(mesh)
+
+
+def _bulk_parts(shear: Array, whole: Array) -> tuple[Array, Array]:
+    own = np.minimum(whole, _ELEMENT_BULK * shear)
+    return own, whole - own
+
+
+def _gradients(mesh: TetrahedralMesh) -> Array:
+    """(M, 4, 3) 1/m: each shape function falls from its corner to the face opposite."""
+    corners = mesh.nodes[mesh.tetrahedra]
+    gradient = np.empty_like(corners)
+    for corner, (a, b, c) in enumerate(((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))):
+        face = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
+        height = np.einsum("ij,ij->i", corners[:, corner] - corners[:, a], face)
+        gradient[:, corner] = face / height[:, None]
+    return gradient
+
+
+def _slopes(mesh: TetrahedralMesh, gradient: Array, displacement: Array) -> Array:
+    """(M, 3, 3) gradient of the displacement, component by direction.
+
+    Relative to one corner, so that a displacement of a whole tetrahedron cancels exactly.
+    """
+    moved = displacement[mesh.tetrahedra]
+    return np.einsum("mai,maj->mij", moved - moved[:, :1], gradient)
+
+
+def _gathered(
+    mesh: TetrahedralMesh, volume: Array, gradient: Array, stress: Array, pressure: Array
+) -> Array:
+    whole = stress + pressure[:, None, None] * np.eye(3)
+    force = np.zeros((len(mesh.nodes), 3))
+    corners = np.einsum("m,mij,maj->mai", volume, whole, gradient)
+    np.add.at(force, mesh.tetrahedra, corners)
+    return force
+
+
+def _around(mesh: TetrahedralMesh, weight: Array, value: Array) -> Array:
+    """(M,) mean over a tetrahedron's nodes of the weighted means around each node."""
+    total, sum_of = np.zeros(len(mesh.nodes)), np.zeros(len(mesh.nodes))
+    np.add.at(total, mesh.tetrahedra, weight[:, None])
+    np.add.at(sum_of, mesh.tetrahedra, (weight * value)[:, None])
+    mean = np.divide(sum_of, total, out=np.zeros_like(total), where=total > 0)
+    return np.asarray(mean[mesh.tetrahedra].mean(axis=1))
+
+
+def _swelling(slope: Array) -> Array:
+    """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
+    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
+    return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
+
+
+def _trace(matrices: Array) -> Array:
+    return np.asarray(np.trace(matrices, axis1=1, axis2=2))
+
+
+def _cofactors(matrices: Array) -> Array:
+    a, b, c = np.moveaxis(matrices, 1, 0)
+    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)

@@ -1,0 +1,302 @@
+"""Points spread over the surface that a probe can touch, and what they share with its nodes.
+
+Contact belongs to the surface, not to its nodes: between them too the probe must not sink in. So
+triangles are divided until their parts are small enough for an edge of the probe to be felt, and
+each part has a point in its middle that stands for its area and moves with the triangle's nodes (as
+quadrature points do; P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section 9). A node
+that the probe can touch, but no triangle's, is a point by itself.
+
+>>> import numpy as np
+>>> from us_sim.tissue.contact.surface_points import SurfacePoints
+>>> from us_sim.tissue.model import TissueModel
+>>> model = TissueModel.block((0.1, 0.1, 0.1), (2, 2, 2))
+>>> points = SurfacePoints(model, size=0.08)
+>>> len(points.rest), float(points.spread(np.ones(8)).sum())  # of the top's four nodes
+(12, 4.0)
+>>> sunk = np.zeros((3, 8))
+>>> sunk[2] = 0.01
+>>> points.moved(sunk)[0]
+array([0.  , 0.  , 0.01])
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from us_sim.tissue.model import TissueModel
+
+__all__ = ["SurfacePoints", "add_springs", "add_turns", "point_size"]
+
+_LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
+
+_FELT, _FINEST = 1.0, 0.25
+"""Size of a part over the probe's rounding, and at least over the spacing of the nodes."""
+
+_SHARE = 0.5
+"""Part of a point's spring that each of its nodes gets by weight, where they do not share it: a
+preconditioner with 1 is too stiff, with 1/3 too soft."""
+
+_AT_NODES = 0.25
+"""Part of a triangle's area that points at its nodes stand for. Points inside find a flat surface
+deeper in a round probe than a bent one would be, points at nodes find it as high as that can be; in
+this proportion to one in the middle, what changes with the square of the place is summed exactly
+(A. H. Stroud, Approximate Calculation of Multiple Integrals, 1971)."""
+
+_WEAK = 0.2
+"""A spring at a node that is weaker than this part of all there is left out."""
+
+
+def point_size(rounding: float, spacing: float) -> float:
+    """m, the longest side of a triangle's parts, for a probe of some rounding (m) and nodes that
+    are ``spacing`` (m) apart.
+    """
+    return min(max(_FELT * rounding, _FINEST * spacing), spacing)
+
+
+class SurfacePoints:
+    """P points on the surface of a tissue.
+
+    Args:
+        model: the points are on the triangles of its boundary all of whose nodes the probe can
+            touch, not all of them fixed.
+        size: m, longest side of a triangle's parts.
+    """
+
+    def __init__(self, model: TissueModel, size: float) -> None:
+        mesh = model.mesh
+        reached = np.zeros(len(mesh.nodes), dtype=bool)
+        reached[model.contact_nodes] = True
+        triangles = mesh.boundary[reached[mesh.boundary].all(axis=1)]
+        triangles = triangles[~model.fixed[triangles].all(axis=1)]
+        corners = mesh.nodes[triangles]
+        sides = corners - np.roll(corners, 1, axis=1)
+        longest = np.linalg.norm(sides, axis=2).max(axis=1)
+        area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        corner_area = np.zeros(len(mesh.nodes))
+        np.add.at(corner_area, triangles, area[:, None] / 3)
+        corner_area[reached & ~model.fixed & (corner_area == 0.0)] = 1.0  # of nodes by themselves
+        own = np.flatnonzero((corner_area > 0.0) & ~model.fixed)
+        nodes, weights = [np.repeat(own[:, None], 3, axis=1)], [np.eye(3)[np.zeros(len(own), int)]]
+        areas = [np.where(np.isin(own, triangles), _AT_NODES, 1.0) * corner_area[own]]
+        area = (1 - _AT_NODES) * area
+        parts = np.maximum(np.ceil(longest / size - 1e-9), 1).astype(int)
+        for count in np.unique(parts):
+            those, middles = np.flatnonzero(parts == count), _middles(count)
+            nodes.append(np.repeat(triangles[those], len(middles), axis=0))
+            weights.append(np.tile(middles, (len(those), 1)))
+            areas.append(np.repeat(area[those] / len(middles), len(middles)))
+        self.nodes = np.concatenate(nodes).astype(np.int64)  # (P, 3)
+        self.weights = np.concatenate(weights)  # (P, 3) of these nodes; they sum to one
+        self.rest = np.einsum("pk,pkd->pd", self.weights, mesh.nodes[self.nodes])  # (P, 3) m
+        self._area = np.concatenate(areas)
+        self._count, self._fixed = len(mesh.nodes), model.fixed
+        self._all = np.arange(len(self.nodes))
+        total = self.at_nodes(self._area)
+        self._per_area = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
+
+    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,), values of nodes (N,) handed to their points by area; the sum is the same."""
+        density = (self.weights * (values * self._per_area)[self.nodes]).sum(axis=1)
+        return np.asarray(self._area * density)
+
+    def at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, ...), values of points (P, ...) handed to their nodes by weight."""
+        total = np.zeros((self._count, *values.shape[1:]))
+        for k in range(3):
+            weight = self.weights[:, k].reshape(-1, *[1] * (values.ndim - 1))
+            np.add.at(total, self.nodes[:, k], weight * values)
+        return total
+
+    def nodal_springs(
+        self,
+        stiffness: NDArray[np.float64],
+        gap: NDArray[np.float64],
+        normal: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """One spring at each node, in place of those of its points.
+
+        Args:
+            stiffness: (P,) N/m; zero where there is none.
+            gap, normal: (P,) m and (P, 3) of the points.
+
+        Returns:
+            (N,) m, gaps, infinite where there is no spring; (N, 3), their directions; and (N,)
+            m/N, how soft they are.
+        """
+        some = np.flatnonzero(stiffness > 0.0)
+        weight = self.weights[some] * stiffness[some, None]
+        total = np.zeros((self._count, 5))
+        given = np.column_stack([np.ones(len(some)), gap[some], normal[some]])
+        for k in range(3):
+            np.add.at(total, self.nodes[some, k], weight[:, k, None] * given)
+        sprung = np.flatnonzero(total[:, 0] > 0.0)
+        firm, across = total[sprung, :1], total[sprung, 2:]
+        gaps, normals = np.full(self._count, np.inf), np.zeros((self._count, 3))
+        gaps[sprung] = total[sprung, 1] / firm[:, 0]
+        normals[sprung] = (
+            across / np.maximum(np.linalg.norm(across, axis=1), 1e-9 * firm[:, 0])[:, None]
+        )
+        softness = np.ones(self._count)
+        softness[sprung] = 1.0 / firm[:, 0]
+        return gaps, normals, softness
+
+    def moved(
+        self, field: NDArray[np.float64], some: NDArray[np.integer] | None = None
+    ) -> NDArray[np.float64]:
+        """(P, 3), a field (3, N) at the points; zero where it is not asked for."""
+        values = np.zeros((len(self.nodes), 3))
+        some = self._all if some is None else some
+        _gather(some, self.nodes, self.weights, field, values)
+        return values
+
+    def add(
+        self, vectors: NDArray[np.float64], field: NDArray[np.float64], some: NDArray[np.integer]
+    ) -> None:
+        """Add vectors (P, 3) of some points to the nodes' field (3, N), by weight."""
+        _scatter(some, self.nodes, self.weights, vectors, field)
+
+    def lumped(
+        self,
+        active: NDArray[np.integer],
+        directions: NDArray[np.float64],
+        stiffness: NDArray[np.float64],
+    ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
+        """Springs of points, each divided among its nodes as if these did not share it.
+
+        They are about as stiff as the springs of the points together; that is for preconditioners.
+
+        Args:
+            active: (K,) points.
+            directions: (K, 3), of their springs.
+            stiffness: (K,) N/m.
+
+        Returns:
+            (S,) nodes that are not fixed, each with all its springs in a row; (S, 3) directions;
+            (S,) N/m.
+        """
+        tensor = np.zeros((self._count, 6))
+        _lump(active, self.nodes, self.weights, directions, stiffness, tensor)
+        tensor[self._fixed] = 0.0
+        used = np.flatnonzero(tensor[:, 0] + tensor[:, 3] + tensor[:, 5])
+        nodes = np.empty(3 * len(used), dtype=np.int64)
+        along, firm = np.empty((3 * len(used), 3)), np.empty(3 * len(used))
+        count = _split(used, tensor, nodes, along, firm)
+        return nodes[:count], along[:count], firm[:count]
+
+
+def _middles(count: int) -> NDArray[np.float64]:
+    """(count^2, 3) barycentric coordinates of the middles of a triangle's equal parts."""
+    row, column = np.divmod(np.arange(count * count), count)
+    lower = row + column < count
+    first = np.column_stack([row, column])[lower] + 1 / 3
+    second = np.column_stack([row, column])[row + column < count - 1] + 2 / 3
+    two = np.concatenate([first, second]) / count
+    return np.column_stack([1 - two.sum(axis=1), two])
+
+
+@njit(**_LOOP)
+def _gather(some, nodes, weights, field, values):
+    x, y, z = field[0], field[1], field[2]
+    for p in some:
+        i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
+        a, b, c = weights[p, 0], weights[p, 1], weights[p, 2]
+        values[p, 0] = a * x[i] + b * x[j] + c * x[k]
+        values[p, 1] = a * y[i] + b * y[j] + c * y[k]
+        values[p, 2] = a * z[i] + b * z[j] + c * z[k]
+
+
+@njit(**_LOOP)
+def _scatter(some, nodes, weights, vectors, field):
+    for p in some:
+        for k in range(3):
+            for d in range(3):
+                field[d, nodes[p, k]] += weights[p, k] * vectors[p, d]
+
+
+@njit(**_LOOP)
+def _lump(active, nodes, weights, directions, stiffness, tensor):
+    """Adds to tensor (N, 6), xx, xy, xz, yy, yz, zz, what springs are at each node."""
+    for m in range(len(active)):
+        x, y, z = directions[m, 0], directions[m, 1], directions[m, 2]
+        for k in range(3):
+            scale = _SHARE * stiffness[m] * weights[active[m], k]
+            t = tensor[nodes[active[m], k]]
+            t[0] += scale * x * x
+            t[1] += scale * x * y
+            t[2] += scale * x * z
+            t[3] += scale * y * y
+            t[4] += scale * y * z
+            t[5] += scale * z * z
+
+
+@njit(**_LOOP)
+def _split(used, tensor, nodes, along, firm):
+    """Writes tensors as springs, by Cholesky's method with pivots; returns how many there are."""
+    count = 0
+    left = np.empty((3, 3))
+    for i in used:
+        t = tensor[i]
+        left[0, 0], left[0, 1], left[0, 2] = t[0], t[1], t[2]
+        left[1, 0], left[1, 1], left[1, 2] = t[1], t[3], t[4]
+        left[2, 0], left[2, 1], left[2, 2] = t[2], t[4], t[5]
+        least = _WEAK * (t[0] + t[3] + t[5])
+        for _ in range(3):
+            pivot = 0
+            for d in range(1, 3):
+                if left[d, d] > left[pivot, pivot]:
+                    pivot = d
+            top = left[pivot, pivot]
+            x, y, z = left[0, pivot], left[1, pivot], left[2, pivot]
+            size = (x * x + y * y + z * z) / top if top > 0.0 else 0.0
+            if size <= least:
+                break
+            length = math.sqrt(x * x + y * y + z * z)
+            nodes[count], firm[count] = i, size
+            along[count, 0], along[count, 1], along[count, 2] = x / length, y / length, z / length
+            count += 1
+            for d in range(3):
+                for e in range(3):
+                    left[d, e] -= size * along[count - 1, d] * along[count - 1, e]
+    return count
+
+
+@njit(**_LOOP)
+def add_springs(nodes, weights, directions, stiffness, change, image):
+    """Add to image (3, N) the forces of points' springs as nodes move by change (3, N).
+
+    nodes, weights and directions are (K, 3), stiffness (K,) N/m.
+    """
+    for p in range(len(nodes)):
+        i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
+        along = 0.0
+        for d in range(3):
+            c = change[d]
+            moved = weights[p, 0] * c[i] + weights[p, 1] * c[j] + weights[p, 2] * c[k]
+            along += directions[p, d] * moved
+        along *= stiffness[p]
+        for d in range(3):
+            force = along * directions[p, d]
+            image[d, i] += weights[p, 0] * force
+            image[d, j] += weights[p, 1] * force
+            image[d, k] += weights[p, 2] * force
+
+
+@njit(**_LOOP)
+def add_turns(nodes, weights, turn, change, image):
+    """As `add_springs`, for stiffnesses (K, 3, 3) N/m in all directions."""
+    for p in range(len(nodes)):
+        i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
+        for d in range(3):
+            force = 0.0
+            for e in range(3):
+                c = change[e]
+                moved = weights[p, 0] * c[i] + weights[p, 1] * c[j] + weights[p, 2] * c[k]
+                force += turn[p, d, e] * moved
+            image[d, i] += weights[p, 0] * force
+            image[d, j] += weights[p, 1] * force
+            image[d, k] += weights[p, 2] * force
