@@ -47,8 +47,11 @@ _RESOLVED = 2.0
 _GRIP = 0.1
 """Length by which the shape continues behind the collider, m, as where a hand holds the probe."""
 
+_REACH = 2.0
+"""Gap of points that may come to touch, over what is deep and the nodes' spacing together."""
+
 _CLOSE = 1e-6  # m
-_TRACED = 50  # steps of a point's way in
+_TRACED = 400  # steps of a point's way in, of which a grazing one takes many
 
 
 class FlaredProbe:
@@ -70,6 +73,8 @@ class FlaredProbe:
         self._shape = np.array([*box[:2], length, box[3], bent, math.sin(lean), cosine, flare])
         #: m, half of the smallest half width: deeper, the nearest surface may be the wrong one.
         self.deep = 0.5 * (float(box[:2].min()) + float(box[3]))
+        #: m, gap up to which a point may come to touch while the probe stays where it is.
+        self.reach = _REACH * (self.deep + spacing)
 
     def distance(
         self, pose: Pose, points: NDArray[np.float64], near: NDArray[np.integer] | None = None

@@ -43,10 +43,6 @@ _LEAP = 0.02
 """Way in one move, m, beyond which a probe has not swept through tissue: it was lifted and came
 down anew."""
 
-_NEAR = 4.0
-"""Gap up to which a point may come to touch while a probe stays where it is, over the depth from
-which on it is deep."""
-
 _OVERSHOOT = 0.1
 """Slope of the energy where a change ends, over the one where it begins, that does not matter."""
 
@@ -107,7 +103,7 @@ class PenaltyContact:
         """
         last, self._pose = self._pose, pose
         gap, self.normal = self._probe.distance(pose, positions)
-        self.near = np.flatnonzero(gap < _NEAR * self._probe.deep)
+        self.near = np.flatnonzero(gap < self._probe.reach)
         self._planar = np.flatnonzero(gap < -self._probe.deep)
         if len(self._planar):
             if last is not None and math.dist(last.position, pose.position) > _LEAP:

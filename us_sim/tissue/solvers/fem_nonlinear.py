@@ -30,6 +30,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
@@ -73,6 +74,9 @@ _SINKS = 0.5
 _STRIDE, _MOST_STRIDES = 3e-3, 8
 """Way of a probe in tissue that is gone at once, m; and how many of them are gone in a frame, a
 longer one being a leap."""
+
+_APPROACHING = 0.7
+"""Part of a frame's time after which no stride is begun any more."""
 
 _LOOSE, _STEPS = 0.2, 5
 """Residual with which a stride ends, and the most steps that it may take."""
@@ -188,29 +192,24 @@ class FemNonlinear(TissueSolver):
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: computed with the tissue's compliance at rest. With friction, how much a
-        node may be dragged is not known.
-        """
+        """Approximate: tissue as at rest, pushes that do not turn. Unknown with friction."""
         newton, contact = self._newton, self._newton.contact
-        gap, normal, softness = newton.points.nodal_springs(
-            contact.slope, contact.gap, contact.normal
-        )
+        law = contact.slope, contact.gap, contact.normal
+        gap, normal, softness = newton.points.nodal_springs(*law)
         pushed = np.flatnonzero(np.isfinite(gap[self._surface]))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
         if self.settings.contact != "frictionless":
             return None
         nodes = self._surface[pushed]
-        places = self.model.mesh.nodes[nodes] + newton.displacement.T[nodes]
         # The springs of the contact and the tissue give way one after the other.
         compliance = compliance_between(self._compliance.matrix, pushed) / self._stiffer
-        for k, node in enumerate(nodes):
-            block = slice(3 * k, 3 * k + 3)
-            compliance[block, block] += softness[node] * np.outer(normal[node], normal[node])
+        across = normal[nodes, :, None] * normal[nodes, None, :]
+        compliance += block_diag(*(softness[nodes, None, None] * across))
         return contact_stiffness(
             self.model.collider,
             self._pose,
-            places,
+            self.model.mesh.nodes[nodes] + newton.displacement.T[nodes],
             newton.pushes[:, nodes].T,
             compliance,
             self.model.contact_spacing,
@@ -267,7 +266,7 @@ class FemNonlinear(TissueSolver):
         elif not moved:
             shifted = newton.settle() if self._balanced else np.inf
         elif len(self._surface):
-            self._approach(pose)
+            self._approach(pose, None if budget is None else began + _APPROACHING * budget)
             start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
@@ -275,15 +274,15 @@ class FemNonlinear(TissueSolver):
         left = settings.most_iterations if moved else 2 * settings.most_iterations
         stuck, actions = False, []
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
-            enough = goal * newton.load if start is None else 0.0
+            enough, stepping = goal * newton.load if start is None else 0.0, time.perf_counter()
             taken = newton.step(min(left, newton.patience), enough, start)
             stuck = not taken and newton.is_stuck
             left -= newton.used
-            if budget is not None and (spent := time.perf_counter() - began) > budget:
-                if start is not None and settings.frame_budget is not None:
+            if budget is not None and (now := time.perf_counter()) - began > budget:
+                if now - stepping > budget and settings.frame_budget is not None:
                     actions.append(
                         f"frame_budget is {1e3 * budget:.3g} ms, but one step takes "
-                        f"{1e3 * spent:.2g} ms: give it more"
+                        f"{1e3 * (now - stepping):.2g} ms: give it more"
                     )
                 break
             start = None
@@ -304,15 +303,16 @@ class FemNonlinear(TissueSolver):
             return False
         return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
-    def _approach(self, pose: Pose) -> None:
-        """Go most of a long way in strides: tissue that is hit or swept aside at once may end
-        elsewhere than if the probe had moved there.
+    def _approach(self, pose: Pose, end: float | None) -> None:
+        """Go most of a long way in strides, until a time (s): tissue that is hit or swept aside at
+        once may end elsewhere than if the probe had moved there.
         """
         for nearer in self._strides(pose):
-            start: NDArray[np.float64] | None = self._predicted(nearer)
-            for _ in range(_STEPS):
-                self._newton.step(self._newton.patience, 0.0, start)
-                start = None
+            if end is not None and time.perf_counter() > end:
+                break
+            start = self._predicted(nearer)
+            for k in range(_STEPS):
+                self._newton.step(self._newton.patience, 0.0, None if k else start)
                 if self._newton.imbalance <= _LOOSE * self._newton.load:
                     break
 
@@ -350,9 +350,9 @@ class FemNonlinear(TissueSolver):
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
         start = field.astype(np.float64)
-        moved = points.moved(start)
-        pushed = contact.push_at(contact.gap + np.einsum("ij,ij->i", contact.normal, moved))
-        newton.expect(np.where(before > 0.0, before, pushed))
+        if self.settings.contact != "frictionless":
+            along = np.einsum("ij,ij->i", contact.normal, points.moved(start))
+            newton.expect(np.where(before > 0.0, before, contact.push_at(contact.gap + along)))
         return start
 
     def _obstacle(self) -> str:
