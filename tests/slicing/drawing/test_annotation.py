@@ -29,6 +29,13 @@ def black(probe):
     return np.zeros((probe.rows, probe.columns), np.uint8)
 
 
+def thread_seconds(work):
+    """What ``work()`` takes of this thread's processor time."""
+    start = time.thread_time()
+    work()
+    return time.thread_time() - start
+
+
 def runs(lit):
     """Middles of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lit, [False]]).astype(int)))
@@ -207,16 +214,16 @@ def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, de
     np.testing.assert_array_equal(picture, again)
 
 
-def test_a_picture_of_512_by_512_is_drawn_within_two_milliseconds():
+def test_a_picture_of_512_by_512_is_drawn_faster_than_a_hundred_thousand_numbers_are_sorted():
     structures = {n: (f"label {n}", (0.2, 0.5, 0.8)) for n in range(1, 7)}
     annotation = Annotation(LINEAR, structures)
     image = np.random.default_rng(2).integers(0, 256, (512, 512), dtype=np.uint8)
     labels = black(LINEAR)
     for n in range(1, 7):
         disk(labels, 70 + 130 * (n % 3), 130 + 200 * (n // 4), 15 + 8 * n, n)
-    seconds = []
+    numbers = np.random.default_rng(3).integers(0, 2**31, 100_000)
+    drawing, sorting = [], []
     for _ in range(60):
-        start = time.thread_time()
-        annotation.draw(image, labels)
-        seconds.append(time.thread_time() - start)
-    assert min(seconds) < 2e-3
+        drawing.append(thread_seconds(lambda: annotation.draw(image, labels)))
+        sorting.append(thread_seconds(lambda: np.sort(numbers, kind="heapsort")))
+    assert min(drawing) < min(sorting)
