@@ -23,7 +23,7 @@ from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-every_method = pytest.mark.parametrize("method", SLICERS)
+every_method = pytest.mark.parametrize("method", list(SLICERS))
 LOW, HIGH = -SIZE / [2, 2, 1] * [1, 1, 0], SIZE / [2, 2, 1]
 
 
