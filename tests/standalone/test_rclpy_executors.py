@@ -221,6 +221,14 @@ def test_spinning_until_a_future_is_done_ends_then_or_in_time(bench) -> None:
     timer.join()
 
 
+def test_spinning_again_and_again_leaves_nothing_at_a_future(bench) -> None:
+    future = Future()
+    for _ in range(3):
+        bench.executor.spin_until_future_complete(future, timeout_sec=0.0)
+        bench.executor.spin_once_until_future_complete(future, timeout_sec=0.0)
+    assert future._callbacks == []
+
+
 def test_nodes_belong_to_one_executor(bench) -> None:
     node = bench.node()
     assert node.executor is bench.executor

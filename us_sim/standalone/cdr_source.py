@@ -22,7 +22,7 @@ import numpy as np
 
 from .cdr_layout import FORMATS, CdrLayout
 from .field_setters import ARRAY_TYPES
-from .interfaces import Field
+from .interfaces import Field, interface
 from .message_class import Message, message_class
 
 __all__ = ["compiled_reader", "compiled_writer"]
@@ -106,6 +106,7 @@ class _Writer(CdrLayout):
 class _Reader(CdrLayout):
     def __init__(self, type_name: str, order: str) -> None:
         super().__init__(order)
+        self.too_many = self.constant(_too_many)
         owner = self.message(type_name)
         self.flush()
         self.line(f"return {owner}, pos")
@@ -141,6 +142,9 @@ class _Reader(CdrLayout):
         if field.shape == "sequence":
             self.primitive("I", "n")
             self.flush()
+            bound = f" or n > {field.size}" if field.size else ""
+            room = f"n * {_least_size(field)} > len(data) - pos"
+            self.line(f"if {room}{bound}: raise {self.too_many}(n)")
         else:
             self.flush()
             self.line(f"n = {field.size}")
@@ -180,3 +184,18 @@ class _Reader(CdrLayout):
             self.line("pos = end")
 
         self.packed(size, emit)
+
+
+def _least_size(field: Field) -> int:
+    """Bytes that one element of a field takes at least, without what aligns it."""
+    if not field.is_message:
+        return 4 if field.kind == "string" else struct.calcsize(f"={FORMATS[field.kind]}")
+    total = 0
+    for part in interface(field.kind).fields:
+        count = part.size if part.shape == "array" else 1
+        total += 4 if part.shape == "sequence" else count * _least_size(part)
+    return total or 1
+
+
+def _too_many(count: int) -> ValueError:
+    return ValueError(f"a sequence of {count} elements is too long for it")

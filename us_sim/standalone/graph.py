@@ -149,13 +149,16 @@ class Graph:
         while lib.dds_take(reader, ct.byref(sample), ct.byref(info), 1, 1) == 1:
             content = ct.cast(sample, ct.POINTER(kind)).contents
             is_alive = info.instance_state == ddsc.ALIVE
-            if info.valid_data or not is_alive:
+            try:
+                if is_alive and not info.valid_data:
+                    continue
                 if kind is BuiltinParticipant:
                     self._take_participant(content, is_alive)
                 else:
                     self._take_endpoint(content, is_alive, topic == ddsc.BUILTIN_PUBLICATION)
-            lib.dds_return_loan(reader, ct.byref(sample), 1)
-            sample.value = None
+            finally:
+                lib.dds_return_loan(reader, ct.byref(sample), 1)
+                sample.value = None
 
     def _take_participant(self, content: Any, is_alive: bool) -> None:
         gid = bytes(content.key)

@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from operator import attrgetter
 from typing import Any
 
@@ -99,15 +99,15 @@ class Executor(AbstractContextManager["Executor"]):
 
     def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
         """Run callbacks until a future is done, or the time is over."""
-        future.add_done_callback(lambda _: self.wake())
         timeout = None if timeout_sec is None or timeout_sec < 0 else timeout_sec
         deadline = None if timeout is None else time.monotonic() + timeout
-        while self._context.ok() and not future.done() and not self._is_shutdown:
-            self._spin_once(timeout, future.done)
-            if deadline is not None:
-                timeout = deadline - time.monotonic()
-                if timeout <= 0:
-                    return
+        with self._woken_by(future):
+            while self._context.ok() and not future.done() and not self._is_shutdown:
+                self._spin_once(timeout, future.done)
+                if deadline is not None:
+                    timeout = deadline - time.monotonic()
+                    if timeout <= 0:
+                        return
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run one callback, waiting for one to be ready until the time is over."""
@@ -117,8 +117,21 @@ class Executor(AbstractContextManager["Executor"]):
         self, future: Future, timeout_sec: float | None = None
     ) -> None:
         """Run one callback, waiting until the future is done or the time is over."""
-        future.add_done_callback(lambda _: self.wake())
-        self._spin_once(timeout_sec, future.done)
+        with self._woken_by(future):
+            self._spin_once(timeout_sec, future.done)
+
+    @contextmanager
+    def _woken_by(self, future: Future) -> Iterator[None]:
+        """Look at everything anew when a future is done."""
+
+        def wake(_: Future) -> None:
+            self.wake()
+
+        future.add_done_callback(wake)
+        try:
+            yield
+        finally:
+            future._remove_done_callback(wake)
 
     def _spin_once(self, timeout_sec: float | None, condition: Callable[[], bool]) -> None:
         entity = self._next_ready(timeout_sec, condition)

@@ -77,6 +77,12 @@ class Future:
                 return
         callback(self)
 
+    def _remove_done_callback(self, callback: Callable[[Any], Any]) -> None:
+        """Call it no more, if it has not been called."""
+        with self._lock:
+            if callback in self._callbacks:
+                self._callbacks.remove(callback)
+
     def _conclude(self, result: Any, exception: BaseException | None) -> None:
         with self._lock:
             self._result, self._exception = result, exception
