@@ -175,6 +175,11 @@ class ProcessGroup:
             elif node not in self._complaints:
                 tqdm.write(line.rstrip(), file=sys.stderr)
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """The processes' numbers by node."""
+        return {node: process.pid for node, process in self._processes.items()}
+
     def is_running(self, node: str) -> bool:
         """Whether that node was started and has not ended."""
         process = self._processes.get(node)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from us_sim.run.graph import (
     player_settings,
     simulation_nodes,
 )
+from us_sim.run.in_process import node_in_process
 from us_sim.run.live import prepare_volume
 from us_sim.run.supervision import refuse_unknown
 from us_sim.scene.building import path_of
@@ -94,8 +94,8 @@ def render(
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
-        for module, name, settings in _nodes(scene, path, out, parameters or {}):
-            nodes.append(_created(module, name, settings, context))
+        for name, settings in _nodes(scene, path, out, parameters or {}):
+            nodes.append(node_in_process(name, settings, context))
             executor.add_node(nodes[-1])
         for process in simulation_nodes(scene, parameters, played=True):
             (node,) = (node for node in nodes if node.get_name() == process.node)
@@ -111,8 +111,8 @@ def render(
 
 def _nodes(
     scene: Scene, path: Path, out: Path, parameters: Parameters
-) -> list[tuple[str, str, dict[str, object]]]:
-    """Module, class and parameters of each node: listeners first, the player last."""
+) -> list[tuple[str, dict[str, object]]]:
+    """Name and parameters of each node: listeners first, the player last."""
     common: dict[str, object] = {"lockstep": True}
     recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
@@ -121,30 +121,14 @@ def _nodes(
     }
     player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [
-        ("session_recorder", "SessionRecorder", recorder),
-        ("image_writer", "ImageWriter", {"folder": str(out / "images")}),
+        ("session_recorder", recorder),
+        ("image_writer", {"folder": str(out / "images")}),
         *(
-            (process.node, _class_name(process.node), {**common, **process.all_parameters})
+            (process.node, {**common, **process.all_parameters})
             for process in simulation_nodes(scene, parameters, played=True)
         ),
-        ("path_player", "PathPlayer", player),
+        ("path_player", player),
     ]
-
-
-def _class_name(node: str) -> str:
-    return "".join(word.capitalize() for word in node.split("_"))
-
-
-def _created(module: str, name: str, parameters: dict[str, object], context: Any) -> Any:
-    from rclpy.exceptions import ParameterException
-    from rclpy.parameter import Parameter
-
-    kind = getattr(importlib.import_module(f"us_sim.nodes.{module}"), name)
-    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
-    try:
-        return kind(context=context, parameter_overrides=overrides)
-    except ParameterException as error:
-        raise UsSimError(" ".join(str(error).split())) from error
 
 
 def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None]) -> int:

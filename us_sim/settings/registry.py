@@ -115,6 +115,7 @@ EVALUATIONS = Choice(
         f"{_EVALUATION}.hand.settings:HandSettings",
     ),
     tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
+    latency=Option(f"{_EVALUATION}.latency.measure:evaluate_latency", _NOTHING),
 )
 
 _CALIBRATION = "us_sim.tracking.calibration"

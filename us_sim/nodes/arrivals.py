@@ -1,0 +1,66 @@
+"""Waits for images, and notes when each message on the way to them arrives."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from us_sim.nodes.qos import EVERY
+
+__all__ = ["HOPS", "Arrivals"]
+
+HOPS = {
+    "tracker/pose": PoseStamped,
+    "probe/pose": PoseStamped,
+    "tissue/nodes": PointCloud2,
+    "skin/nodes": PointCloud2,
+    "ultrasound/image": Image,
+}
+"""What carries the stamp of the tracker's pose, in the order in which it is made."""
+
+EYE = {"tissue/structures": MarkerArray, "ultrasound/image_annotated": Image}
+"""What is computed only where somebody looks."""
+
+_HEADER = struct.Struct("<4xiI")
+"""Where a serialized message with a header has its stamp."""
+
+
+class Arrivals(Node):
+    """Subscribes to topics without looking at more of their messages than the stamps.
+
+    Args:
+        viewer: whether it also takes what is made for the eye.
+    """
+
+    def __init__(self, *, viewer: bool = False, **kwargs: Any) -> None:
+        super().__init__("arrivals", **kwargs)
+        self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
+        for topic, kind in HOPS.items():
+            self.create_subscription(kind, topic, self._noted(self._heard[topic]), EVERY, raw=True)
+        if viewer:
+            for topic, kind in EYE.items():
+                self.create_subscription(kind, topic, lambda _: None, EVERY, raw=True)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """What is noted, in the order in which it is made."""
+        return tuple(self._heard)
+
+    def heard(self, topic: str) -> Sequence[tuple[int, int]]:
+        """Stamp and time of arrival of every message so far, ns."""
+        return list(self._heard[topic])
+
+    @staticmethod
+    def _noted(heard: list[tuple[int, int]]) -> Callable[[bytes], None]:
+        def note(data: bytes) -> None:
+            seconds, nanoseconds = _HEADER.unpack_from(data)
+            heard.append((1_000_000_000 * seconds + nanoseconds, time.time_ns()))
+
+        return note
