@@ -85,7 +85,9 @@ def test_images_round_trip(pixels):
 
 
 @quick
-@given(arrays(np.int32, st.tuples(st.integers(0, 9), st.just(4))))
+@given(
+    arrays(np.int32, st.tuples(st.integers(0, 9), st.just(4)), elements=st.integers(0, 2**31 - 1))
+)
 def test_tetrahedra_round_trip(tetrahedra):
     np.testing.assert_array_equal(tetrahedra_from(tetrahedra_message(tetrahedra)), tetrahedra)
 
@@ -173,7 +175,7 @@ def test_colour_images_hold_red_green_blue_of_each_pixel(pixels):
 
 
 @quick
-@given(arrays(np.float64, (3, 4), elements=st.floats(-1e300, 1e300)))
+@given(arrays(np.float64, (3, 4), elements=st.floats(-1e6, 1e6)))
 def test_affine_maps_round_trip(upper):
     matrix = np.vstack([upper, [0, 0, 0, 1]])
     sent = deserialize_message(serialize_message(affine_message(matrix)), Float64MultiArray)
