@@ -9,7 +9,6 @@ array([[0.   , 0.   , 0.042]])
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,10 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import PoseError
 
-__all__ = ["FARTHEST", "Pose"]
+__all__ = ["Pose"]
 
-FARTHEST = 1e15
-"""m: the coordinates of poses are below it, so that no product of a few of them overflows."""
+_FARTHEST = 1e15
+"""m: the coordinates of poses are no larger, so that no product of a few of them overflows."""
+_LONGEST = 1e6
+"""Of a quaternion's components."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +33,8 @@ class Pose:
         orientation: (4,) quaternion x, y, z, w; normalised here.
 
     Raises:
-        PoseError: a number is not finite, the quaternion's norm is below 1e-6 or above 1e6, or
-            the position so far away that products of it would not be finite.
+        PoseError: a number is not finite, the quaternion's norm is below 1e-6, a component of it
+            above 1e6, or the position so far away that products of it would not be finite.
     """
 
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -52,12 +53,14 @@ class Pose:
                 f"the pose is not finite: position {position.tolist()}, "
                 f"orientation {orientation.tolist()}"
             )
-        norm = math.hypot(*orientation.tolist())  # which does not overflow on the way
+        if np.abs(orientation).max() > _LONGEST:  # nor may the norm overflow
+            raise PoseError(
+                f"the pose's quaternion is {orientation.tolist()}, where one of length 1 is meant"
+            )
+        norm = float(np.linalg.norm(orientation))
         if norm < 1e-6:
             raise PoseError("the pose's quaternion is zero, so it has no orientation")
-        if norm > 1e6:
-            raise PoseError(f"the pose's quaternion has a length of {norm:.3g}, where 1 is meant")
-        if np.abs(position).max() > FARTHEST:
+        if np.abs(position).max() > _FARTHEST:
             raise PoseError(
                 f"the pose is at {position.tolist()}, beyond any place: positions are in metres"
             )

@@ -105,8 +105,7 @@ class Health:
 
     def _failures(self) -> Counter[str]:
         """Exceptions that nobody expected, by where they happened."""
-        failures: Counter[str] = getattr(self._node, "failures", Counter())
-        return failures.copy()  # other threads may count, too
+        return Counter(getattr(self._node, "failures", ()))
 
     def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:
         status = DiagnosticStatus()
