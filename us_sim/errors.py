@@ -5,11 +5,13 @@ __all__ = [
     "CalibrationError",
     "MaterialError",
     "MeshError",
+    "MessageError",
     "PoseError",
     "ProbeError",
     "SceneError",
     "SettingsError",
     "SolverError",
+    "StampError",
     "TrackingError",
     "UsSimError",
     "VolumeError",
@@ -31,6 +33,14 @@ class SettingsError(UsSimError):
 
 class SceneError(UsSimError):
     """A scene file, or a value in it, cannot be used."""
+
+
+class MessageError(UsSimError):
+    """A message that came in cannot be read, or is not for where it was sent."""
+
+
+class StampError(UsSimError):
+    """A stamp is no time."""
 
 
 class PoseError(UsSimError):

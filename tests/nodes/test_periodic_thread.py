@@ -4,8 +4,6 @@ import itertools
 import threading
 import time
 
-import pytest
-
 from us_sim.nodes.periodic_thread import PeriodicThread
 
 
@@ -41,18 +39,3 @@ def test_it_ends_even_if_it_never_began():
     thread = PeriodicThread(100.0, lambda _: None)
     thread.stop()
     assert thread.jitter == 0.0
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_work_that_raises_is_told():
-    def work(_):
-        raise ValueError("a bug")
-
-    thread = PeriodicThread(1000.0, work)
-    assert not thread.has_failed
-    thread.start()
-    deadline = time.monotonic() + 20.0
-    while not thread.has_failed:
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    thread.stop()

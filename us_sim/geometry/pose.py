@@ -18,6 +18,11 @@ from us_sim.errors import PoseError
 
 __all__ = ["Pose"]
 
+_FARTHEST = 1e15
+"""m: the coordinates of poses are no larger, so that no product of a few of them overflows."""
+_LONGEST = 1e6
+"""Of a quaternion's components."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pose:
@@ -28,7 +33,8 @@ class Pose:
         orientation: (4,) quaternion x, y, z, w; normalised here.
 
     Raises:
-        PoseError: a number is not finite, or the quaternion's norm is below 1e-6.
+        PoseError: a number is not finite, the quaternion's norm is below 1e-6, a component of it
+            above 1e6, or the position so far away that products of it would not be finite.
     """
 
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -47,9 +53,17 @@ class Pose:
                 f"the pose is not finite: position {position.tolist()}, "
                 f"orientation {orientation.tolist()}"
             )
+        if np.abs(orientation).max() > _LONGEST:  # nor may the norm overflow
+            raise PoseError(
+                f"the pose's quaternion is {orientation.tolist()}, where one of length 1 is meant"
+            )
         norm = float(np.linalg.norm(orientation))
         if norm < 1e-6:
             raise PoseError("the pose's quaternion is zero, so it has no orientation")
+        if np.abs(position).max() > _FARTHEST:
+            raise PoseError(
+                f"the pose is at {position.tolist()}, beyond any place: positions are in metres"
+            )
         position.flags.writeable = False
         orientation /= norm
         orientation.flags.writeable = False

@@ -33,8 +33,8 @@ class AnnotatedImage:
     """``ultrasound/image_annotated``: the image, what is in it, and whether it is live.
 
     A picture is drawn for each image while somebody subscribes. When no pose has come for a
-    while, or the newest is old by its stamp, the last image is sent again with a badge, under
-    its own stamp; before the first pose a black one. In lockstep nothing ages.
+    while, the last image is sent again with a badge, under its own stamp; before the first pose
+    a black one. In lockstep nothing ages.
 
     Args:
         node: that publishes it.

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
@@ -18,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from us_sim.errors import TrackingError
 from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import bgr_image_message, image_message
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
@@ -40,7 +40,7 @@ A best-effort subscriber may find this publisher a little later than it is found
 """
 
 
-class CameraDriver(Node):
+class CameraDriver(GuardedNode):
     """``camera/image_raw`` and, with the same stamp, ``camera/camera_info`` of each image.
 
     Its parameters are those of `CameraDriverSettings` and `AwaitedSettings`. A camera is asked for
@@ -97,10 +97,16 @@ class CameraDriver(Node):
     # In the camera's thread.
 
     def _run(self) -> None:
-        if self._video.is_file:
-            self._play()
-        else:
-            self._follow()
+        while not self._closing.is_set() and not self._ended:
+            try:
+                if self._video.is_file:
+                    self._play()
+                else:
+                    self._follow()
+            except Exception as error:  # so that the thread does not end silently
+                self.failed("camera", error)
+                self._video.close()
+                self._closing.wait(RETRY_S)
 
     def _follow(self) -> None:
         """A camera or stream, each time that it is there."""

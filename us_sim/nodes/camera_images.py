@@ -35,6 +35,9 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
 }
 
+_LARGEST = 1e9
+"""Pixels, or a coefficient of the distortion."""
+
 
 def camera_from(message: CameraInfo) -> CameraModel:
     """The camera that a driver describes.
@@ -42,6 +45,11 @@ def camera_from(message: CameraInfo) -> CameraModel:
     Raises:
         TrackingError: it is not calibrated, or the numbers are none of a camera.
     """
+    if not (np.abs([*message.k, *message.d]) <= _LARGEST).all():
+        raise TrackingError(
+            f"the camera's matrix {list(message.k)} or its distortion {list(message.d)} holds a "
+            f"number that is not finite or far too large: calibrate the camera again"
+        )
     return CameraModel(
         message.width,
         message.height,
@@ -82,7 +90,13 @@ def grey_from(message: Image) -> NDArray[np.uint8]:
     if conversion is None:
         return np.ascontiguousarray(rows)
     pixels = rows if size == 1 else rows.reshape(message.height, message.width, size)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+    try:
+        grey = cv2.cvtColor(np.ascontiguousarray(pixels), conversion)
+    except cv2.error as error:  # an odd width of pairs, say, or a Bayer pattern of one pixel
+        raise TrackingError(
+            f"an image of {message.width} × {message.height} pixels cannot be {message.encoding}"
+        ) from error
+    return np.asarray(grey, dtype=np.uint8)
 
 
 def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:

@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
-from rclpy.time import Time
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import contact_model_message
+from us_sim.nodes.conversions import contact_model_message, nanoseconds_of
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.solvers.switching import SwitchableTissue
@@ -49,7 +48,7 @@ class ContactModelPublisher:
         try:
             if stiffness is None:
                 stiffness = self._secant.at(pose, wrench)
-            model = ContactModel(Time.from_msg(stamp).nanoseconds, pose, wrench, stiffness)
+            model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
         except TrackingError as error:
             self._secant.forget()
             self._node.health.problem("contact_model", f"{error}; it is not published")

@@ -10,11 +10,15 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
-from rclpy.time import Time
 from std_msgs.msg import Bool, Float64MultiArray
 
-from us_sim.errors import SceneError, UsSimError
-from us_sim.nodes.conversions import contact_model_from, pose_from, wrench_serialized
+from us_sim.errors import SceneError, StampError, UsSimError
+from us_sim.nodes.conversions import (
+    contact_model_from,
+    nanoseconds_of,
+    pose_from,
+    wrench_serialized,
+)
 from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
@@ -54,7 +58,7 @@ class HapticRenderer(SceneNode):
         self.listen(PoseStamped, "haptic/pose", self._take_pose, FOREIGN)
         self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
         self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
-        self._thread = PeriodicThread(settings.rate, self._render)
+        self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
         self._look()
         self._report()
         self.create_timer(1.0 / LOOKS, self._look)
@@ -70,48 +74,45 @@ class HapticRenderer(SceneNode):
     def _take_pose(self, message: PoseStamped) -> None:
         now = time.monotonic_ns()
         self.health.received += 1
-        stamp, frame = Time.from_msg(message.header.stamp).nanoseconds, message.header.frame_id
+        frame = message.header.frame_id
         if frame != self._frame:
-            self._refuse(
-                "frame",
+            sentence = (
                 f"haptic/pose is in frame '{frame}', not '{self._frame}', so nothing is felt: set "
-                f"the arm's frame, or tracker.frame in the scene",
+                f"the arm's frame, or tracker.frame in the scene"
             )
+            self.health.problem("frame", sentence)
+            self._rendering.distrust(sentence)
             return
-        try:
-            pose = pose_from(message)
-        except UsSimError as error:
-            self._refuse("pose", f"haptic/pose: {error}; nothing is felt")
-            return
+        pose, stamp = pose_from(message), nanoseconds_of(message.header.stamp)
         if stamp == 0:
-            self._refuse(
-                "stamp", "haptic/pose has no stamp, so nothing is felt: let its driver set it"
-            )
-            return
+            raise StampError("there is no stamp: let the arm's driver set it")
         self._rendering.pose(stamp, pose, now)
 
     def _take_clutch(self, message: Bool) -> None:
         self._rendering.clutch(message.data)
 
     def _take_model(self, message: Float64MultiArray) -> None:
-        try:
-            model = contact_model_from(message)
-        except UsSimError as error:
-            self._refuse("model", f"tissue/contact_model: {error}; nothing is felt")
-            return
-        self._rendering.model(model, time.monotonic_ns())
+        self._rendering.model(contact_model_from(message), time.monotonic_ns())
 
-    def _refuse(self, kind: str, sentence: str) -> None:
-        self.health.problem(kind, sentence)
-        self._rendering.distrust(sentence)
+    def refused(self, where: str, error: UsSimError) -> None:
+        """Feel nothing, too, where something that came cannot be used."""
+        super().refused(where, error)
+        self._rendering.distrust(f"{where}: {error}")
+
+    def failed(self, where: str, error: Exception) -> None:
+        """Feel nothing, too, and render anew: what has failed may be of no use any more."""
+        super().failed(where, error)
+        self._rendering = haptic_rendering_of(self.scene)
+        self._stops = 0
 
     def _render(self, now: int) -> None:
         """One tick, in the thread of its own."""
+        rendering = self._rendering
         if not self._is_taken:
-            self._rendering.distrust("nobody takes the wrench")
+            rendering.distrust("nobody takes the wrench")
         wrench = np.zeros(6)
         try:
-            wrench = self._rendering.render(now)
+            wrench = rendering.render(now)
         finally:  # also should it fail: the arm must not keep what it was told last
             if self._is_taken:
                 self._publish(wrench)
@@ -136,9 +137,6 @@ class HapticRenderer(SceneNode):
             self.health.problem("doubt", f"nothing is felt: {self._rendering.stopped}")
         self._stops = stops
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
-        if self._thread.has_failed:
-            self.health.state = "zero: the rendering has failed"
-            self.health.problem("failure", "the rendering has failed: start the node again")
 
     def _report(self) -> None:
         """Tell diagnostics how it goes."""

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter, deque
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.time import Time
 
+from us_sim.nodes.conversions.stamps import nanoseconds_of
 from us_sim.nodes.qos import STREAM, overridable
 
 __all__ = ["Health"]
 
+ANOTHER_CLOCK_S = 10.0
+"""From the present to a stamp: from there on it is of another clock, or of an earlier day."""
+
 
 class Health:
     """Counts what a node does and publishes it on ``diagnostics`` at 1 Hz.
+
+    Latency is the age of what goes out by its stamp. Where stamps are of another clock, as those
+    of a recording are, that is said once, and latency counts from the arrival of what a message
+    was made from.
 
     Args:
         node: whose clock, logger and timer are used.
@@ -31,6 +39,8 @@ class Health:
         self._problems: Counter[str] = Counter()
         self._last_problem = ""
         self.warning = ""  # what is wrong for as long as it is
+        self._failures_told = 0
+        self._clock_differs = False
         self._last_total = 0
         self._last_time = node.get_clock().now().nanoseconds
         self.state = "starting"
@@ -46,8 +56,20 @@ class Health:
         """One message went out on ``topic``; with a stamp, its age counts as latency."""
         self._published[topic] += 1
         if stamp is not None:
-            age = self._node.get_clock().now().nanoseconds - Time.from_msg(stamp).nanoseconds
-            self._latencies.append(age * 1e-6)
+            self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
+
+    def _age(self, stamp: int) -> float:
+        """s, of something with that stamp in ns."""
+        age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
+        if abs(age) < ANOTHER_CLOCK_S:
+            return age
+        if not self._clock_differs:
+            self._clock_differs = True
+            self._node.get_logger().warning(
+                f"stamps are {abs(age):.1f} s {'old' if age > 0 else 'ahead'}, so they are of "
+                f"another clock: latency counts from arrival"
+            )
+        return 1e-9 * (time.monotonic_ns() - getattr(self._node, "arrived", time.monotonic_ns()))
 
     def problem(self, kind: str, sentence: str) -> None:
         """Count a problem of that kind; it is logged at most every five seconds."""
@@ -72,6 +94,7 @@ class Health:
             "dropped": str(self.dropped),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
+            **{f"failed {where}": str(n) for where, n in self._failures().items()},
             **self.values,
         }
         if self._latencies:
@@ -80,10 +103,18 @@ class Health:
         self._publisher.publish(self._message(now.to_msg(), values))
         self._last_problem = ""
 
+    def _failures(self) -> Counter[str]:
+        """Exceptions that nobody expected, by where they happened."""
+        return Counter(getattr(self._node, "failures", ()))
+
     def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:
         status = DiagnosticStatus()
         wrong = self._last_problem or self.warning
         status.level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
+        failures = self._failures().total()
+        if failures > self._failures_told:
+            self._failures_told, wrong = failures, self._node.last_failure
+            status.level = DiagnosticStatus.ERROR
         status.name = self._node.get_fully_qualified_name()
         status.message = wrong or self.state
         status.hardware_id = self._hardware_id

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from rclpy.node import Node
 from sensor_msgs.msg import Image
 
-from us_sim.errors import UsSimError
 from us_sim.nodes.conversions import pixels_from
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, overridable
 from us_sim.nodes.settings import ImageWriterSettings
@@ -18,7 +17,7 @@ from us_sim.nodes.settings import ImageWriterSettings
 __all__ = ["ImageWriter"]
 
 
-class ImageWriter(Node):
+class ImageWriter(GuardedNode):
     """``ultrasound/image`` to ``folder/000000.png``, ``000001.png``, …"""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -33,5 +32,5 @@ class ImageWriter(Node):
     def _write(self, message: Image) -> None:
         file = self._folder / f"{self.count:06d}.png"
         if not cv2.imwrite(str(file), pixels_from(message)):
-            raise UsSimError(f"{file} cannot be written; choose another folder with --out")
+            raise OSError(f"{file} cannot be written; choose another folder with --out")
         self.count += 1

@@ -84,7 +84,13 @@ class LiveTissue:
             UsSimError: the pose cannot be used.
         """
         self._look()
-        return self.tissue.deform(pose)
+        try:
+            return self.tissue.deform(pose)
+        except UsSimError:
+            raise
+        except Exception:
+            self.tissue.reset()  # it may have been left halfway
+            raise
 
     def _use(self, values: dict[str, Any]) -> None:
         """Make ready what was set."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.node import Node
-
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 
 __all__ = ["Newest"]
@@ -21,12 +21,14 @@ class Newest:
     """
 
     def __init__(
-        self, node: Node, health: Health, work: Callable[[Any], None], *, lockstep: bool
+        self, node: GuardedNode, health: Health, work: Callable[[Any], None], *, lockstep: bool
     ) -> None:
+        self._node = node
         self._health = health
         self._work = work
         self._lockstep = lockstep
         self._waiting: Any = None
+        self._arrived = 0  # ns of the monotonic clock
         self._fresh = False
         self._guard = node.create_guard_condition(self._turn)
 
@@ -38,7 +40,7 @@ class Newest:
             return
         if self._waiting is not None:
             self._health.dropped += 1
-        self._waiting = message
+        self._waiting, self._arrived = message, time.monotonic_ns()
         self._fresh = True
         self._guard.trigger()
 
@@ -49,4 +51,5 @@ class Newest:
             return
         message, self._waiting = self._waiting, None
         if message is not None:
+            self._node.arrived = self._arrived
             self._work(message)

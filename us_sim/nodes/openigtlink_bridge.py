@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
-from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import affine_from, pixels_from, pose_from
+from us_sim.errors import ProbeError
+from us_sim.nodes.conversions import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
@@ -77,23 +76,17 @@ class OpenIGTLinkBridge(SceneNode):
             self.get_logger().info(self.health.state)
 
     def _take_place(self, message: Float64MultiArray) -> None:
-        try:
-            matrix = affine_from(message)
-        except UsSimError as error:
-            self.health.problem("matrix", f"ultrasound/image_to_probe: {error}")
-            return
+        matrix = affine_from(message)
         # As thick as a pixel is wide: the simulation's own matrix has a slice a metre thick.
         normal, step = np.linalg.norm(matrix[:3, 2]), np.linalg.norm(matrix[:3, 0])
+        if not normal > 0.0 or not step > 0.0:
+            raise ProbeError("the matrix gives pixels no size")
         matrix[:3, 2] *= step / normal
         self._image_to_probe = matrix
 
     def _take_pose(self, message: PoseStamped) -> None:
-        try:
-            pose = pose_from(message)
-        except UsSimError as error:
-            self.health.problem("pose", f"probe/pose: {error}; it is not sent")
-            return
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        pose = pose_from(message, "patient")
+        stamp = nanoseconds_of(message.header.stamp)
         matrix = self._from_patient @ pose.matrix
         self._poses[stamp] = matrix
         while len(self._poses) > REMEMBERED:
@@ -103,18 +96,14 @@ class OpenIGTLinkBridge(SceneNode):
             self._take_image(self._image)
 
     def _take_image(self, message: Image) -> None:
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        stamp = nanoseconds_of(message.header.stamp)
         self._image = None
         if self._image_to_probe is None or not self._server.clients:
             return
         if stamp not in self._poses:
             self._image = message  # its pose may come after it, over another connection
             return
-        try:
-            pixels = pixels_from(message)
-        except UsSimError as error:
-            self.health.problem("image", f"ultrasound/image: {error}; it is not sent")
-            return
+        pixels = pixels_from(message)
         matrix = self._poses[stamp] @ self._image_to_probe
         name = "Image_Reference"
         self._server.send(name, image_message(name, stamp, pixels, matrix, self._world))

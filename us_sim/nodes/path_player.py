@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
 from us_sim.nodes.awaited import Awaited
-from us_sim.nodes.conversions import pose_message
+from us_sim.nodes.conversions import nanoseconds_of, pose_message
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
@@ -29,7 +29,7 @@ CHECK_S, CHECKS = 0.05, 6
 """How often, and how often in a row, everything awaited must be there before the first pose."""
 
 
-class PathPlayer(Node):
+class PathPlayer(GuardedNode):
     """A bag's poses on ``tracker/pose``.
 
     Its parameters are those of `PathPlayerSettings` and `AwaitedSettings`.
@@ -100,7 +100,7 @@ class PathPlayer(Node):
         return bool((times[self._next] - times[0]) / self._rate <= elapsed)
 
     def _imaged(self, image: Image) -> None:
-        stamp = Time.from_msg(image.header.stamp).nanoseconds
+        stamp = nanoseconds_of(image.header.stamp)
         if stamp == self._stamps[self._next] and not self.finished.done():
             self._advance()
             if not self.finished.done():

@@ -25,7 +25,7 @@ class PeriodicThread:
 
     Args:
         rate: Hz.
-        work: what to do, with the time in ns of the monotonic clock.
+        work: what to do, with the time in ns of the monotonic clock; it must not raise.
     """
 
     def __init__(self, rate: float, work: Callable[[int], None]) -> None:
@@ -45,11 +45,6 @@ class PeriodicThread:
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join()
-
-    @property
-    def has_failed(self) -> bool:
-        """Whether ``work`` has raised, which ends the thread."""
-        return bool(self._thread.ident) and not (self._thread.is_alive() or self._ending.is_set())
 
     @property
     def jitter(self) -> float:

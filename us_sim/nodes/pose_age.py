@@ -3,49 +3,57 @@
 from __future__ import annotations
 
 from builtin_interfaces.msg import Time as TimeMessage
-from rclpy.node import Node
-from rclpy.time import Time
 
+from us_sim.nodes.conversions import nanoseconds_of
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.settings import PoseAgeSettings
 
 __all__ = ["PoseAge"]
 
+REMEMBERED = 256
+"""Poses whose arrival is kept for the images at them."""
+
 
 class PoseAge:
-    """How long ago the newest pose was taken, and what that makes of an image at it.
+    """How long ago the newest pose came, and what that makes of an image at it.
 
-    A pose ages by its stamp, and from its arrival too, so that a tracker whose clock is ahead
-    does not look live when it has gone. How long is too long are the parameters of
+    A pose ages from its arrival: its stamp may be of another clock, such as that of a tracker
+    which is ahead, or of the day it was recorded. How long is too long are the parameters of
     `PoseAgeSettings`.
 
     Args:
         node: whose clock is used, and which gets the parameters.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: GuardedNode) -> None:
         self._node = node
-        self._stamp: int | None = None  # ns, of the newest pose
-        self._arrived = 0  # ns
+        self._arrivals: dict[int, int] = {}  # ns, by stamps in ns
         self._settings = LiveSettings(node, {"age": Group(PoseAgeSettings())})
 
     def came(self, stamp: TimeMessage) -> None:
         """A pose with that stamp has come."""
-        self._stamp = Time.from_msg(stamp).nanoseconds
-        self._arrived = self._now()
+        nanoseconds = nanoseconds_of(stamp)
+        self._arrivals.pop(nanoseconds, None)  # so that the newest comes last
+        self._arrivals[nanoseconds] = self._now()
+        if len(self._arrivals) > REMEMBERED:
+            del self._arrivals[next(iter(self._arrivals))]
 
     @property
     def pose(self) -> float | None:
         """Age of the newest pose, s; None before the first."""
-        if self._stamp is None:
+        if not self._arrivals:
             return None
-        now = self._now()
-        self._arrived = min(self._arrived, now)  # time may be set back, as when a bag starts again
-        return 1e-9 * max(now - self._stamp, now - self._arrived)
+        newest = next(reversed(self._arrivals))
+        return self._since(newest)
 
     def image(self, stamp: TimeMessage) -> float:
-        """Age of an image of the pose with that stamp, s: at least that of the newest pose."""
-        return max(self.pose or 0.0, 1e-9 * (self._now() - Time.from_msg(stamp).nanoseconds))
+        """Age of an image of the pose with that stamp, s, or of the oldest that is remembered."""
+        if not self._arrivals:
+            return 0.0
+        nanoseconds = nanoseconds_of(stamp)
+        known = nanoseconds in self._arrivals
+        return self._since(nanoseconds if known else next(iter(self._arrivals)))
 
     def word(self, age: float | None) -> str:
         """``live``, ``stale``, ``lost``, or ``waiting`` for the first."""
@@ -55,6 +63,13 @@ class PoseAge:
         if age > limits.lost_after:
             return "lost"
         return "stale" if age > limits.stale_after else "live"
+
+    def _since(self, stamp: int) -> float:
+        """s since the pose with that stamp came."""
+        now = self._now()
+        if self._arrivals[stamp] > now:  # time was set back, as when a bag starts again
+            self._arrivals[stamp] = now
+        return 1e-9 * (now - self._arrivals[stamp])
 
     def _now(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Callable
@@ -10,14 +11,19 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from us_sim.errors import PoseError
+from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pose_from, pose_message, transform_message
-from us_sim.nodes.newest import Newest
+from us_sim.nodes.conversions import (
+    nanoseconds_of,
+    pose_from,
+    pose_message,
+    stamp_message,
+    transform_message,
+)
+from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
@@ -87,21 +93,41 @@ class ProbeTracker(SceneNode):
     ) -> None:
         """Subscribe as drivers may publish, best effort; all that come count as received."""
 
+        qos = EVERY if self.lockstep else quality or FOREIGN
+        work = self._of_source(callback)
+
         def count(message: Any) -> None:
             self.health.received += 1
-            callback(message)
+            work(message)
 
-        self.listen(message_type, topic, count, EVERY if self.lockstep else quality or FOREIGN)
+        self.listen(message_type, topic, count, qos)
 
     def listen_to_newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
         """Likewise, but ``work`` gets the newest alone where it is slower than messages come."""
-        newest = Newest(self, self.health, work, lockstep=self.lockstep)
-        self.listen(message_type, topic, newest, EVERY if self.lockstep else FOREIGN)
+        qos = EVERY if self.lockstep else FOREIGN
+        self.newest(message_type, topic, self._of_source(work), qos)
 
     def in_tracker(self, work: Callable[[], None]) -> Callable[[], None]:
         """What another thread calls to have ``work`` done in this node's own."""
-        trigger: Callable[[], None] = self.create_guard_condition(work).trigger
+        guard = self.create_guard_condition(self._of_source(work))
+        trigger: Callable[[], None] = guard.trigger
         return trigger
+
+    def _of_source(self, work: Callable[..., None]) -> Callable[..., None]:
+        """The source's ``work``; should it fail, the source is reset, for it may be of no use."""
+
+        @functools.wraps(work)
+        def call(*arguments: Any) -> None:
+            try:
+                work(*arguments)
+            except UsSimError:
+                raise
+            except Exception:
+                self._input.reset()
+                self._tracking.reset()
+                raise
+
+        return call
 
     def is_awaited(self) -> bool:
         """Whether the simulation's other nodes are there and listen to the probe."""
@@ -111,7 +137,7 @@ class ProbeTracker(SceneNode):
 
     def every(self, seconds: float, work: Callable[[], None]) -> Any:
         """A timer, which has ``cancel``."""
-        return self.create_timer(seconds, work)
+        return self.create_timer(seconds, self._of_source(work))
 
     def say(self, sentence: str) -> None:
         """Tell a person."""
@@ -135,7 +161,7 @@ class ProbeTracker(SceneNode):
 
     def stamp_of(self, header: Header, topic: str) -> int:
         """When a device's message was measured, ns; its arrival where it does not say."""
-        stamp = Time.from_msg(header.stamp).nanoseconds
+        stamp = nanoseconds_of(header.stamp)
         if stamp == 0:
             name = self.resolve_topic_name(topic)
             self.health.problem("stamp", f"{name} has no stamp: its time of arrival is used")
@@ -159,6 +185,11 @@ class ProbeTracker(SceneNode):
             )
         return pose
 
+    def refused(self, where: str, error: UsSimError) -> None:
+        """Count and say what cannot be used, in the probe's status too."""
+        self._tracking.refuse(kind_of(error), str(error))
+        super().refused(where, error)
+
     def refuse(self, kind: str, sentence: str) -> None:
         """Count and say, now and then, why a device's message is not used."""
         self._tracking.refuse(kind, sentence)
@@ -166,6 +197,7 @@ class ProbeTracker(SceneNode):
 
     def take(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
+        stamp_message(measurement.stamp)  # before it is taken: it may be later than can be said
         distance = float(abs(measurement.pose.position).max())
         if distance > FARTHEST:
             self.refuse(
@@ -185,7 +217,7 @@ class ProbeTracker(SceneNode):
             self.health.problem(tracking.last_refused, f"{tracking.last_problem}; it is not used")
             self._check()
             return
-        stamp = Time(nanoseconds=max(probe.stamp, 0)).to_msg()
+        stamp = stamp_message(probe.stamp)
         self._poses.publish(pose_message(probe.pose, stamp, PATIENT))
         self.health.published("probe/pose", stamp)
         if self._transforms.get_subscription_count():

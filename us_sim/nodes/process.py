@@ -5,17 +5,22 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.guarded_node import GuardedNode
 
 __all__ = ["run_node"]
+
+HELPLESS_S = 10.0
+"""A node in which nothing has worked for so long ends: then somebody can start it again."""
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
@@ -35,11 +40,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     node: Any = None
     try:
         node = create()
-        finished = getattr(node, "finished", None)
-        if finished is None:
-            rclpy.spin(node)
-        else:
-            rclpy.spin_until_future_complete(node, finished)
+        spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except (UsSimError, ParameterException) as error:
@@ -56,6 +57,62 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         for number in _ENDINGS:
             signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
     return 0
+
+
+def spin(node: Node) -> None:
+    """Run the node's callbacks until its future ``finished``, if it has one, or rclpy is shut down.
+
+    Callbacks of a `GuardedNode` raise nothing, but rclpy does, for instance for a request of a
+    service that it cannot decode: that is counted and said as a failure of the node, too.
+
+    Raises:
+        ExternalShutdownException: rclpy was shut down.
+        Exception: what rclpy raises, where nothing but that has happened for ten seconds.
+    """
+    finished = getattr(node, "finished", None)
+    executor = _Executor(context=node.context)
+    executor.add_node(node)
+    worked = time.monotonic()
+    try:
+        while node.context.ok() and (finished is None or not finished.done()):
+            try:
+                executor.spin_once()
+                worked = time.monotonic()
+            except ExternalShutdownException:
+                raise
+            except Exception as error:
+                if not isinstance(node, GuardedNode) or not node.context.ok():
+                    raise
+                if time.monotonic() - worked > HELPLESS_S:
+                    raise
+                node.failed("what came in", error)
+    finally:
+        executor.remove_node(node)
+
+
+class _Executor(SingleThreadedExecutor):
+    """rclpy's own never serves a node again that has failed to take what came in for it."""
+
+    def _take_subscription(self, entity: Any) -> Any:
+        return self._taken(super()._take_subscription, entity)
+
+    def _take_service(self, entity: Any) -> Any:
+        return self._taken(super()._take_service, entity)
+
+    def _take_client(self, entity: Any) -> Any:
+        return self._taken(super()._take_client, entity)
+
+    def _taken(self, take: Callable[[Any], Any], entity: Any) -> Any:
+        """What is to be done with what came, as rclpy has it; a failure is raised only then."""
+        try:
+            return take(entity)
+        except Exception as error:
+            failure = error
+
+        async def fail() -> None:
+            raise failure
+
+        return fail
 
 
 def _interrupt_once(*_: object) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from us_sim.nodes.guarded_node import GuardedNode, decoded
 from us_sim.nodes.health import Health
 from us_sim.nodes.newest import Newest
 from us_sim.nodes.parameters import declared
@@ -20,7 +20,7 @@ from us_sim.scene.scene import Scene
 __all__ = ["SceneNode"]
 
 
-class SceneNode(Node):
+class SceneNode(GuardedNode):
     """A node that works on a scene.
 
     Its parameters are those of `SceneNodeSettings`.
@@ -32,7 +32,7 @@ class SceneNode(Node):
         self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
         self.lockstep = settings.lockstep
         self.threads = settings.threads
-        self.health = Health(self, self.scene.name)
+        self.health: Health = Health(self, self.scene.name)
 
     def stream(self, message_type: Any, topic: str) -> Publisher:
         """A publisher of what changes with every pose."""
@@ -46,9 +46,20 @@ class SceneNode(Node):
             message_type, topic, LATCHED, qos_overriding_options=overridable()
         )
 
-    def newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
-        """Call ``work`` with the newest message of ``topic`` (with each one in lockstep)."""
-        self.listen(message_type, topic, Newest(self, self.health, work, lockstep=self.lockstep))
+    def newest(
+        self,
+        message_type: Any,
+        topic: str,
+        work: Callable[[Any], None],
+        qos: QoSProfile | None = None,
+    ) -> None:
+        """Call ``work`` with the newest message of ``topic`` (with each one in lockstep).
+
+        What is skipped is not even decoded.
+        """
+        guarded = self.guarded(self.resolve_topic_name(topic), decoded(message_type, work))
+        newest = Newest(self, self.health, guarded, lockstep=self.lockstep)
+        self._subscribe(message_type, topic, newest, qos, raw=True)
 
     def listen(
         self,
@@ -58,7 +69,12 @@ class SceneNode(Node):
         qos: QoSProfile | None = None,
     ) -> None:
         """Subscribe to every message of ``topic``."""
+        self._subscribe(message_type, topic, callback, qos)
+
+    def _subscribe(
+        self, message_type: Any, topic: str, callback: Any, qos: QoSProfile | None, **options: Any
+    ) -> None:
         qos = qos or (EVERY if self.lockstep else STREAM)
         self.create_subscription(
-            message_type, topic, callback, qos, qos_overriding_options=overridable()
+            message_type, topic, callback, qos, qos_overriding_options=overridable(), **options
         )

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.node import Node
 
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import EVERY
 
 __all__ = ["SessionMonitor"]
 
 
-class SessionMonitor(Node):
+class SessionMonitor(GuardedNode):
     """Keeps the last report of each node, by its name without namespace."""
 
     def __init__(self, **kwargs: Any) -> None:

@@ -7,12 +7,12 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 from us_sim.errors import BagError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
@@ -26,7 +26,7 @@ START_S = 0.5
 """For subscribers to find the publishers before the first message."""
 
 
-class SessionPlayer(Node):
+class SessionPlayer(GuardedNode):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
 
     Its parameters are those of `SessionPlayerSettings`.

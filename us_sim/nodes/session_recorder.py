@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from us_sim.errors import BagError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
@@ -26,7 +26,7 @@ QUEUE = 1000
 """Messages a topic may be ahead of the disk."""
 
 
-class SessionRecorder(Node):
+class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
     Its parameters are those of `SessionRecorderSettings`. ``tissue/structures`` and

@@ -6,13 +6,18 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import cloud_message, mesh_message, pose_from, surface_marker
+from us_sim.nodes.conversions import (
+    cloud_message,
+    mesh_message,
+    nanoseconds_of,
+    pose_from,
+    surface_marker,
+)
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
@@ -50,11 +55,14 @@ class SkinDeformer(SceneNode):
         if not (wanted or shown):
             return
         stamp = message.header.stamp
+        pose = pose_from(message, "patient")
         try:
-            skin = self._membrane.deform(pose_from(message))
-        except UsSimError as error:
-            self.health.problem("pose", f"{error}; the skin stays as it was")
-            return
+            skin = self._membrane.deform(pose)
+        except UsSimError:
+            raise
+        except Exception:
+            self._membrane.reset()  # it may have been left halfway
+            raise
         if wanted:
             columns = [*skin.vertices.T, *skin.normals.T]
             names = ["x", "y", "z", "normal_x", "normal_y", "normal_z"]
@@ -70,7 +78,7 @@ class SkinDeformer(SceneNode):
 
     def _is_marker_due(self, message: PoseStamped) -> bool:
         """Whether a marker's time has passed since the last one, or the stamps went back."""
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        stamp = nanoseconds_of(message.header.stamp)
         rate = self._settings.values["markers"].marker_rate
         if 0 <= stamp - self._marked < 0.99e9 / rate:
             return False

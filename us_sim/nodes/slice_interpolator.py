@@ -7,16 +7,15 @@ from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.conversions import (
     affine_message,
     image_message,
+    nanoseconds_of,
     pose_from,
     tetrahedra_from,
     vectors_from,
@@ -106,30 +105,21 @@ class SliceInterpolator(SceneNode):
         """Once both halves of it are there."""
         if self._rest is None or self._tetrahedra is None:
             return
-        try:
-            self._scanner.carry(vectors_from(self._rest), tetrahedra_from(self._tetrahedra))
-            self._carried = True
-        except UsSimError as error:
-            self.health.problem("mesh", f"tissue mesh: {error}")
+        nodes = vectors_from(self._rest, "patient")
+        self._scanner.carry(nodes, tetrahedra_from(self._tetrahedra))
+        self._carried = True
 
     def _remember(self, message: PoseStamped) -> None:
         """Keep the pose until the nodes deformed by it arrive."""
-        pose = self._pose(message)
-        if pose is None:
-            return
-        self._poses[_nanoseconds(message)] = pose
+        self._poses[_nanoseconds(message)] = self._pose(message)
         while len(self._poses) > REMEMBERED:
             del self._poses[next(iter(self._poses))]
         if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
             self._image_deformed(self._unpaired)
 
-    def _pose(self, message: PoseStamped) -> Pose | None:
-        """The pose in a message, if it can be used."""
-        try:
-            pose = pose_from(message)
-        except UsSimError as error:
-            self.health.problem("pose", f"probe/pose: {error}; it is not used")
-            return None
+    def _pose(self, message: PoseStamped) -> Pose:
+        """The pose in a message."""
+        pose = pose_from(message, "patient")
         self._annotated.pose_came(message.header.stamp)
         return pose
 
@@ -142,9 +132,7 @@ class SliceInterpolator(SceneNode):
         self._image(message, pose, message)
 
     def _image_rigid(self, message: PoseStamped) -> None:
-        pose = self._pose(message)
-        if pose is not None:
-            self._image(message, pose, None)
+        self._image(message, self._pose(message), None)
 
     def _image(
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
@@ -153,13 +141,8 @@ class SliceInterpolator(SceneNode):
         if not (self._images.get_subscription_count() or self._annotated.is_wanted):
             return
         stamp = source.header.stamp
-        try:
-            nodes = None if tissue is None else vectors_from(tissue)
-            pixels = self._scanner.image(pose, nodes)
-        except UsSimError as error:
-            kind, topic = ("pose", "probe/pose") if tissue is None else ("mesh", "tissue/nodes")
-            self.health.problem(kind, f"{topic}: {error}; no image is made of it")
-            return
+        nodes = None if tissue is None else vectors_from(tissue, "patient")
+        pixels = self._scanner.image(pose, nodes)
         if self._images.get_subscription_count():
             self._images.publish(image_message(pixels, stamp, "probe"))
             self.health.published("ultrasound/image", stamp)
@@ -172,7 +155,7 @@ class SliceInterpolator(SceneNode):
 
 
 def _nanoseconds(message: PoseStamped | PointCloud2) -> int:
-    return Time.from_msg(message.header.stamp).nanoseconds
+    return nanoseconds_of(message.header.stamp)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -6,11 +6,11 @@ import sys
 import threading
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
@@ -24,7 +24,7 @@ RETRY_S = 1.0
 """How long a device that is not there is left alone."""
 
 
-class SpaceMouseDriver(Node):
+class SpaceMouseDriver(GuardedNode):
     """``spacenav/joy``: six axes in ±1 and the buttons, at each change and while nothing changes.
 
     Its parameters are those of `SpaceMouseDriverSettings`. While nothing changes the device itself
@@ -68,6 +68,9 @@ class SpaceMouseDriver(Node):
                 with self._lock:
                     self._problem = f"{error}; it is tried again"
                 self._guard.trigger()
+                self._closing.wait(RETRY_S)
+            except Exception as error:  # so that the thread does not end silently
+                self.failed("SpaceMouse", error)
                 self._closing.wait(RETRY_S)
 
     def _follow(self, mouse: SpaceMouse) -> None:

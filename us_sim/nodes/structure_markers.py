@@ -8,11 +8,10 @@ import time
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
-from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import structure_markers
+from us_sim.nodes.conversions import nanoseconds_of, structure_markers
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings
@@ -59,12 +58,12 @@ class StructureMarkers:
             return False
         if self._sent is None:
             return True
-        since = Time.from_msg(stamp).nanoseconds - self._sent
+        since = nanoseconds_of(stamp) - self._sent
         return not 0 <= since < 0.99e9 / self._settings.values["markers"].marker_rate
 
     def publish(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
         """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
-        self._sent = Time.from_msg(stamp).nanoseconds
+        self._sent = nanoseconds_of(stamp)
         surfaces = [
             (made.name, (*made.colour, 1.0), made.surface.carry(nodes), made.surface.triangles)
             for made in self._structures
@@ -81,6 +80,10 @@ class StructureMarkers:
         except UsSimError as error:
             self.state = str(error)
             self._node.health.problem("structures", f"{error}; no structure is shown")
+            return
+        except Exception as error:  # so that the thread does not end silently
+            self.state = "could not be made"
+            self._node.failed("tissue/structures", error)
             return
         count = sum(len(made.surface.triangles) for made in self._structures)
         names = ", ".join(made.name for made in self._structures)

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.errors import SceneError, UsSimError
+from us_sim.errors import SceneError
 from us_sim.nodes.conversions import (
     cloud_message,
     pose_from,
@@ -105,12 +105,8 @@ class TissueDeformer(SceneNode):
         shown = self._structures is not None and self._structures.is_due(stamp)
         if not (wanted or felt or touched or shown):
             return
-        try:
-            pose = pose_from(message)
-            deformation = self._live.deform(pose)
-        except UsSimError as error:
-            self.health.problem("pose", f"{error}; the tissue stays as it was")
-            return
+        pose = pose_from(message, "patient")
+        deformation = self._live.deform(pose)
         self._describe(deformation)
         if again and np.abs(deformation.nodes - self._sent).max() < VISIBLE_M:
             return

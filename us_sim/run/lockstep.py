@@ -139,6 +139,9 @@ def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None])
     changed, last = clock.now().nanoseconds, (-1, -1)
     while True:
         executor.spin_once(timeout_sec=0.05)
+        failure = next(filter(None, (getattr(node, "last_failure", "") for node in nodes)), "")
+        if failure:  # the node itself would go on
+            raise UsSimError(failure)
         state = (writer.count, recorder.health.received)
         now = clock.now().nanoseconds
         if state != last:

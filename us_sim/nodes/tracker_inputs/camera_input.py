@@ -35,6 +35,11 @@ class CameraInput(TrackerInput):
         ):
             device.listen_to_newest(message_type, topic, self._looking(topic, decode))
 
+    def reset(self) -> None:
+        """Forget where the probe was; the camera stays."""
+        if self._source is not None:
+            self._source.reset()
+
     def _describe(self, message: CameraInfo) -> None:
         """Look through this camera from now on; drivers repeat it with every image."""
         if self._described is not None and _is_same(message, self._described):

@@ -38,6 +38,9 @@ class TrackerInput:
         self._device = device
         self._settings = settings
 
+    def reset(self) -> None:
+        """Forget what was measured: it may be of no use, since taking a message has failed."""
+
     def close(self) -> None:
         """Let go of the device, where it is held by more than subscriptions."""
 
@@ -59,7 +62,11 @@ class Device(Protocol):
         """The pose in a message, if it is one and in the scene's frame; said when not."""
 
     def stamp_of(self, header: Header, topic: str) -> int:
-        """When a message was measured, ns; its arrival where it does not say."""
+        """When a message was measured, ns; its arrival where it does not say.
+
+        Raises:
+            StampError: the stamp is no time; raised on, the message is refused.
+        """
 
     def now(self) -> int:
         """The present, ns."""

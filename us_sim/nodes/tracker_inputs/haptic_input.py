@@ -21,6 +21,10 @@ class HapticInput(TrackerInput):
         device.listen_to_device(PoseStamped, "haptic/pose", self._take)
         device.listen_to_device(Bool, "haptic/clutch", self._clutch)
 
+    def reset(self) -> None:
+        """Forget the clutch."""
+        self._handle.reset()
+
     def _take(self, message: PoseStamped) -> None:
         pose = self._device.pose_in(message, "haptic/pose")
         if pose is None:

@@ -22,6 +22,10 @@ class SixDofMouseInput(TrackerInput):
         device.listen_to_device(Joy, "spacenav/joy", self._take_joy)
         device.listen_to_device(Twist, "spacenav/twist", self._take_twist)
 
+    def reset(self) -> None:
+        """Bring the probe home."""
+        self._mouse.reset()
+
     def _take_joy(self, message: Joy) -> None:
         self._has_joy = True
         stamp = self._device.stamp_of(message.header, "spacenav/joy")

@@ -213,6 +213,12 @@ class SwitchableTissue:
         """
         self.adopt(self.make(replace(self._plan, compared=name), progress))
 
+    def reset(self) -> None:
+        """Bring the tissue to rest, as after a frame that failed halfway."""
+        for solver in filter(None, (self._solver, self._beside)):
+            solver.reset()
+        self.difference = None
+
     def deform(self, pose: Pose | None) -> Deformation:
         """One frame of the solver in use, and of the one beside it."""
         deformation = self._solver.deform(pose)

@@ -35,6 +35,7 @@ _CONNECT_S = 2.0
 _LONGEST_POSES = 1 << 20  # bytes: a message with more than that is no list of poses
 _SKIPPED_AT_ONCE = 1 << 16
 _SAY_EVERY_S = 1.0
+_MOST_NAMES = 100  # of a server's bodies, to be told
 
 
 class OpenIGTLinkClient:
@@ -82,7 +83,7 @@ class OpenIGTLinkClient:
         while not self._closing.is_set():
             try:
                 self._converse()
-            except (OSError, TrackingError) as error:
+            except Exception as error:  # whatever it sends, it is tried again
                 if not self._closing.is_set():
                     why = getattr(error, "strerror", None) or error
                     self._problem(
@@ -142,7 +143,8 @@ class OpenIGTLinkClient:
 
     def _is_wanted(self, name: str) -> bool:
         """Whether a name is the body's; reports now and then when only others come."""
-        self._names[name] = None
+        if len(self._names) < _MOST_NAMES:
+            self._names[name] = None
         if self._body is None:
             if len(self._names) == 1:
                 return True

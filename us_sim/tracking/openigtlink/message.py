@@ -148,8 +148,13 @@ def image_message(
         pixels: (rows, columns).
         matrix: (4, 4), from (column, row, slice, 1) of pixel centres to m of the world.
         world: "ras" or "lps".
+
+    Raises:
+        TrackingError: OpenIGTLink has no images of that size.
     """
     rows, columns = pixels.shape
+    if max(rows, columns) > 65_535:
+        raise TrackingError(f"an image of {columns} × {rows} pixels is too large for OpenIGTLink")
     middle = matrix.copy()
     middle[:3, 3] = (matrix @ [(columns - 1) / 2, (rows - 1) / 2, 0.0, 1.0])[:3]
     # A map from pixels to metres becomes one to millimetres in all of its columns.

@@ -1,0 +1,349 @@
+"""Nothing that comes in ends a node: any message of any input, and bytes that are none."""
+
+import math
+import socket
+import warnings
+from array import array
+
+import cv2
+import numpy as np
+import pytest
+from any_message import damaged, messages, nearly
+from bench import pose_at
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import (
+    PoseArray,
+    PoseStamped,
+    TransformStamped,
+    Twist,
+    WrenchStamped,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy, PointCloud2
+from std_msgs.msg import Bool
+from tf2_msgs.msg import TFMessage
+
+from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes import conversions
+from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
+from us_sim.nodes.haptic_renderer import HapticRenderer
+from us_sim.nodes.health import Health
+from us_sim.nodes.image_writer import ImageWriter
+from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
+from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.skin_deformer import SkinDeformer
+from us_sim.nodes.slice_interpolator import SliceInterpolator
+from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene
+from us_sim.tracking.haptic.contact_model import ContactModel
+from us_sim.tracking.openigtlink.message import HEADER, header_of, poses_in
+
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+
+
+def transforms(parent, child, second):
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id, message.header.stamp = parent, Time(sec=second)
+    message.transform.rotation.w = 1.0
+    return TFMessage(transforms=[message])
+
+
+def joy(second=3):
+    message = Joy(axes=[0.1] * 6, buttons=[0, 1])
+    message.header.stamp = Time(sec=second)
+    return message
+
+
+def camera_info():
+    message = CameraInfo(width=8, height=6, distortion_model="plumb_bob", d=[0.0] * 5)
+    message.k = [9.0, 0.0, 4.0, 0.0, 9.0, 3.0, 0.0, 0.0, 1.0]
+    return message
+
+
+def grey(second=3):
+    pixels = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    return conversions.image_message(pixels, Time(sec=second), "probe")
+
+
+def contact_model():
+    stiffness = np.diag([1.0, 2, 3, 4, 5, 6])
+    return conversions.contact_model_message(
+        ContactModel(3_000_000_000, Pose(), np.arange(6.0), stiffness)
+    )
+
+
+def cloud(points=CORNERS, second=3):
+    columns = dict(zip("xyz", np.asarray(points).T, strict=True))
+    return conversions.cloud_message(columns, Time(sec=second), "patient")
+
+
+def poses_of(second=3):
+    message = PoseArray(poses=[pose_at(0.001, second).pose] * 2)
+    message.header = pose_at(0.0, second).header
+    return message
+
+
+GOOD = [
+    (conversions.pose_from, pose_at(0.001, 3)),
+    (conversions.vectors_from, cloud()),
+    (conversions.pixels_from, grey()),
+    (conversions.tetrahedra_from, conversions.tetrahedra_message(np.array([[0, 1, 2, 3]]))),
+    (conversions.affine_from, conversions.affine_message(np.eye(4))),
+    (conversions.contact_model_from, contact_model()),
+    (grey_from, grey()),
+    (grey_from_compressed, CompressedImage(format="png", data=array("B", b"\x89PNG\r\n"))),
+    (camera_from, camera_info()),
+]
+
+
+def numbers_of(value):
+    """All numbers of what a conversion has made."""
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64).ravel()
+    parts = [part for part in vars(value).values() if isinstance(part, np.ndarray | Pose)]
+    return np.concatenate([numbers_of(part) for part in parts])
+
+
+@pytest.mark.parametrize(("convert", "good"), GOOD, ids=lambda case: getattr(case, "__name__", ""))
+def test_what_a_conversion_makes_of_any_message_is_finite_or_it_says_why_not(convert, good):
+    @settings(max_examples=150, deadline=None)
+    @given(nearly(good) | messages(type(good)))
+    def check(message):
+        try:
+            made = convert(message)
+        except UsSimError:
+            return
+        numbers = numbers_of(made)
+        assert np.isfinite(numbers).all()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert math.isfinite(float(numbers @ numbers))  # nor do their products overflow
+
+    check()
+
+
+def send(node, topic, message):
+    """As its executor does when a message has come, or bytes."""
+    (callback,) = (s.callback for s in node.subscriptions if s.topic_name == f"/{topic}")
+    callback(message if isinstance(message, bytes) else serialize_message(message))
+
+
+def attack(bench, node, inputs, count):
+    """Send any messages, and bytes that are none; what failed, but was not refused, is said."""
+
+    @settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.data())
+    def once(data):
+        topic = data.draw(st.sampled_from(sorted(inputs)))
+        good = inputs[topic](data.draw(st.integers(1, 9)))
+        kinds = nearly(good) | messages(type(good)) | damaged(serialize_message(good))
+        send(node, topic, data.draw(kinds | st.just(good)))
+        for _ in range(3):  # where the newest is worked on, not at once
+            bench.executor.spin_once(timeout_sec=0.0)
+
+    once()
+    assert not node.failures, node.last_failure
+    assert node.health.problems("message") > 0
+
+
+def is_finite(message):
+    """Whether all numbers of a message are, those of its parts and of its points too."""
+    if isinstance(message, PointCloud2):
+        return bool(np.isfinite(np.frombuffer(message.data, "<f4")).all())
+    for name, kind in type(message).get_fields_and_field_types().items():
+        value = getattr(message, name)
+        values = value if isinstance(value, list) else [value]
+        if "/" in kind and not all(map(is_finite, values)):
+            return False
+        if kind.startswith(("float", "double", "sequence<float", "sequence<double")) and not (
+            np.isfinite(np.array(value, np.float64)).all()
+        ):
+            return False
+    return True
+
+
+def answers(bench, send_good, outputs):
+    """Good messages until there is an answer to one of them; all that came is finite."""
+    count, second = len(outputs), 100_000
+
+    def came():
+        nonlocal second
+        second += 1
+        send_good(second)
+        bench.spin_for(3)
+        return any(message.header.stamp.sec > 100_000 for message in outputs[count:])
+
+    bench.spin_until(came)
+    assert all(map(is_finite, outputs))
+
+
+def marker_image(second):
+    pixels = np.full((480, 640), 255, np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    pixels[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary, 7, 80)
+    return conversions.image_message(pixels, Time(sec=second), "camera")
+
+
+def wide_camera(_):
+    message = CameraInfo(width=640, height=480, distortion_model="plumb_bob", d=[0.0] * 5)
+    message.k = [500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0]
+    return message
+
+
+def compressed(second):
+    message = CompressedImage(format="png")
+    message.header.stamp = Time(sec=second)
+    message.data = array("B", cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes())
+    return message
+
+
+def pose(second):
+    return pose_at(0.001, second)
+
+
+SOURCES = {
+    "{source: pose}": {"tracker/pose": pose},
+    "{source: pose_array, entry: 1}": {"tracker/poses": poses_of},
+    "{source: tf, frame: tracker, body: marker}": {
+        "tf_static": lambda second: transforms("arm", "marker", second),
+        "tf": lambda second: transforms("tracker", "arm", second),
+    },
+    "{source: six_dof_mouse}": {"spacenav/twist": lambda _: Twist(), "spacenav/joy": joy},
+    "{source: haptic}": {"haptic/clutch": lambda _: Bool(), "haptic/pose": pose},
+    "{source: camera, camera: {dictionary: 4X4_50, marker: 7, size: 40 mm}}": {
+        "camera/camera_info": wide_camera,
+        "camera/image_raw/compressed": compressed,
+        "camera/image_raw": marker_image,
+    },
+}
+
+
+@pytest.mark.parametrize(("section", "inputs"), SOURCES.items())
+def test_no_message_of_any_source_ends_the_tracker(bench, small_scene, tmp_path, section, inputs):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(f"{small_scene.read_text()}\ntracker: {section}\n")
+    node = bench.make(ProbeTracker, scene=str(scene), lockstep=True)
+    poses = bench.collect(PoseStamped, "probe/pose")
+    attack(bench, node, inputs, 120)
+
+    def good(second):
+        for topic, make in inputs.items():
+            send(node, topic, make(second))
+
+    answers(bench, good, poses)
+
+
+@pytest.mark.parametrize(
+    ("kind", "output"), [(TissueDeformer, "tissue/nodes"), (SkinDeformer, "skin/nodes")]
+)
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_no_pose_ends_what_is_deformed(bench, small_scene, kind, output, lockstep):
+    node = bench.make(kind, scene=str(small_scene), lockstep=lockstep)
+    clouds = bench.collect(PointCloud2, output)
+    bench.spin_until(lambda: bench.peer.count_publishers(output) > 0)
+    bench.spin_for(5)
+    attack(bench, node, {"probe/pose": pose}, 60)
+    answers(bench, lambda second: send(node, "probe/pose", pose(second)), clouds)
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_no_mesh_and_no_pose_end_the_slicing(bench, small_scene, lockstep):
+    scene = load_scene(small_scene)
+    mesh = tissue_model_of(scene, volume_of(scene)).mesh
+    node = bench.make(SliceInterpolator, scene=str(small_scene), lockstep=lockstep)
+    images = bench.collect(Image, "ultrasound/image")
+    bench.collect(Image, "ultrasound/image_annotated")
+    bench.spin_until(lambda: node._images.get_subscription_count() > 0)
+    tetrahedra = conversions.tetrahedra_message(mesh.tetrahedra)
+    inputs = {
+        "probe/pose": pose,
+        "tissue/rest": lambda second: cloud(mesh.nodes, second),
+        "tissue/tetrahedra": lambda _: tetrahedra,
+        "tissue/nodes": lambda second: cloud(mesh.nodes, second),
+    }
+    attack(bench, node, inputs, 150)
+
+    def good(second):
+        for topic, make in inputs.items():
+            send(node, topic, make(second))
+
+    answers(bench, good, images)
+
+
+def test_no_message_ends_the_bridge(bench, small_scene, monkeypatch):
+    node = bench.make(OpenIGTLinkBridge, scene=str(small_scene), host="127.0.0.1", port=0)
+    sent = []
+    monkeypatch.setattr(node._server, "send", lambda name, data: sent.append((name, data)))
+    inputs = {
+        "ultrasound/image_to_probe": lambda _: conversions.affine_message(np.eye(4)),
+        "probe/pose": pose,
+        "ultrasound/image": grey,
+    }
+    with socket.create_connection(("127.0.0.1", node.port)):
+        bench.spin_until(lambda: node._server.clients == 1)
+        attack(bench, node, inputs, 150)
+        count = len(sent)
+        for topic, make in inputs.items():
+            send(node, topic, make(100_001))
+        bench.spin_for(5)
+    names = {name for name, _ in sent[count:]}
+    assert names == {"ProbeToReference", "ImageToReference", "Image_Reference"}
+    for name, data in sent:
+        if name != "Image_Reference":
+            ((_, matrix),) = poses_in(header_of(data[: HEADER.size]), data[HEADER.size :])
+            assert np.isfinite(matrix).all()
+
+
+def test_no_message_ends_the_rendering_for_the_hand(bench, small_scene, tmp_path):
+    scene = tmp_path / "haptic.yaml"
+    section = "{source: haptic, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s}}"
+    scene.write_text(f"{small_scene.read_text()}\ntracker: {section}\n")
+    node = bench.make(HapticRenderer, scene=str(scene))
+    wrenches = bench.collect(WrenchStamped, "haptic/wrench")
+    bench.spin_until(lambda: wrenches)
+    inputs = {
+        "haptic/pose": pose,
+        "haptic/clutch": lambda _: Bool(),
+        "tissue/contact_model": lambda _: contact_model(),
+    }
+    attack(bench, node, inputs, 300)
+    moment, wrench = 0, np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+    send(node, "haptic/clutch", Bool())
+
+    def is_felt():
+        nonlocal moment
+        moment += 1_000_000
+        message = pose_at(0.001, 0)
+        message.header.stamp = conversions.stamp_message(100_000 * 10**9 + moment)
+        send(node, "haptic/pose", message)
+        bench.spin_for(2)
+        stiffness = np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
+        model = ContactModel(
+            conversions.nanoseconds_of(message.header.stamp), Pose([0, 0, 0.001]), wrench, stiffness
+        )
+        send(node, "tissue/contact_model", conversions.contact_model_message(model))
+        return wrenches[-1].wrench.force.z == pytest.approx(-1.0)
+
+    bench.spin_until(is_felt)
+    assert all(map(is_finite, wrenches))
+
+
+def test_no_image_ends_the_writing_of_images(bench, tmp_path):
+    node = bench.make(ImageWriter, folder=str(tmp_path))
+    node.health = Health(node, "images")
+    attack(bench, node, {"ultrasound/image": grey}, 60)
+    count = node.count
+    send(node, "ultrasound/image", grey())
+    assert node.count == count + 1
+    written = cv2.imread(str(tmp_path / f"{count:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(written, conversions.pixels_from(grey()))

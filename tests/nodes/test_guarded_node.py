@@ -1,0 +1,256 @@
+"""A node goes on whatever comes in: bad input is refused, a failure counted, said and survived."""
+
+import time
+from pathlib import Path
+
+import pytest
+from bench import pose_at
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import ExternalShutdownException
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
+
+from us_sim.errors import PoseError
+from us_sim.nodes import guarded_node, process
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
+from us_sim.nodes.probe_tracker import ProbeTracker
+
+
+class Broken(GuardedNode):
+    """A node with health, whose callbacks fail as long as they are told to."""
+
+    def __init__(self, **kwargs):
+        super().__init__("broken", **kwargs)
+        self.health = Health(self, "test")
+        self.error = None
+        self.calls = 0
+
+    def work(self, *_):
+        self.calls += 1
+        if self.error is not None:
+            raise self.error
+
+
+@pytest.fixture
+def broken(bench):
+    return bench.make(Broken)
+
+
+@pytest.fixture
+def said(broken, monkeypatch):
+    """What the node logs: level and sentence."""
+    lines = []
+    log = broken.get_logger()
+    for level in ("error", "warning", "debug"):
+        monkeypatch.setattr(
+            type(log), level, lambda _, text, level=level, **__: lines.append((level, text))
+        )
+    return lines
+
+
+def test_a_failing_subscription_is_counted_said_once_a_second_and_goes_on(bench, broken, said):
+    broken.create_subscription(PoseStamped, "pose", broken.work, 100)
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    poses = bench.publisher(PoseStamped, "pose")
+    broken.error = ValueError("a\nbug")
+    for second in range(1, 31):
+        poses.publish(pose_at(0.0, second))
+    bench.spin_until(lambda: broken.calls == 30)
+    assert broken.failures == {"/pose": 30}
+    assert broken.last_failure == "/pose: ValueError: a bug"
+    errors = [text for level, text in said if level == "error"]
+    assert errors[0].startswith("/pose: ValueError: a bug; the node goes on")
+    assert len(errors) <= 3  # a slow machine may take more than a second for all
+    traces = [text for level, text in said if level == "debug" and "Traceback" in text]
+    assert len(traces) == len(errors)
+    assert "raise self.error" in traces[0]
+
+    def level():
+        return [r.status[0].level for r in reports if r.status[0].message == broken.last_failure]
+
+    bench.spin_until(level)
+    assert level() == [DiagnosticStatus.ERROR]
+    values = {item.key: item.value for item in reports[-1].status[0].values}
+    assert values["failed /pose"] == "30"
+    broken.error = None
+    poses.publish(pose_at(0.0, 31))
+    bench.spin_until(lambda: broken.calls == 31)
+    assert broken.failures.total() == 30
+
+
+def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
+    broken.create_subscription(PoseStamped, "pose", broken.work, 10)
+    poses = bench.publisher(PoseStamped, "pose")
+    broken.error = PoseError("it is nowhere")
+    poses.publish(pose_at(0.0, 1))
+    bench.spin_until(lambda: broken.health.problems("pose") == 1)
+    assert not broken.failures
+
+
+def test_timers_and_guard_conditions_go_on(bench, broken):
+    broken.error = RuntimeError("a bug")
+    broken.create_timer(0.01, broken.work)
+    bench.spin_until(lambda: broken.failures["timer Broken.work"] >= 3)
+    guard = broken.create_guard_condition(broken.work)
+    for count in (1, 2):
+        guard.trigger()
+        bench.spin_until(lambda count=count: broken.failures["Broken.work"] == count)
+
+
+def test_a_request_that_fails_has_an_answer(bench, broken):
+    def fail(_, __):
+        raise RuntimeError("a bug")
+
+    broken.create_service(SetParameters, "set", fail)
+    client = bench.peer.create_client(SetParameters, "set")
+    bench.spin_until(client.service_is_ready)
+    for count in (1, 2):
+        answer = client.call_async(SetParameters.Request())
+        bench.spin_until(answer.done)
+        assert list(answer.result().results) == []
+        assert broken.failures["service set"] == count
+
+
+def test_a_parameter_whose_check_fails_is_refused(broken):
+    broken.declare_parameter("depth", 1)
+    broken.add_on_set_parameters_callback(broken.work)
+    broken.error = KeyError("a bug")
+    (result,) = broken.set_parameters([Parameter("depth", value=2)])
+    assert not result.successful
+    assert "see the node's log" in result.reason
+    assert broken.get_parameter("depth").value == 1
+
+
+def test_what_ends_a_node_still_does(broken):
+    for ending in (KeyboardInterrupt, ExternalShutdownException, SystemExit):
+        broken.error = ending()
+        with pytest.raises(ending):
+            broken.guarded("here", broken.work)()
+    assert not broken.failures
+
+
+GOOD = serialize_message(pose_at(0.001, 3))
+LENGTH_OF_FRAME = slice(12, 16)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        GOOD[:3],
+        GOOD[:4],
+        GOOD[:20],
+        GOOD[:-1],
+        GOOD[: LENGTH_OF_FRAME.start] + b"\xff\xff\xff\xff" + GOOD[LENGTH_OF_FRAME.stop :],
+    ],
+    ids=len,
+)
+def test_bytes_that_are_no_message_never_reach_a_callback(broken, data):
+    take = broken.guarded("/pose", guarded_node.decoded(PoseStamped, broken.work))
+    take(data)
+    assert (broken.calls, broken.health.problems("message")) == (0, 1)
+    take(GOOD)
+    assert broken.calls == 1
+
+
+@pytest.mark.parametrize(
+    ("bad", "kind"),
+    [
+        (pose_at(0.0, -1), "stamp"),
+        (Time(sec=2_147_483_647, nanosec=4_294_967_295), "stamp"),
+        (Time(sec=1, nanosec=1_000_000_000), "stamp"),
+        (Time(sec=2_147_483_647), "stamp"),
+        (pose_at(0.0, 8, w=0.0), "pose"),
+        (pose_at(0.0, 8, w=1e308), "pose"),
+        (pose_at(0.0, 8, w=5e-324), "pose"),
+        (pose_at(1e308, 8), "pose"),
+        (GOOD[:20], "message"),
+    ],
+)
+def test_one_message_over_the_network_does_not_end_the_tracker(bench, small_scene, bad, kind):
+    if isinstance(bad, Time):
+        stamp, bad = bad, pose_at(0.0, 8)
+        bad.header.stamp = stamp
+    node = bench.make(ProbeTracker, scene=str(small_scene), lockstep=True)
+    poses = bench.collect(PoseStamped, "probe/pose")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("probe/pose") > 0)
+    publisher.publish(bad)
+    publisher.publish(pose_at(0.002, 9))
+    bench.spin_until(lambda: poses)
+    assert [(p.header.stamp.sec, p.pose.position.z) for p in poses] == [(9, 0.002)]
+    assert node.health.problems(kind) == 1
+    assert not node.failures
+
+
+def test_a_source_that_fails_is_reset_and_goes_on(bench, small_scene, tmp_path, monkeypatch):
+    scene = tmp_path / "haptic.yaml"
+    scene.write_text(f"{small_scene.read_text()}\ntracker: {{source: haptic}}\n")
+    node = bench.make(ProbeTracker, scene=str(scene), lockstep=True)
+    poses = bench.collect(PoseStamped, "probe/pose")
+    publisher = bench.publisher(PoseStamped, "haptic/pose")
+    handle = node._input._handle
+    handle.clutch(True)
+    with monkeypatch.context() as patched:
+        patched.setattr(handle, "take", None)
+        publisher.publish(pose_at(0.001, 1))
+        bench.spin_until(lambda: node.failures["/haptic/pose"] == 1)
+    assert not handle.is_held
+    for second in range(2, 302):
+        publisher.publish(pose_at(0.001, second))
+        bench.spin_for(1)
+    bench.spin_until(lambda: len(poses) == 300)
+
+
+def test_latency_counts_from_arrival_where_stamps_are_of_another_clock(broken, said):
+    monotonic = time.monotonic_ns()
+    now = broken.get_clock().now().nanoseconds
+    for age, expected in ((0.02, 20.0), (95_332_936.7, 5.0), (95_332_936.8, 5.0), (-3600.0, 5.0)):
+        broken.arrived = monotonic - 5_000_000
+        nanoseconds = now - round(1e9 * age)
+        broken.health.published("out", Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
+        late = 1e-6 * (time.monotonic_ns() - monotonic)
+        assert expected - 1.0 < broken.health._latencies[-1] < expected + late + 5.0
+    (warning,) = (text for level, text in said if level == "warning")
+    assert "95332936.7 s old, so they are of another clock" in warning
+
+
+def test_spinning_survives_what_rclpy_raises(bench, broken, monkeypatch):
+    bench.executor.remove_node(broken)
+    original, raised = process._Executor.spin_once, []
+
+    def spin_once(executor):
+        if len(raised) < 3:
+            raised.append(1)
+            raise RuntimeError("failed to take request")
+        original(executor)
+
+    monkeypatch.setattr(process._Executor, "spin_once", spin_once)
+    broken.finished = Future()
+    broken.create_timer(0.01, lambda: broken.finished.set_result(None))
+    process.spin(broken)
+    assert broken.failures == {"what came in": 3}
+
+
+def test_spinning_ends_where_nothing_works_any_more(bench, broken, monkeypatch):
+    bench.executor.remove_node(broken)
+    monkeypatch.setattr(process, "HELPLESS_S", 0.05)
+
+    def spin_once(_):
+        raise RuntimeError("no executor at all")
+
+    monkeypatch.setattr(process._Executor, "spin_once", spin_once)
+    with pytest.raises(RuntimeError, match="no executor at all"):
+        process.spin(broken)
+    assert broken.failures["what came in"] > 1
+
+
+def test_every_node_is_guarded():
+    folder = Path(guarded_node.__file__).parent
+    bare = [file.stem for file in folder.glob("*.py") if "(Node):" in file.read_text("utf-8")]
+    assert bare == ["guarded_node"]

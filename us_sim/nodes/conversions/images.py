@@ -1,0 +1,105 @@
+"""Grey and colour images, and where their pixels are."""
+
+from __future__ import annotations
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from us_sim.errors import ProbeError, VolumeError
+from us_sim.nodes.conversions.packing import packed
+
+__all__ = [
+    "affine_from",
+    "affine_message",
+    "bgr_image_message",
+    "colour_image_message",
+    "image_message",
+    "pixels_from",
+]
+
+_LARGEST = 1e6
+"""m, of a pixel, or to the first one."""
+
+
+def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """A ``mono8`` image of (rows, columns) pixels."""
+    return _image(pixels, "mono8", 1, stamp, frame)
+
+
+def colour_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """An ``rgb8`` image of (rows, columns, 3) pixels: red, green, blue."""
+    return _image(pixels, "rgb8", 3, stamp, frame)
+
+
+def bgr_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
+    """A ``bgr8`` image of (rows, columns, 3) pixels, as OpenCV has them."""
+    return _image(pixels, "bgr8", 3, stamp, frame)
+
+
+def _image(pixels: NDArray[np.uint8], encoding: str, size: int, stamp: Time, frame: str) -> Image:
+    message = Image()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.height, message.width = pixels.shape[:2]
+    message.encoding = encoding
+    message.is_bigendian = 0
+    message.step = size * message.width
+    message.data = packed("B", pixels)
+    return message
+
+
+def pixels_from(message: Image) -> NDArray[np.uint8]:
+    """The (rows, columns) pixels of a ``mono8`` image.
+
+    Raises:
+        VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
+    """
+    if message.encoding not in ("mono8", "8UC1"):
+        raise VolumeError(f"the image is {message.encoding}; it must be mono8")
+    rows, columns = int(message.height), int(message.width)
+    step = int(message.step) or columns
+    if not rows or not columns or step < columns or len(message.data) < rows * step:
+        raise VolumeError(
+            f"the image holds {len(message.data)} bytes, but says it has {rows} rows of {columns} "
+            f"pixels in {step} bytes each"
+        )
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=rows * step)
+    return flat.reshape(rows, step)[:, :columns]
+
+
+def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
+    """A (4, 4) affine map, row after row."""
+    message = Float64MultiArray()
+    message.layout.dim = [
+        MultiArrayDimension(label="row", size=4, stride=16),
+        MultiArrayDimension(label="column", size=4, stride=4),
+    ]
+    message.data = packed("d", matrix.astype(np.float64))
+    return message
+
+
+def affine_from(message: Float64MultiArray) -> NDArray[np.float64]:
+    """The (4, 4) affine map in a message.
+
+    Raises:
+        ProbeError: it is no 4 by 4 matrix, its last row is not 0 0 0 1, or a number of it is not
+            finite, or so large that products of it would not be.
+    """
+    sizes = tuple(dimension.size for dimension in message.layout.dim)
+    strides = tuple(dimension.stride for dimension in message.layout.dim)
+    count, offset = len(message.data), message.layout.data_offset
+    if sizes != (4, 4) or strides[1] != 4 or count != offset + 16:
+        raise ProbeError(
+            f"the matrix has {count} numbers from {offset} on in dimensions {list(sizes)} with "
+            f"strides {list(strides)}; it must be 4 by 4, row after row (strides 16 and 4)"
+        )
+    matrix = np.array(message.data[offset:], dtype=np.float64).reshape(4, 4)
+    if not ((np.abs(matrix) <= _LARGEST).all() and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()):
+        raise ProbeError(
+            f"the matrix {matrix.tolist()} is not an affine map: give finite numbers, and "
+            f"0 0 0 1 as the last row"
+        )
+    return matrix

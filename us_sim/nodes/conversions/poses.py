@@ -1,0 +1,108 @@
+"""Poses, transforms and wrenches."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
+from numpy.typing import NDArray
+
+from us_sim.errors import PoseError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.conversions.packing import CDR_LITTLE_ENDIAN
+from us_sim.nodes.conversions.stamps import require_frame
+
+__all__ = [
+    "pose_from",
+    "pose_message",
+    "transform_from",
+    "transform_message",
+    "wrench_message",
+    "wrench_serialized",
+]
+
+_FARTHEST = 1e7
+"""m: from the middle of the Earth everything is nearer, but for what is no place."""
+
+
+def pose_from(message: PoseStamped, frame: str | None = None) -> Pose:
+    """The pose in a message.
+
+    Args:
+        message: of any device or node.
+        frame: that it must be in; None is any.
+
+    Raises:
+        PoseError: it is not finite, beyond any place, or its quaternion has no length to speak of.
+        MessageError: it is in another frame.
+    """
+    require_frame(message.header, frame)
+    return _pose(message.pose.position, message.pose.orientation)
+
+
+def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
+    """``pose`` of the probe in ``frame``."""
+    message = PoseStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = map(float, pose.position)
+    q.x, q.y, q.z, q.w = map(float, pose.orientation)
+    return message
+
+
+def transform_from(message: TransformStamped) -> Pose:
+    """The child's pose in the frame of a transform's header.
+
+    Raises:
+        PoseError: as for `pose_from`.
+    """
+    return _pose(message.transform.translation, message.transform.rotation)
+
+
+def _pose(p: Any, q: Any) -> Pose:
+    pose = Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+    if max(map(abs, (p.x, p.y, p.z))) > _FARTHEST:
+        raise PoseError(
+            f"the pose is at ({p.x:.3g}, {p.y:.3g}, {p.z:.3g}) m, which is no place: positions are "
+            f"in metres"
+        )
+    return pose
+
+
+def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:
+    """The same transform for tf."""
+    message = TransformStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    message.child_frame_id = child
+    t, q = message.transform.translation, message.transform.rotation
+    t.x, t.y, t.z = map(float, pose.position)
+    q.x, q.y, q.z, q.w = map(float, pose.orientation)
+    return message
+
+
+def wrench_message(
+    force: NDArray[np.float64], torque: NDArray[np.float64], stamp: Time, frame: str
+) -> WrenchStamped:
+    """Force (3,) N and torque (3,) N m about the origin of ``frame``."""
+    message = WrenchStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    f, t = message.wrench.force, message.wrench.torque
+    f.x, f.y, f.z = map(float, force)
+    t.x, t.y, t.z = map(float, torque)
+    return message
+
+
+def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
+    """Force and torque (6,) N, N m about the origin of ``frame`` at ns, as a WrenchStamped.
+
+    Written here it takes a tenth of the time, for those who send a thousand a second.
+    """
+    name = frame.encode() + b"\0"
+    head = struct.pack(f"@iII{len(name)}s0d", *divmod(stamp, 1_000_000_000), len(name), name)
+    return CDR_LITTLE_ENDIAN + head + wrench.astype("<f8").tobytes()

@@ -1,0 +1,196 @@
+"""A node that goes on whatever comes in, and says what it could not use."""
+
+from __future__ import annotations
+
+import inspect
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+
+from us_sim.errors import MessageError, UsSimError
+from us_sim.nodes.conversions.stamps import require_stamp
+
+if TYPE_CHECKING:
+    from us_sim.nodes.health import Health
+
+__all__ = ["GuardedNode", "decoded", "kind_of"]
+
+SAY_S = 1.0
+"""How long the same failure is not said again."""
+HEADER_SIZE = 4
+"""Bytes that every serialized message begins with."""
+LONGEST = 500
+"""Characters of a sentence: an error may quote all of a message."""
+
+
+class GuardedNode(Node):
+    """Every callback of it is guarded: what it raises ends neither the callback's node nor others.
+
+    Bad input, an error of this package, is *refused*: said, and counted by its kind. Any other
+    exception is a *failure*: counted by where it happened, said once a second at most, its
+    traceback at log level debug. `Health` puts both in diagnostics.
+
+    Messages are taken as bytes and decoded here, so that those which cannot be are refused, too,
+    and so are those whose stamps are no time. Subscribers that ask for ``raw`` get the bytes.
+    """
+
+    health: Health  # where the node has one
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        self.failures: Counter[str] = Counter()
+        self.last_failure = ""
+        self.arrived = time.monotonic_ns()
+        """When what is being worked on came, ns of the monotonic clock."""
+        self._said: dict[str, float] = {}
+        super().__init__(name, **kwargs)
+
+    def refused(self, where: str, error: UsSimError) -> None:
+        """Count and say that something which came in cannot be used."""
+        sentence = _shortened(f"{where}: {error}; it is not used")
+        if hasattr(self, "health"):
+            self.health.problem(kind_of(error), sentence)
+        elif self._is_time_to_say(where):
+            self.get_logger().warning(sentence)
+
+    def failed(self, where: str, error: Exception) -> None:
+        """Count and say an exception that nobody expected; any thread may."""
+        text = " ".join(str(error).split())
+        self.failures[where] += 1
+        self.last_failure = _shortened(f"{where}: {type(error).__name__}: {text}")
+        if self._is_time_to_say(where):
+            self.get_logger().error(
+                f"{self.last_failure}; the node goes on (failure {self.failures[where]} of this "
+                f"kind; the traceback is at log level debug)"
+            )
+            self.get_logger().debug("".join(traceback.format_exception(error)))
+
+    def guarded(
+        self,
+        where: str,
+        callback: Callable[..., Any],
+        otherwise: Callable[..., Any] = lambda *_: None,
+    ) -> Callable[..., Any]:
+        """The callback, which raises no more, unless the node is being ended.
+
+        Args:
+            where: the topic, or what else a person knows it by.
+            callback: takes what it takes.
+            otherwise: gives what is returned when the callback raises, from the same arguments.
+        """
+
+        def call(*arguments: Any) -> Any:
+            try:
+                return callback(*arguments)
+            except ExternalShutdownException:
+                raise
+            except Exception as error:
+                if not self.context.ok():
+                    raise  # whatever was broken off by the end
+                if isinstance(error, UsSimError):
+                    self.refused(where, error)
+                else:
+                    self.failed(where, error)
+                return otherwise(*arguments)
+
+        return call
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Any:
+        """As `rclpy.node.Node.create_subscription`, guarded."""
+        if not options.pop("raw", False):
+            callback = decoded(msg_type, callback)
+        where = self.resolve_topic_name(topic)
+        entered = self._entered(where, callback)
+        return super().create_subscription(
+            msg_type, topic, entered, qos_profile, raw=True, **options
+        )
+
+    def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
+        """As `rclpy.node.Node.create_timer`, guarded."""
+        entered = self._entered(f"timer {_name(callback)}", callback)
+        return super().create_timer(timer_period_sec, entered, *args, **kw)
+
+    def create_guard_condition(self, callback: Any, *args: Any, **kw: Any) -> Any:
+        """As `rclpy.node.Node.create_guard_condition`, guarded."""
+        return super().create_guard_condition(self._entered(_name(callback), callback), *args, **kw)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
+        """As `rclpy.node.Node.create_service`, guarded: a request that fails has its answer too."""
+        entered = self._entered(f"service {srv_name}", callback, lambda _, response: response)
+        return super().create_service(srv_type, srv_name, entered, **options)
+
+    def add_on_set_parameters_callback(self, callback: Any) -> None:
+        """As `rclpy.node.Node.add_on_set_parameters_callback`: what fails refuses the change."""
+
+        def refuse(_: Any) -> SetParametersResult:
+            return SetParametersResult(successful=False, reason="it failed; see the node's log")
+
+        super().add_on_set_parameters_callback(self.guarded("parameters", callback, refuse))
+
+    def add_post_set_parameters_callback(self, callback: Any) -> None:
+        """As `rclpy.node.Node.add_post_set_parameters_callback`, guarded."""
+        super().add_post_set_parameters_callback(self.guarded("parameters", callback))
+
+    def _entered(
+        self, where: str, callback: Any, otherwise: Callable[..., Any] = lambda *_: None
+    ) -> Callable[..., Any]:
+        """The guarded callback, which says when it began; rclpy looks at its arguments."""
+        guarded = self.guarded(where, callback, otherwise)
+
+        def enter(*arguments: Any) -> Any:
+            self.arrived = time.monotonic_ns()
+            return guarded(*arguments)
+
+        enter.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
+        return enter
+
+    def _is_time_to_say(self, where: str) -> bool:
+        now = time.monotonic()
+        if now - self._said.get(where, -SAY_S) < SAY_S:
+            return False
+        self._said[where] = now
+        return True
+
+
+def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes], None]:
+    """What takes a message's bytes and hands ``work`` the message.
+
+    It raises MessageError for bytes that are none, and StampError where its stamp is no time. That
+    is not left to subscriptions: of a message that is cut off, rmw_fastrtps says nothing, and
+    rmw_cyclonedds hands on what it had read until then.
+    """
+
+    def take(data: bytes) -> None:
+        try:
+            if len(data) < HEADER_SIZE:
+                raise ValueError("there is not even a header")  # and nobody else looks for one
+            message = deserialize_message(data, message_type)
+        except Exception as error:  # which, differs between middlewares
+            raise MessageError(
+                f"{len(data)} bytes came that are no {message_type.__name__} ({error})"
+            ) from error
+        require_stamp(message)
+        work(message)
+
+    return take
+
+
+def kind_of(error: UsSimError) -> str:
+    """What an error is counted as: ``pose`` of a PoseError."""
+    return type(error).__name__.removesuffix("Error").lower()
+
+
+def _name(callback: Any) -> str:
+    return getattr(callback, "__qualname__", type(callback).__name__)
+
+
+def _shortened(sentence: str) -> str:
+    return sentence if len(sentence) <= LONGEST else f"{sentence[:LONGEST]} …"
