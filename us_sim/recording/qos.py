@@ -18,9 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-
 from us_sim.errors import BagError
+from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = ["INFINITE", "QosProfile", "qos_from_yaml", "qos_to_yaml"]
 
@@ -139,15 +138,14 @@ def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tupl
     """
     try:
         if isinstance(document, str):
-            document = yaml.safe_load(document)
+            document = load_yaml(document)
         if document is None or document == "":
             return ()
         if not isinstance(document, list):
             raise BagError("this is not a list of QoS profiles")
         return tuple(QosProfile.of(item) for item in document)
-    except yaml.YAMLError as error:
-        reason = str(error).splitlines()[0]
-        raise BagError(f"{where}: the QoS profiles are not YAML: {reason}") from None
+    except YamlError as error:
+        raise BagError(f"{where}: the QoS profiles are not YAML: {error}") from None
     except BagError as error:
         raise BagError(f"{where}: {error}") from None
 

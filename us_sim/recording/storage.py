@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import tempfile
@@ -68,11 +69,11 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     Raises:
         BagError: there are none, some are missing, or several could be meant.
     """
-    if path.is_file():
+    if os.path.isfile(path):
         return [path], None
-    if not path.is_dir():
+    if not os.path.isdir(path):
         raise BagError(f"there is no bag at {path}: give an .mcap or .db3 file, or a bag's folder")
-    if (path / "metadata.yaml").is_file():
+    if os.path.isfile(path / "metadata.yaml"):
         metadata = read_metadata(path / "metadata.yaml")
         return [_listed_file(path, file.path) for file in metadata.files], metadata
     files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
@@ -114,6 +115,6 @@ def _open(file: Path, label: str, scratch: Scratch) -> Storage:
 def _listed_file(folder: Path, listed: str) -> Path:
     """A file that metadata.yaml names; before version 4 its path began with the bag's folder."""
     for file in (folder / listed, folder / PurePosixPath(listed).name):
-        if file.is_file():
+        if os.path.isfile(file):
             return file
     raise BagError(f"{folder / 'metadata.yaml'} names {listed}, which is not there")

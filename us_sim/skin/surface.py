@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -155,7 +156,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
             not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshError(f"{path}: there is no such surface file")
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def read_mesh(
             a body, the mesh cannot be used, or meshio is needed and not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshError(f"{path}: there is no such mesh file")
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
