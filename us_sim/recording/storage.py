@@ -11,14 +11,13 @@ from collections.abc import Collection, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Protocol
 
-import zstandard
-
 from us_sim.errors import BagError
 from us_sim.recording import mcap_file, sqlite_file
 from us_sim.recording.mcap_file import McapFile
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.sqlite_file import SqliteFile
 from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.unpacking import unpack_file
 
 __all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
 
@@ -49,17 +48,13 @@ class Scratch:
         """A decompressed copy of a zstd file.
 
         Raises:
-            BagError: the file is damaged or cut off.
+            BagError: the file is damaged, or too large for this disk.
         """
         if self._folder is None:
             self._folder = tempfile.mkdtemp(prefix="us_sim_bag_")
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         copy = Path(self._folder, file.name.removesuffix(".zstd"))
-        with file.open("rb") as packed, copy.open("wb") as unpacked:
-            try:
-                zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
-            except zstandard.ZstdError as error:
-                raise BagError(f"{file} cannot be decompressed: {error}") from None
+        unpack_file(file, copy)
         return copy
 
 
