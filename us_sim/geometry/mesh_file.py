@@ -45,6 +45,8 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
             f"reading a {path.suffix or 'mesh'} file needs meshio; install it with "
             f"`pip install meshio`"
         ) from error
+    if path.suffix.lower() == ".ply" and not _has_ply_header(path):
+        raise MeshError(refusal)
     try:
         # For a file that none of its readers takes, meshio prints and then leaves the process.
         silence = io.StringIO()
@@ -67,6 +69,12 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
         raise
     except (Exception, SystemExit) as error:
         raise MeshError(refusal) from error
+
+
+def _has_ply_header(path: Path) -> bool:
+    """Whether the header of a PLY file ends; meshio would look for its end for ever."""
+    with path.open("rb") as file:
+        return any(line.strip() == b"end_header" for line in file)
 
 
 @contextlib.contextmanager

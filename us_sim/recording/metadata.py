@@ -128,7 +128,14 @@ def read_metadata(file: Path) -> BagMetadata:
         raise BagError(f"{file} cannot be read: {error.strerror}") from None
     except KeyError as error:
         raise BagError(f"{file} is not the metadata of a bag: it lacks {error}") from None
-    except (YamlError, UnicodeDecodeError, TypeError, ValueError, AttributeError) as error:
+    except (
+        YamlError,
+        UnicodeDecodeError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         reason = str(error).splitlines()[0]
         raise BagError(f"{file} is not the metadata of a bag: {reason}") from None
 

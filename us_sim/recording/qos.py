@@ -93,12 +93,15 @@ class QosProfile:
             else:
                 values = {name: getattr(profile, name) for name in cls.__dataclass_fields__}
         except (KeyError, AttributeError) as error:
-            raise BagError(f"{profile!r} is no QoS profile: it lacks {error}") from None
+            raise BagError(f"{repr(profile)[:200]} is no QoS profile: it lacks {error}") from None
         for policy in _POLICIES:
             values[policy] = _policy_name(policy, values[policy])
         for duration in _DURATIONS:
             values[duration] = _nanoseconds(duration, values[duration])
-        values["depth"] = int(values["depth"])
+        try:
+            values["depth"] = int(values["depth"])
+        except (TypeError, ValueError, OverflowError):
+            raise BagError(f"QoS depth is no whole number: {values['depth']!r}") from None
         return cls(**values)
 
     def lines(self) -> list[str]:
@@ -167,7 +170,7 @@ def _nanoseconds(duration: str, value: Any) -> int:
         if isinstance(value, Mapping):
             return int(value["sec"]) * 10**9 + int(value["nsec"])
         return int(getattr(value, "nanoseconds", value))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise BagError(f"QoS {duration} is not a duration: {value!r}") from None
 
 

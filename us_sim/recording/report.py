@@ -32,7 +32,12 @@ def describe(bag: Bag) -> str:
             f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  "
             f"{rate:>{widths[3]}}  {quality}"
         )
-    return "\n".join(lines)
+    return "\n".join(_printable(line) for line in lines)
+
+
+def _printable(line: str) -> str:
+    """A line without what a stranger's names could do to a terminal."""
+    return "".join(c if c.isprintable() else " " for c in line)
 
 
 def _date(nanoseconds: int) -> str:

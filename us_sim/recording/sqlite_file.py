@@ -41,7 +41,7 @@ class SqliteFile:
                     "MAX(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
                     "COUNT(*), MAX(id) FROM messages"
                 ).fetchone()
-        except (sqlite3.Error, TypeError, AttributeError) as error:
+        except _DAMAGE as error:
             raise BagError(f"{self._label} cannot be read as a rosbag2 database: {error}") from None
         usable = sum(topic.message_count for topic in self.topics)
         notes = [unread] if unread else []
@@ -74,9 +74,12 @@ class SqliteFile:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
                 for name, time, data in database.execute(query, tuple(types)):
                     yield BagMessage(name, types[name], time, time, data)
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise BagError(f"{self._label} is damaged: {error}") from None
 
+
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError, MemoryError)
+"""Errors that a damaged database gives."""
 
 _USABLE = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
 

@@ -24,6 +24,8 @@ from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.skin.wavefront import parse_wavefront
 
+_CORNERS = {"triangle": 3, "quad": 4}
+
 __all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface"]
 
 
@@ -184,6 +186,8 @@ def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]
     )
     parts = [np.empty((0, 3), dtype=np.int64)]
     for block in mesh.cells:
+        if block.type in _CORNERS and block.data.shape[1:] != (_CORNERS[block.type],):
+            raise MeshError(f"the file has a {block.type} of {block.data.shape[1:]} corners")
         if block.type == "triangle":
             parts.append(block.data.astype(np.int64))
         elif block.type == "quad":

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -34,6 +35,11 @@ _TYPES = {
 }
 _BYTES = {name: size for size, names in _TYPES.items() for name in names.split("|")}
 
+_PER_AXIS = {
+    *("space directions", "spacings", "thicknesses", "axis mins", "axismins", "axis maxs"),
+    *("axismaxs", "centers", "centerings", "kinds", "labels", "units"),
+}
+
 _PACKED = {"raw": False, "gzip": True, "gz": True}
 
 
@@ -52,6 +58,7 @@ def nrrd_voxels(path: Path) -> StoredVoxels:
             f"{path}: cannot be read as an image: its sizes are {' '.join(size)[:80]!r} and its "
             f"dimension {dimension[:80]!r} where as many whole numbers above zero belong"
         )
+    _check_axes(path, fields, len(size))
     kind, encoding = fields.get("type", "").lower(), fields.get("encoding", "").lower()
     if kind not in _BYTES or encoding not in _PACKED:
         raise VolumeError(
@@ -73,6 +80,38 @@ def nrrd_voxels(path: Path) -> StoredVoxels:
     return StoredVoxels(
         tuple(map(int, size)), _BYTES[kind], file, path, start, packed=_PACKED[encoding]
     )
+
+
+def _check_axes(path: Path, fields: dict[str, str], dimension: int) -> None:
+    """Refuse fields of more or fewer axes; ITK's reader writes beyond its memory for them."""
+    pieces = {key: re.findall(r"\([^()]*\)|\"[^\"]*\"|[^\s()]+", fields[key]) for key in fields}
+    for key, found in pieces.items():
+        if key in _PER_AXIS and len(found) != dimension:
+            raise VolumeError(
+                f"{path}: its {key} has {len(found)} entries where the image has {dimension} axes; "
+                f"export it again"
+            )
+    vectors = [*pieces.get("space directions", ()), *pieces.get("space origin", ())]
+    vectors += pieces.get("measurement frame", ())
+    if not all(vector == "none" or _is_vector(vector) for vector in vectors) or (
+        len(pieces.get("space origin", [""])) != 1
+        or len(pieces.get("measurement frame", "xyz")) != 3
+        or len(pieces.get("space units", "xyz")) > 3
+    ):
+        raise VolumeError(
+            f"{path}: its space directions, origin or units are not made of vectors of three "
+            f"finite numbers; export it again"
+        )
+
+
+def _is_vector(text: str) -> bool:
+    if not (text.startswith("(") and text.endswith(")")):
+        return False
+    words = text[1:-1].split(",")
+    try:
+        return len(words) == 3 and all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:

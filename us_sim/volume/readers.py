@@ -24,10 +24,18 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.stored_size import check_stored_size
-from us_sim.volume.stored_voxels import check_claim
 from us_sim.volume.volume import Volume
 
 __all__ = ["read_placement", "read_volume"]
+
+# Not what else SimpleITK reads: a damaged DICOM file ends the process that reads it.
+_READERS = {
+    "mha": "MetaImageIO",
+    "mhd": "MetaImageIO",
+    "nrrd": "NrrdImageIO",
+    "nhdr": "NrrdImageIO",
+    "nii": "NiftiImageIO",
+}
 
 _METRES = 1e-3  # these formats hold millimetres
 _SPACINGS = (1e-4, 1e2)  # mm, from a microscope's to one voxel for half a limb
@@ -79,6 +87,7 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD or NIfTI volume")
     stored = check_stored_size(path)
     header = sitk.ImageFileReader()
+    header.SetImageIO(_READERS[path.name.lower().removesuffix(".gz").rpartition(".")[2]])
     header.SetFileName(str(path))
     try:
         header.ReadImageInformation()
@@ -92,8 +101,7 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         )
     placement = _placement(path, header)
     value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
-    check_claim(path, header.GetSize(), value)
-    if stored not in (None, math.prod(header.GetSize()) * value):
+    if stored.expected != math.prod(header.GetSize()) * value:
         raise VolumeError(
             f"{path}: its header says more than one thing about its size; export it again"
         )

@@ -13,9 +13,9 @@ us_sim.errors.VolumeError: ...cut.mha: holds 100 bytes of image data where its h
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
+from us_sim.errors import VolumeError
 from us_sim.volume.metaimage import metaimage_header, metaimage_voxels
 from us_sim.volume.nifti import nifti_voxels
 from us_sim.volume.nrrd import nrrd_voxels
@@ -24,24 +24,23 @@ from us_sim.volume.stored_voxels import StoredVoxels
 __all__ = ["check_stored_size"]
 
 
-def check_stored_size(path: Path) -> int | None:
+def check_stored_size(path: Path) -> StoredVoxels:
     """Compare the bytes of image data in a MetaImage, NRRD or NIfTI file with its header.
 
     Returns:
-        The bytes of image data; None for files of other formats, which pass.
+        What the header says.
 
     Raises:
-        VolumeError: the file holds fewer or more bytes, its header is none of the format's, its
-            data file is missing, its compression is broken, or it is larger than what is read.
+        VolumeError: the file is of another format, holds fewer or more bytes, its header is none of
+            the format's, its data file is missing, its compression is broken, or it is larger than
+            what is read.
     """
     voxels = _voxels(path)
-    if voxels is None:
-        return None
     voxels.check()
-    return math.prod(voxels.size) * voxels.value
+    return voxels
 
 
-def _voxels(path: Path) -> StoredVoxels | None:
+def _voxels(path: Path) -> StoredVoxels:
     name = path.name.lower()
     if name.endswith((".mha", ".mhd")):
         return metaimage_voxels(path, *metaimage_header(path))
@@ -49,4 +48,7 @@ def _voxels(path: Path) -> StoredVoxels | None:
         return nrrd_voxels(path)
     if name.endswith((".nii", ".nii.gz")):
         return nifti_voxels(path)
-    return None
+    raise VolumeError(
+        f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume, which 3D Slicer "
+        f"makes of DICOM and others"
+    )

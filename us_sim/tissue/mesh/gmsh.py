@@ -100,7 +100,7 @@ class _Numbers:
                 self._words = np.array(part.split(), dtype=np.float64)
             except ValueError as error:
                 raise MeshError(
-                    f"the file has something else where a number should be: {error}"
+                    f"the file has something else where a number should be: {str(error)[:100]}"
                 ) from error
 
     @property
