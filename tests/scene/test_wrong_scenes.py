@@ -479,3 +479,22 @@ def test_a_file_that_is_no_yaml_is_one_sentence(tmp_path, text, sentence):
     said = str(caught.value)
     assert said.startswith(f"{file}: {sentence}")
     assert "\n" not in said
+
+
+def test_a_long_chain_of_scenes_is_refused(tmp_path):
+    for number in range(1200):
+        (tmp_path / f"{number}.yaml").write_text(f"based_on: {number + 1}.yaml\n")
+    with pytest.raises(SceneError, match=r"based_on: .*/0\.yaml is based on more than 20 scenes"):
+        load_scene(tmp_path / "0.yaml")
+
+
+def test_a_vast_file_is_not_read_as_a_scene(tmp_path):
+    file = tmp_path / "vast.yaml"
+    file.write_text("name: " + "x" * 20_000_000)
+    with pytest.raises(SceneError, match="has 20000006 bytes, which is no scene"):
+        load_scene(file)
+
+
+def test_a_name_too_long_for_a_file_is_one_that_is_not_there():
+    with pytest.raises(SceneError, match="there is no scene file xxx"):
+        load_scene("x" * 300)
