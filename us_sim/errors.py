@@ -26,6 +26,10 @@ class UsSimError(Exception):
     problem: str = ""
     """What is wrong with it."""
 
+    def __str__(self) -> str:
+        """The sentence in one line, whatever the names in it are made of."""
+        return "".join(c if c.isprintable() else " " for c in super().__str__())
+
 
 class SettingsError(UsSimError):
     """A setting is unknown, or has a value that will not do."""

@@ -48,8 +48,8 @@ def shared_path(relative: str) -> Path:
 def find_bag(name: str | Path) -> Path:
     """The bag at that path, or the installed one of that name."""
     path = Path(name).expanduser()
-    if not path.exists() and path.name == str(name):
+    if not os.path.exists(path) and path.name == str(name):
         for root in shared_roots():
-            if (root / "bags" / path).exists():
+            if os.path.exists(root / "bags" / path):
                 return root / "bags" / path
     return path

@@ -9,6 +9,8 @@ import pytest
 from us_sim.command.main import main
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 
+LONG = "x" * 300  # more than a file's name may have
+
 
 @pytest.mark.parametrize(
     ("args", "words"),
@@ -33,6 +35,11 @@ from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
         (["demo", "--path", "nowhere.mcap"], "there is no bag at nowhere.mcap"),
         (["demo", "--path", __file__], "is not a bag: it is neither MCAP nor SQLite"),
         (["demo", "upper_arm", "--volume", "nowhere.mha"], "there is no file"),
+        (["run", LONG, "--dry-run"], "there is no scene file xxx"),
+        (["run", "upper_arm", "--dry-run", "--path", LONG], "there is no bag at xxx"),
+        (["bag", "info", LONG], "there is no bag at xxx"),
+        (["play", LONG], "there is no bag at "),
+        (["demo", "upper_arm", "--volume", LONG], "there is no file"),
     ],
 )
 def test_bad_input_is_one_sentence(args, words, capsys):
@@ -41,6 +48,25 @@ def test_bad_input_is_one_sentence(args, words, capsys):
     assert words in error
     assert error.startswith("us-sim: ")
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("module", ["argparse", "us_sim.command.run", "us_sim.recording.reader"])
+def test_ctrl_c_while_something_is_imported_is_one_sentence(module, tmp_path):
+    """The signal comes at the import of a module, as early as the command has any."""
+    program = (
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name == {module!r}: os.kill(os.getpid(), signal.SIGINT)\n"
+        "from us_sim.command.main import main\n"
+        f"sys.modules.pop({module!r}, None)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "sys.exit(main(['bag', 'info', 'nowhere.mcap']))"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (ran.stderr, ran.returncode) == ("us-sim: interrupted\n", 130)
 
 
 def test_what_is_not_chosen_is_not_imported():

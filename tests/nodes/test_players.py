@@ -120,7 +120,38 @@ def test_what_is_not_cdr_is_left_out_of_a_recording(bench, tmp_path):
     bench.spin_for(10)
     assert [message.data for message in said] == ["yes"]
     assert not other
-    assert player.health.problems("topic") == 1
+    assert player.health.warning == "/other (json is not CDR): left out"
+
+
+def _bag_of(file, types, encoding="cdr"):
+    """A file with a message on a topic of each of the types, which need not exist."""
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        for number, name in enumerate(types):
+            schema = writer.register_schema(name, "ros2msg", b"string data\n")
+            channel = writer.register_channel(f"/t{number}", encoding, schema)
+            writer.add_message(channel, EPOCH, bytes(serialize_message(String(data="yes"))), EPOCH)
+        writer.finish()
+    return file
+
+
+def test_everything_that_is_left_out_of_a_recording_is_said(bench, tmp_path):
+    types = ["std_msgs/msg/String", "String", "no_such_msgs/msg/Thing", "os/msg/path"]
+    file = _bag_of(tmp_path / "foreign.mcap", types)
+    warning = bench.make(SessionPlayer, path=str(file)).health.warning
+    assert [word for word in ("/t0", "/t1", "/t2", "/t3") if word in warning] == [
+        "/t1",
+        "/t2",
+        "/t3",
+    ]
+
+
+@pytest.mark.parametrize("types", [["String"], []])
+def test_a_recording_of_which_nothing_can_be_played_is_refused(bench, tmp_path, types):
+    file = _bag_of(tmp_path / "foreign.mcap", types)
+    with pytest.raises(BagError, match="holds nothing that can be played: "):
+        bench.make(SessionPlayer, path=str(file))
 
 
 def test_a_recording_is_published_as_it_was(bench, shared_data):

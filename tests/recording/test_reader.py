@@ -1,7 +1,12 @@
 """Reading bags: real ones against rosbags and mcap, cut ones, damaged ones, no bags at all."""
 
+import gc
 import shutil
 import sqlite3
+import struct
+import tempfile
+import tracemalloc
+from contextlib import closing
 
 import pytest
 import zstandard
@@ -15,7 +20,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from us_sim.errors import BagError
+from us_sim.recording import unpacking
 from us_sim.recording.reader import read_bag
+from us_sim.recording.report import describe
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"
@@ -316,6 +323,46 @@ def test_messages_compressed_one_by_one(tmp_path):
     assert list(read_bag(tmp_path / "packed").messages()) == plain
 
 
+def _with_chunk(file, packed, says):
+    """A file of one zstd chunk, that says how many bytes are in it."""
+    chunk = struct.pack("<QQQII", 0, 0, says, 0, 4) + b"zstd" + struct.pack("<Q", len(packed))
+    records = [(0x01, bytes(8)), (0x06, chunk + packed), (0x0F, bytes(4))]
+    content = b"".join(struct.pack("<BQ", opcode, len(data)) + data for opcode, data in records)
+    file.write_bytes(b"\x89MCAP0\r\n" + content + b"\x89MCAP0\r\n")
+    return file
+
+
+def test_a_chunk_is_unpacked_up_to_what_it_says_and_a_limit(tmp_path):
+    packed = zstandard.ZstdCompressor().compress(bytes(64 << 20))
+    assert len(packed) < 10_000
+    with pytest.raises(BagError, match="it says that it holds 4000000000 bytes"):
+        read_bag(_with_chunk(tmp_path / "a.mcap", packed, 4_000_000_000))
+    tracemalloc.start()
+    try:
+        bag = read_bag(_with_chunk(tmp_path / "b.mcap", packed, 1000))
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+    assert "breaks off" in bag.note
+
+
+def test_a_packed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(unpacking, "LARGEST_FILE", 10_000_000)
+    file = tmp_path / "bag.mcap.zstd"
+    for says in (True, False):
+        compressor = zstandard.ZstdCompressor(write_content_size=says).compressobj(
+            *([20_000_000] if says else [])
+        )
+        file.write_bytes(compressor.compress(bytes(20_000_000)) + compressor.flush())
+        assert file.stat().st_size < 10_000
+        held = "20000000" if says else "more"
+        with pytest.raises(BagError, match=f"holds {held} bytes .* 10000000 are the most"):
+            read_bag(file)
+        gc.collect()
+        assert sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file()) < 10_000
+
+
 def test_a_compressed_file_leaves_nothing_behind(tmp_path, monkeypatch):
     write_session(tmp_path / "bag.mcap")
     packed = tmp_path / "bag.mcap.zstd"
@@ -354,6 +401,74 @@ def test_old_sqlite_without_qos_or_definitions(tmp_path):
     assert bag.deserialize(note).data == "hi"
     with pytest.raises(BagError, match="my_msgs/msg/Thing without its definition"):
         bag.deserialize(thing)
+
+
+def _database(file, count=600, journal=False):
+    """An open bag of SQLite with messages 10 ms apart, as rosbag2 numbers them."""
+    database = sqlite3.connect(file)
+    if journal:
+        database.execute("PRAGMA journal_mode = WAL")
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, "
+        "serialization_format TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+        "data BLOB);"
+        f"INSERT INTO topics VALUES(1, '/a', '{STRING}', 'cdr');"
+    )
+    database.executemany(
+        "INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, ?)",
+        [(EPOCH + k * 10**7, HI) for k in range(count)],
+    )
+    database.commit()
+    return database
+
+
+def test_a_text_where_sqlite_should_have_a_time_is_left_out_and_said(tmp_path):
+    with closing(_database(tmp_path / "bag.db3")) as database:
+        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 7")
+        database.commit()
+    bag = read_bag(tmp_path / "bag.db3")
+    assert len(list(bag.messages())) == bag.message_count == 599
+    assert "1 of the 600 messages of " in bag.note
+    assert "duration  5.990 s" in describe(bag)
+
+
+def test_messages_that_sqlite_lost_are_said(tmp_path):
+    with closing(_database(tmp_path / "bag.db3")) as database:
+        database.execute("DELETE FROM messages WHERE id BETWEEN 100 AND 126")
+        database.commit()
+    bag = read_bag(tmp_path / "bag.db3")
+    assert bag.message_count == 573
+    assert bag.note.endswith("the last one has the number 600: 27 were lost")
+
+
+def test_messages_that_metadata_promises_and_the_files_lack_are_said(tmp_path):
+    write_session(tmp_path / "bag", count=20)
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    text = metadata.read_text()
+    assert "\n  message_count: 20\n" in text
+    metadata.write_text(text.replace("\n  message_count: 20\n", "\n  message_count: 25\n"))
+    assert read_bag(tmp_path / "bag").note.endswith("metadata.yaml says 25: 5 were lost")
+
+
+def test_what_a_killed_recorder_left_in_the_journal_is_read(tmp_path):
+    with closing(_database(tmp_path / "live.db3", journal=True)):
+        for part in ("", "-wal"):
+            shutil.copy(tmp_path / f"live.db3{part}", tmp_path / f"killed.db3{part}")
+    bag = read_bag(tmp_path / "killed.db3")
+    assert (len(list(bag.messages())), bag.note) == (600, "")
+
+
+def test_a_table_that_is_an_endless_query_is_refused(tmp_path):
+    with closing(_database(tmp_path / "bag.db3")) as database:
+        database.executescript(
+            "DROP TABLE messages;"
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS "
+            "(SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n;"
+        )
+    with pytest.raises(BagError, match="it has no table messages"):
+        read_bag(tmp_path / "bag.db3")
 
 
 def test_sqlite_that_is_no_bag_or_damaged(shared_data, tmp_path):

@@ -2,12 +2,14 @@
 
 import gzip
 import struct
+import zlib
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
+from us_sim.volume import stored_voxels
 from us_sim.volume.readers import read_volume
 
 SHAPE = (4, 5, 6)
@@ -172,11 +174,27 @@ def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_data):
         ({"ElementType": "MET_SHORT"}, None, "header says 240"),
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
         ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
-        ({"ElementSpacing": "1 nan 1"}, None, "must be a number above zero"),
-        ({"ElementSpacing": "1 1 inf"}, None, "must be a number above zero"),
+        ({"ElementSpacing": "1 nan 1"}, None, "every one must be a number"),
+        ({"ElementSpacing": "1 1 inf"}, None, "every one must be a number"),
         ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular direction matrix"),
         ({"DimSize": "4 5 1"}, b"\0" * 20, "two or more along each axis"),
         ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers per voxel"),
+        ({"DimSize": ":4 5 6"}, None, "its DimSize is ':4 5 6' where whole numbers above zero"),
+        ({"DimSize": "-4 5 6"}, None, "whole numbers above zero"),
+        ({"DimSize": "4 5_0 6"}, None, "whole numbers above zero"),
+        ({"NDims": "2"}, None, "NDims says 2 numbers"),
+        ({"DimSize": "1024 1024 1024"}, None, "536870912 are read at most"),
+        ({"DimSize": "4000000000 4000000000 4000000000"}, None, "are read at most"),
+        ({"ElementType": "MET_UCHAR\nDimSize : 8 8 8"}, None, "more than one thing about its size"),
+        ({"ElementSpacing": "1e-30 1 1"}, None, "spacing 1e-30 × 1 × 1 mm; that of a body is"),
+        ({"Offset": "nan 0 0"}, None, "its Offset is 'nan 0 0' where 3 finite numbers belong"),
+        ({"Offset": "0 0"}, None, "where 3 finite numbers belong"),
+        ({"Offset": "0 0 1e9"}, None, "lies 1e\\+06 m from its origin"),
+        ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "axes that are sheared or scaled"),
+        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "axes that are sheared or scaled"),
+        ({"HeaderSize": "-1"}, None, "has a HeaderSize"),
+        ({"BinaryData": "False"}, None, "holds its voxels as text"),
+        ({"ElementType": "MET_STRING"}, None, "save it with one of MET_CHAR"),
     ],
 )
 def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, message):
@@ -185,6 +203,85 @@ def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, messag
         read_volume(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
+
+
+def _compressed(path, data, **fields):
+    packed = zlib.compress(data)
+    size = str(len(packed))
+    return _metaimage(path, packed, CompressedData="True", CompressedDataSize=size, **fields)
+
+
+def test_a_compressed_metaimage_holds_what_its_header_says(tmp_path):
+    data = GREY.tobytes(order="F")
+    np.testing.assert_array_equal(
+        read_volume(_compressed(tmp_path / "a.mha", data)).intensities, GREY
+    )
+    for wrong, held in ((data[:60], "60"), (b"", "0"), (data + b"\0", "121 or more")):
+        with pytest.raises(VolumeError, match=f"holds {held} bytes .* where its header says 120"):
+            read_volume(_compressed(tmp_path / "a.mha", wrong))
+
+
+def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
+    with pytest.raises(VolumeError, match="or more bytes of image data where its header says 120"):
+        read_volume(_compressed(tmp_path / "a.mha", bytes(100 << 20)))
+    with pytest.raises(VolumeError, match="536870912 are read at most"):
+        read_volume(_compressed(tmp_path / "a.mha", bytes(100), DimSize="1024 1024 1024"))
+
+
+def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(stored_voxels, "_free_memory", lambda: 200.0)
+    with pytest.raises(VolumeError, match=r"take 0\.0 GB of memory where 0\.0 GB are free"):
+        read_volume(_metaimage(tmp_path / "a.mha"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("sizes: 4 5 6", "sizes: 4 5 7", "holds 120 bytes .* where its header says 140"),
+        ("sizes: 4 5 6", "sizes: 4 5 6 1", "its dimension '3'"),
+        ("sizes: 4 5 6", "sizes: 4 5 -6", "whole numbers above zero"),
+        # ITK writes beyond its memory for these.
+        ("space directions: ", "space directions: " + 25 * "(1,0,0) ", "has 28 entries where"),
+        ("space origin: (0,0,0)", "space origin: (0,0,nan)", "vectors of three finite numbers"),
+        ("encoding: raw", "encoding: hex", "in the encoding 'hex'"),
+        ("encoding: raw", "encoding: raw\nencoding: gzip", "has 'encoding' twice"),
+    ],
+)
+def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message):
+    path = tmp_path / "a.nrrd"
+    sitk.WriteImage(sitk.GetImageFromArray(GREY.transpose(2, 1, 0)), str(path))
+    content = path.read_bytes()
+    assert old.encode() in content
+    path.write_bytes(content.replace(old.encode(), new.encode()))
+    with pytest.raises(VolumeError, match=message):
+        read_volume(path)
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "value", "message"),
+    [
+        (40, "<2h", (3, -4), "axes of -4, 5, 6"),
+        (40, "<h", (8,), "says 8 axes"),
+        (70, "<h", (4,), "holds 120 bytes .* where its header says 240"),
+        (70, "<h", (77,), "data type 77"),
+        (108, "<f", (np.nan,), "from byte 0"),
+        (108, "<f", (np.inf,), "from byte 0"),
+        (108, "<f", (1e9,), "holds 0 bytes"),
+    ],
+)
+def test_a_nifti_header_that_does_not_fit_is_refused(tmp_path, at, form, value, message):
+    path = _nifti(tmp_path / "a.nii", GREY.tobytes(order="F"), np.eye(4))
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, at, *value)
+    path.write_bytes(content)
+    with pytest.raises(VolumeError, match=message):
+        read_volume(path)
+
+
+def test_a_nifti_bomb_is_not_unpacked(tmp_path):
+    path = _nifti(tmp_path / "a.nii.gz", bytes(100 << 20), np.eye(4))
+    with pytest.raises(VolumeError, match="or more bytes of image data where its header says 120"):
+        read_volume(path)
 
 
 @pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])

@@ -213,3 +213,18 @@ def test_real_files_of_other_kinds_are_refused(shared_data, name, message):
         pytest.skip(f"no {shared_data / name}")
     with pytest.raises(VolumeError, match=message):
         read_sweep(shared_data / name)
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ("100000 100000 3", "says it holds 3 images of 100000 × 100000 pixels"),
+        ("5 4 9000000000", "says it holds 9000000000 images"),
+        (":5 4 3", "where a sequence has columns, rows and frames"),
+    ],
+)
+def test_a_sequence_that_says_it_is_vast_is_refused(tmp_path, size, message):
+    data = zlib.compress(GREY.tobytes())
+    fields = {"CompressedData": "True", "CompressedDataSize": str(len(data)), "DimSize": size}
+    with pytest.raises(VolumeError, match=message):
+        read_sweep(_sequence(tmp_path / "a.igs.mha", data, **fields))

@@ -5,28 +5,67 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from us_sim import __version__
-from us_sim.command.bag import add_bag
-from us_sim.command.calibrate import add_calibrate
-from us_sim.command.chosen_parser import ChosenParser
-from us_sim.command.compile import add_compile
-from us_sim.command.demo import add_demo
-from us_sim.command.evaluate import add_evaluate
-from us_sim.command.play import add_play
-from us_sim.command.print_marker import add_print_marker
-from us_sim.command.reference import add_reference
-from us_sim.command.render import add_render
-from us_sim.command.run import add_run
 from us_sim.errors import UsSimError
+
+if TYPE_CHECKING:
+    from us_sim.command.chosen_parser import ChosenParser
 
 __all__ = ["main"]
 
-_ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
+    ended: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        """End as on Ctrl-C, so that no node outlives the command."""
+        ended.append(number)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
+    try:
+        parsed = _parser().parse_args(args)
+        return int(parsed.command(parsed) or 0)
+    except UsSimError as error:
+        print(f"us-sim: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return _interrupted()
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
+    except Exception:
+        if not ended:
+            raise
+        return _interrupted()  # a library that is broken off while it is imported fails in its way
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _parser() -> ChosenParser:
+    """All commands; imported here, where an interruption is one sentence already."""
+    from us_sim import __version__
+    from us_sim.command.bag import add_bag
+    from us_sim.command.calibrate import add_calibrate
+    from us_sim.command.chosen_parser import ChosenParser
+    from us_sim.command.compile import add_compile
+    from us_sim.command.demo import add_demo
+    from us_sim.command.evaluate import add_evaluate
+    from us_sim.command.play import add_play
+    from us_sim.command.print_marker import add_print_marker
+    from us_sim.command.reference import add_reference
+    from us_sim.command.render import add_render
+    from us_sim.command.run import add_run
+
     parser = ChosenParser(
         prog="us-sim", description="Interactive simulation of compression ultrasonography."
     )
@@ -36,28 +75,9 @@ def main(args: Sequence[str] | None = None) -> int:
         add(commands)
     for add in (add_calibrate, add_print_marker, add_evaluate, add_reference, add_compile):
         add(commands)
-    before = {number: signal.signal(number, _interrupt) for number in _ENDINGS}
-    try:
-        parsed = parser.parse_args(args)
-        return int(parsed.command(parsed) or 0)
-    except UsSimError as error:
-        print(f"us-sim: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("us-sim: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)
-        return 1
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return parser
 
 
-def _interrupt(*_: object) -> None:
-    """End as on Ctrl-C, so that no node outlives the command."""
-    raise KeyboardInterrupt
+def _interrupted() -> int:
+    print("us-sim: interrupted", file=sys.stderr)
+    return 130

@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from us_sim.kernels import njit
 
 __all__ = ["vertex_normals"]
 

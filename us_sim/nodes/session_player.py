@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Iterator
 from typing import Any
 
+from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -14,6 +14,7 @@ from rclpy.task import Future
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
+from us_sim.nodes.message_types import message_type
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.settings import SessionPlayerSettings
@@ -21,6 +22,9 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
 
 __all__ = ["SessionPlayer", "main"]
+
+_MOST_SAID = 10
+"""Topics that are left out, of which a person is told each."""
 
 START_S = 0.5
 """For subscribers to find the publishers before the first message."""
@@ -42,26 +46,28 @@ class SessionPlayer(GuardedNode):
         self.finished = Future()
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
-        for topic in self._bag.topics:
-            self._offer(topic)
+        left_out = [why for topic in self._bag.topics if (why := self._offer(topic))]
+        if not any(self._bag.topic(name).message_count for name in self._topics):
+            raise BagError(f"{path} holds nothing that can be played: {_joined(left_out)}")
+        if left_out:
+            self.health.warning = f"{_joined(left_out)}: left out"
+            self.get_logger().warning(self.health.warning)
+        if self._bag.note:
+            self.get_logger().warning(self._bag.note)
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._begun = 0
         self._first = 0
         self._start = self.create_timer(START_S, self._begin)
 
-    def _offer(self, topic: BagTopic) -> None:
+    def _offer(self, topic: BagTopic) -> str:
+        """Publish a topic, or say why it cannot be published."""
         if topic.encoding != "cdr":
-            self.health.problem("topic", f"{topic.name} is left out: {topic.encoding} is not CDR")
-            return
-        package, _, name = topic.type_name.split("/")
+            return f"{topic.name} ({topic.encoding} is not CDR)"
         try:
-            message_type = getattr(importlib.import_module(f"{package}.msg"), name)
-        except (ImportError, AttributeError):
-            self.health.problem(
-                "topic", f"{topic.name} is left out: {topic.type_name} is not installed here"
-            )
-            return
+            kind = message_type(topic.type_name)
+        except BagError as error:
+            return f"{topic.name} ({error})"
         latched = _is_latched(topic)
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(
@@ -70,7 +76,11 @@ class SessionPlayer(GuardedNode):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=durability,
         )
-        self._topics[topic.name] = self.create_publisher(message_type, topic.name, qos)
+        try:
+            self._topics[topic.name] = self.create_publisher(kind, topic.name, qos)
+        except (NameValidationException, ValueError):
+            return f"{topic.name!r} (no topic of ROS 2 is called so)"
+        return ""
 
     def _begin(self) -> None:
         self._start.cancel()
@@ -97,6 +107,13 @@ class SessionPlayer(GuardedNode):
             return
         self.health.state = "finished"
         self.finished.set_result(None)
+
+
+def _joined(sentences: list[str]) -> str:
+    """As many of them as a person reads; the number of the others."""
+    more = len(sentences) - _MOST_SAID
+    shown = "; ".join(sentences[:_MOST_SAID]) or "no topic of it has a message"
+    return f"{shown}; and {more} more" if more > 0 else shown
 
 
 def _is_latched(topic: BagTopic) -> bool:

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
-import yaml
-
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
@@ -19,6 +17,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
 from us_sim.settings.spelling import unknown
+from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.slicing.formation.imaging import Imaging
 
 __all__ = [
@@ -318,9 +317,9 @@ def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
     if name not in known and not name.startswith(_ROS_OWN):
         raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
     try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UsSimError(f"--param {node}.{name}={text}: is not YAML") from error
+        return load_yaml(text)
+    except YamlError as error:
+        raise UsSimError(f"--param {node}.{name}={text[:80]}: {error}") from error
 
 
 def _checked(node: str, name: str, value: object, settings: type[Settings], field: str) -> object:

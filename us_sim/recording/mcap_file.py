@@ -18,7 +18,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -31,6 +30,7 @@ from us_sim.errors import BagError
 from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 __all__ = ["MAGIC", "McapFile"]
 
@@ -40,8 +40,13 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of compression name
 
+_LARGEST_OVERLAP = 1 << 30
+"""Bytes of messages that wait until no earlier one can come."""
+
 _DAMAGE = (
     McapError,
+    EOFError,
+    OverflowError,
     zstandard.ZstdError,
     struct.error,
     ValueError,
@@ -106,15 +111,24 @@ class McapFile:
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
         # Of messages with the same log time the one that is earlier in the file comes first.
         pending: list[tuple[int, int, int, BagMessage]] = []
+        held = 0
         with self._path.open("rb") as stream:
             for run in self._runs:
                 while pending and pending[0][0] < run.start:
-                    yield heapq.heappop(pending)[-1]
+                    message = heapq.heappop(pending)[-1]
+                    held -= len(message.data)
+                    yield message
                 for index, content in enumerate(self._run_messages(stream, run)):
                     channel, log_time, publish_time, data = content
                     if channel in wanted:
                         message = BagMessage(*wanted[channel], log_time, publish_time, bytes(data))
                         heapq.heappush(pending, (log_time, run.offset, index, message))
+                        held += len(message.data)
+                if held > _LARGEST_OVERLAP:
+                    raise BagError(
+                        f"{self._label} cannot be put into order: more than {_LARGEST_OVERLAP} "
+                        f"bytes of its messages are of the same time; sort it with `mcap sort`"
+                    )
         while pending:
             yield heapq.heappop(pending)[-1]
 
@@ -254,6 +268,11 @@ def _records(
     stream: BinaryIO, offset: int, length: int, label: str
 ) -> Iterator[tuple[int, memoryview]]:
     """Opcode and content of a record outside of chunks, or of each that a chunk holds."""
+    if length > LARGEST_CHUNK:
+        raise BagError(
+            f"{label} cannot be read: its chunk at byte {offset} has {length} bytes, and "
+            f"{LARGEST_CHUNK} are read at most: record with smaller chunks"
+        )
     stream.seek(offset)
     content = memoryview(stream.read(length))
     opcode, declared = _RECORD.unpack_from(content)
@@ -282,10 +301,11 @@ def _chunk_records(content: memoryview, *, whole: bool, label: str) -> memoryvie
     packed = content[begin:]
     if compression == "":
         records = packed
-    elif compression == "zstd":
-        records = memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(packed))
-    elif compression == "lz4":
-        records = memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed))
+    elif compression in ("zstd", "lz4"):
+        try:
+            records = memoryview(unpack(packed, compression, size))
+        except BagError as error:
+            raise BagError(f"{label} cannot be read: of a chunk {error}") from None
     else:
         raise BagError(f"{label} is compressed with {compression!r}: use zstd, lz4 or none")
     if whole and (len(records) != size or (crc and zlib.crc32(records) != crc)):

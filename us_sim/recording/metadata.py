@@ -21,6 +21,7 @@ import yaml
 
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile, qos_from_yaml
+from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = ["BagMetadata", "FileEntry", "TopicEntry", "read_metadata"]
 
@@ -101,7 +102,7 @@ def read_metadata(file: Path) -> BagMetadata:
         BagError: it cannot be read, is not such a file, or is of a newer version.
     """
     try:
-        document = yaml.load(file.read_text(encoding="utf-8"), _LOADER)
+        document = load_yaml(file.read_text(encoding="utf-8"))
         information = document["rosbag2_bagfile_information"]
         version = int(information["version"])
         if version > _NEWEST_VERSION:
@@ -127,7 +128,14 @@ def read_metadata(file: Path) -> BagMetadata:
         raise BagError(f"{file} cannot be read: {error.strerror}") from None
     except KeyError as error:
         raise BagError(f"{file} is not the metadata of a bag: it lacks {error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, ValueError, AttributeError) as error:
+    except (
+        YamlError,
+        UnicodeDecodeError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         reason = str(error).splitlines()[0]
         raise BagError(f"{file} is not the metadata of a bag: {reason}") from None
 

@@ -182,11 +182,17 @@ def _extract(bag: Bag, topic: BagTopic, messages: list[BagMessage]) -> ProbePath
     frames: dict[str, None] = {}
     for k, raw in enumerate(messages):
         message = bag.deserialize(raw)
-        stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
-        stamps[k] = stamp.sec * 10**9 + stamp.nanosec
-        log_times[k] = raw.log_time
-        poses[k] = p.x, p.y, p.z, q.x, q.y, q.z, q.w
-        frames[message.header.frame_id] = None
+        try:
+            stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
+            stamps[k] = stamp.sec * 10**9 + stamp.nanosec
+            log_times[k] = raw.log_time
+            poses[k] = p.x, p.y, p.z, q.x, q.y, q.z, q.w
+            frames[message.header.frame_id] = None
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise BagError(
+                f"{bag.path} defines or times {topic.type_name} as ROS 2 does not, so that there "
+                f"are no poses on {topic.name}: {error}"
+            ) from None
     if len(frames) > 1:
         raise BagError(
             f"{bag.path} holds poses on {topic.name} in the frames {', '.join(frames)}: a path "

@@ -37,12 +37,13 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
+from us_sim.volume.metaimage import metaimage_header
 from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
-from us_sim.volume.stored_size import metaimage_header
 
 __all__ = ["TrackerRecording", "TransformChain", "read_tracker_recording"]
 
 _METRES = 1e-3  # the format holds millimetres
+_MOST_SAMPLES = 1 << 20  # four hours at 60 Hz
 _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
 
 
@@ -272,10 +273,10 @@ def _count(path: Path, header: Mapping[str, str]) -> int:
         count = int(header["DimSize"].split()[-1])
     except (KeyError, ValueError, IndexError):
         count = 0
-    if count < 1:
+    if not 1 <= count <= _MOST_SAMPLES:
         raise TrackingError(
             f"{path}: its DimSize is {header.get('DimSize')!r} where a tracker recording ends it "
-            f"with the number of samples; export it again"
+            f"with the number of samples, {_MOST_SAMPLES} at most; export it again"
         )
     return count
 

@@ -18,9 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-
 from us_sim.errors import BagError
+from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = ["INFINITE", "QosProfile", "qos_from_yaml", "qos_to_yaml"]
 
@@ -94,12 +93,15 @@ class QosProfile:
             else:
                 values = {name: getattr(profile, name) for name in cls.__dataclass_fields__}
         except (KeyError, AttributeError) as error:
-            raise BagError(f"{profile!r} is no QoS profile: it lacks {error}") from None
+            raise BagError(f"{repr(profile)[:200]} is no QoS profile: it lacks {error}") from None
         for policy in _POLICIES:
             values[policy] = _policy_name(policy, values[policy])
         for duration in _DURATIONS:
             values[duration] = _nanoseconds(duration, values[duration])
-        values["depth"] = int(values["depth"])
+        try:
+            values["depth"] = int(values["depth"])
+        except (TypeError, ValueError, OverflowError):
+            raise BagError(f"QoS depth is no whole number: {values['depth']!r}") from None
         return cls(**values)
 
     def lines(self) -> list[str]:
@@ -139,15 +141,14 @@ def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tupl
     """
     try:
         if isinstance(document, str):
-            document = yaml.safe_load(document)
+            document = load_yaml(document)
         if document is None or document == "":
             return ()
         if not isinstance(document, list):
             raise BagError("this is not a list of QoS profiles")
         return tuple(QosProfile.of(item) for item in document)
-    except yaml.YAMLError as error:
-        reason = str(error).splitlines()[0]
-        raise BagError(f"{where}: the QoS profiles are not YAML: {reason}") from None
+    except YamlError as error:
+        raise BagError(f"{where}: the QoS profiles are not YAML: {error}") from None
     except BagError as error:
         raise BagError(f"{where}: {error}") from None
 
@@ -169,7 +170,7 @@ def _nanoseconds(duration: str, value: Any) -> int:
         if isinstance(value, Mapping):
             return int(value["sec"]) * 10**9 + int(value["nsec"])
         return int(getattr(value, "nanoseconds", value))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise BagError(f"QoS {duration} is not a duration: {value!r}") from None
 
 

@@ -27,6 +27,7 @@ from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
 from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
 from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 __all__ = ["Bag", "read_bag"]
 
@@ -82,7 +83,15 @@ class Bag:
     @property
     def note(self) -> str:
         """The fault of a bag that was not closed properly; empty when whole."""
-        return "; ".join(storage.note for storage in self._storages if storage.note)
+        notes = [storage.note for storage in self._storages if storage.note]
+        if self.metadata is not None:
+            said, held = self.metadata.message_count, self.message_count
+            if said > held:
+                notes.append(
+                    f"{self.path} has {held} messages where its metadata.yaml says {said}: "
+                    f"{said - held} were lost"
+                )
+        return "; ".join(notes)
 
     def topic(self, name: str) -> BagTopic:
         """The topic of this name, with or without its leading slash.
@@ -108,9 +117,14 @@ class Bag:
         for message in heapq.merge(*streams, key=lambda message: message.log_time):
             if self._decompress_messages:
                 try:
-                    data = zstandard.ZstdDecompressor().decompressobj().decompress(message.data)
+                    data = unpack(message.data, "zstd", LARGEST_CHUNK)
                 except zstandard.ZstdError as error:
                     raise BagError(f"{self.path} is damaged: {error}") from None
+                if len(data) > LARGEST_CHUNK:
+                    raise BagError(
+                        f"{self.path} cannot be read: a message on {message.topic} has more than "
+                        f"{LARGEST_CHUNK} bytes when it is unpacked"
+                    )
                 message = message._replace(data=data)
             yield message
 

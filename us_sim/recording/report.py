@@ -17,8 +17,7 @@ def describe(bag: Bag) -> str:
     if not summary["complete"]:
         lines.append(f"note      {summary['note']}")
     if summary["start"] is not None:
-        start = datetime.fromtimestamp(summary["start"] * 1e-9, tz=UTC)
-        lines.append(f"start     {start.isoformat(timespec='milliseconds')}")
+        lines.append(f"start     {_date(summary['start'])}")
     lines += [f"duration  {seconds:.3f} s", f"messages  {summary['message_count']}", ""]
     table = [("topic", "type", "count", "Hz", "quality of service")]
     for topic in summary["topics"]:
@@ -33,4 +32,18 @@ def describe(bag: Bag) -> str:
             f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  "
             f"{rate:>{widths[3]}}  {quality}"
         )
-    return "\n".join(lines)
+    return "\n".join(_printable(line) for line in lines)
+
+
+def _printable(line: str) -> str:
+    """A line without what a stranger's names could do to a terminal."""
+    return "".join(c if c.isprintable() else " " for c in line)
+
+
+def _date(nanoseconds: int) -> str:
+    """A time since the epoch as a person reads it; as it is where no calendar has it."""
+    try:
+        date = datetime.fromtimestamp(nanoseconds * 1e-9, tz=UTC)
+    except (ValueError, OverflowError, OSError):
+        return f"{nanoseconds} ns"
+    return date.isoformat(timespec="milliseconds")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
@@ -28,20 +29,33 @@ class SqliteFile:
         BagError: the file is damaged, or without the tables of rosbag2.
     """
 
-    note = ""
-
     def __init__(self, path: Path, label: str = "") -> None:
-        # Immutable, so that a bag on a read-only disk needs no lock file beside it.
-        self._uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         self._label = label or str(path)
+        self._uri, unread = _address(path)
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
+                _check_tables(database)
                 self.topics = tuple(_topics(database, self._label))
-                self.start, self.end = database.execute(
-                    "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
+                self.start, self.end, rows, last = database.execute(
+                    "SELECT MIN(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
+                    "MAX(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
+                    "COUNT(*), MAX(id) FROM messages"
                 ).fetchone()
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise BagError(f"{self._label} cannot be read as a rosbag2 database: {error}") from None
+        usable = sum(topic.message_count for topic in self.topics)
+        notes = [unread] if unread else []
+        if usable < rows:
+            notes.append(
+                f"{rows - usable} of the {rows} messages of {self._label} have no whole number as "
+                f"their time, no data or no topic, and are left out"
+            )
+        if last is not None and last > rows:  # rosbag2 numbers them from 1
+            notes.append(
+                f"{self._label} holds {rows} messages, and the last one has the number {last}: "
+                f"{last - rows} were lost"
+            )
+        self.note = "; ".join(notes)
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
@@ -54,14 +68,50 @@ class SqliteFile:
         query = (
             "SELECT topics.name, timestamp, data FROM messages "
             "JOIN topics ON topics.id = messages.topic_id "
-            f"WHERE topics.name IN ({marks}) ORDER BY timestamp, messages.id"
+            f"WHERE topics.name IN ({marks}) AND {_USABLE} ORDER BY timestamp, messages.id"
         )
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
                 for name, time, data in database.execute(query, tuple(types)):
                     yield BagMessage(name, types[name], time, time, data)
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise BagError(f"{self._label} is damaged: {error}") from None
+
+
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError, MemoryError)
+"""Errors that a damaged database gives."""
+
+_USABLE = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+
+
+def _address(path: Path) -> tuple[str, str]:
+    """The URI of a database, and what of it cannot be read.
+
+    What was recorded last is in a journal beside the file (``-wal``) where the recorder was killed.
+    """
+    uri = f"{path.resolve().as_uri()}?mode=ro"
+    # Immutable, so that a bag on a read-only disk needs no lock file beside it.
+    unlocked = f"{uri}&immutable=1"
+    journal = path.with_name(f"{path.name}-wal")
+    try:
+        if not (os.path.isfile(journal) and journal.stat().st_size):
+            return unlocked, ""
+        with closing(sqlite3.connect(uri, uri=True)) as database:
+            database.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+        return uri, ""
+    except (sqlite3.Error, OSError) as error:
+        return unlocked, (
+            f"what {journal.name} holds of it is not read ({error}): copy both files to a folder "
+            f"that can be written, and read them there"
+        )
+
+
+def _check_tables(database: sqlite3.Connection) -> None:
+    """Refuse tables that are queries in truth, which may never end."""
+    kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE type <> 'index'"))
+    for name in ("topics", "messages"):
+        if kinds.get(name) != "table":
+            raise sqlite3.DatabaseError(f"it has no table {name}")
 
 
 def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
@@ -79,10 +129,12 @@ def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
         )
     rows = database.execute(
         f"SELECT name, type, serialization_format, {qos}, {type_hash}, COUNT(messages.id) "
-        "FROM topics LEFT JOIN messages ON messages.topic_id = topics.id "
+        f"FROM topics LEFT JOIN messages ON messages.topic_id = topics.id AND {_USABLE} "
         "GROUP BY topics.id ORDER BY topics.id"
     )
     for name, type_name, encoding, profiles, digest, count in rows:
+        if not all(isinstance(text, str) for text in (name, type_name, encoding)):
+            raise sqlite3.DatabaseError(f"topic {name!r} has no name, type or encoding")
         yield BagTopic(
             name=name,
             type_name=normalized_type(type_name),

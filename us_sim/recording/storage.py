@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import tempfile
@@ -10,14 +11,13 @@ from collections.abc import Collection, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Protocol
 
-import zstandard
-
 from us_sim.errors import BagError
 from us_sim.recording import mcap_file, sqlite_file
 from us_sim.recording.mcap_file import McapFile
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.sqlite_file import SqliteFile
 from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.unpacking import unpack_file
 
 __all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
 
@@ -48,17 +48,13 @@ class Scratch:
         """A decompressed copy of a zstd file.
 
         Raises:
-            BagError: the file is damaged or cut off.
+            BagError: the file is damaged, or too large for this disk.
         """
         if self._folder is None:
             self._folder = tempfile.mkdtemp(prefix="us_sim_bag_")
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         copy = Path(self._folder, file.name.removesuffix(".zstd"))
-        with file.open("rb") as packed, copy.open("wb") as unpacked:
-            try:
-                zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
-            except zstandard.ZstdError as error:
-                raise BagError(f"{file} cannot be decompressed: {error}") from None
+        unpack_file(file, copy)
         return copy
 
 
@@ -68,11 +64,11 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     Raises:
         BagError: there are none, some are missing, or several could be meant.
     """
-    if path.is_file():
+    if os.path.isfile(path):
         return [path], None
-    if not path.is_dir():
+    if not os.path.isdir(path):
         raise BagError(f"there is no bag at {path}: give an .mcap or .db3 file, or a bag's folder")
-    if (path / "metadata.yaml").is_file():
+    if os.path.isfile(path / "metadata.yaml"):
         metadata = read_metadata(path / "metadata.yaml")
         return [_listed_file(path, file.path) for file in metadata.files], metadata
     files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
@@ -114,6 +110,6 @@ def _open(file: Path, label: str, scratch: Scratch) -> Storage:
 def _listed_file(folder: Path, listed: str) -> Path:
     """A file that metadata.yaml names; before version 4 its path began with the bag's folder."""
     for file in (folder / listed, folder / PurePosixPath(listed).name):
-        if file.is_file():
+        if os.path.isfile(file):
             return file
     raise BagError(f"{folder / 'metadata.yaml'} names {listed}, which is not there")

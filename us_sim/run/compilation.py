@@ -1,7 +1,7 @@
 """Compiling all kernels ahead, so that no run waits for it.
 
-Numba compiles a kernel where it is first called, and keeps it in a cache that all processes of the
-user share (`NUMBA_CACHE_DIR` names another folder). So every part is made small, and used once.
+A kernel is compiled where it is first called, and kept for all processes of the user, as
+`us_sim.kernels` says. So every part is made small, and used once.
 """
 
 from __future__ import annotations

@@ -8,22 +8,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-import yaml
-
 from us_sim.errors import SceneError
 from us_sim.scene.scene import Scene
 from us_sim.settings.choice import Choice
 from us_sim.settings.setting import Settings, kinds_of, rules_of
+from us_sim.settings.yaml_text import LARGEST_YAML, YamlError, load_yaml
 
 __all__ = ["merged", "read_document"]
 
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
+
+_LONGEST_CHAIN = 20
+"""Scenes, each based on the next."""
 
 
 def read_document(
@@ -36,7 +39,7 @@ def read_document(
         seen: files that are based on this one.
 
     Raises:
-        SceneError: it cannot be read, is not YAML, or is based on itself.
+        SceneError: it cannot be read, is not YAML, is based on itself, or on too many.
     """
     document: Any = _yaml(path)
     folders = [path.parent]
@@ -47,11 +50,16 @@ def read_document(
         raise SceneError(f"{path}: {BASE}: must be a scene's file or name, not {name!r}")
     beside = path.parent / name
     try:
-        base = beside.resolve() if beside.is_file() else find(name)
+        base = beside.resolve() if os.path.isfile(beside) else find(name)
     except SceneError as error:
         raise SceneError(f"{path}: {BASE}: {error}") from error
     if base in (*seen, path):
         raise SceneError(f"{path}: {BASE}: {base} is based on this scene itself")
+    if len(seen) == _LONGEST_CHAIN:
+        raise SceneError(
+            f"{path}: {BASE}: {seen[0]} is based on more than {_LONGEST_CHAIN} scenes, one on the "
+            f"other: write some of them as one"
+        )
     below: Any
     below, more = read_document(base, find, (*seen, path))
     if not isinstance(below, dict):
@@ -117,35 +125,14 @@ def _settings_in(kind: Any) -> type[Settings] | None:
     return None
 
 
-class _Loader(yaml.SafeLoader):
-    """Refuses what YAML forbids and PyYAML lets pass: a key that is there twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        lines: dict[Any, int] = {}
-        for key_node, _ in node.value:
-            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag.endswith(":merge"):
-                continue
-            line = key_node.start_mark.line + 1
-            key = self.construct_object(key_node)  # type: ignore[no-untyped-call]
-            if key in lines:
-                problem = f"key `{key}` is there twice, first in line {lines[key]}"
-                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
-            lines[key] = line
-        made: dict[Any, Any] = super().construct_mapping(node, deep)
-        return made
-
-
 def _yaml(path: Path) -> Any:
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        if path.stat().st_size > 4 * LARGEST_YAML:  # bytes of a character at most
+            raise SceneError(
+                f"{path}: has {path.stat().st_size} bytes, which is no scene: name one that is"
+            )
+        return load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}:" if mark else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        if "is there twice" in problem:
-            raise SceneError(f"{path}:{where} {problem}: keep one") from error
-        raise SceneError(f"{path}:{where} is not YAML: {problem}") from error
-    except (ValueError, RecursionError) as error:  # PyYAML lets those of bad dates and numbers pass
-        raise SceneError(f"{path}: is not YAML: {error}") from error
+    except YamlError as error:
+        raise SceneError(f"{path}: {error}") from error

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def find_scene(name: str | Path) -> Path:
         SceneError: there is no such file; the sentence lists the installed scenes.
     """
     path = Path(name).expanduser()
-    if path.is_file():
+    if os.path.isfile(path):
         return path.resolve()
     known: dict[str, Path] = {}
     for root in shared_roots():
@@ -106,6 +107,6 @@ def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
     if key == "path" and not path.is_absolute():
         candidates += [root / "bags" / path for root in shared_roots()]
     for candidate in candidates:
-        if candidate.exists():
+        if os.path.exists(candidate):
             return str(candidate.resolve())
     raise SceneError(f"{origin}: {key}: there is no file {candidates[0]}")

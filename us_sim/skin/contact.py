@@ -16,9 +16,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from us_sim.geometry.collider_distance import offset_box_distance
+from us_sim.kernels import njit
 
 __all__ = ["push_out"]
 

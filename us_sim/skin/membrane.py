@@ -27,13 +27,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.skin.contact import push_out
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces

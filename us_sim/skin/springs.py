@@ -17,7 +17,8 @@ array([ 0.04 , -0.044])
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = ["SHORTEST", "spring_energy", "spring_forces"]
 

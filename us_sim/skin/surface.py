@@ -11,9 +11,8 @@ array([ 0.,  0., -1.])
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.skin.wavefront import parse_wavefront
+
+_CORNERS = {"triangle": 3, "quad": 4}
 
 __all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface"]
 
@@ -155,7 +157,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
             not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshError(f"{path}: there is no such surface file")
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
@@ -163,7 +165,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
         if path.suffix.lower() == ".obj":
             points, faces = parse_wavefront(path.read_text(errors="replace"))
         else:
-            points, faces = _read_with_meshio(path)
+            points, faces = _faces_by_meshio(path)
         if not len(faces):
             raise MeshError("the file has no triangles")
         places, joined = np.unique(points, axis=0, return_inverse=True)
@@ -177,36 +179,24 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
         raise MeshError(f"{path}: {error}") from error
 
 
-def _read_with_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points (N, 3) and triangles (T, 3) of a file."""
-    try:
-        import meshio
-    except ImportError as error:
-        raise MeshError(
-            f"reading a {path.suffix} file needs meshio; install it with `pip install meshio`"
-        ) from error
-    try:
-        # For a file that none of its readers takes, meshio prints and then leaves the process.
-        # Its STL reader overflows on the first bytes of a text file before it knows that it is one.
-        silence = io.StringIO()
-        with (
-            contextlib.redirect_stdout(silence),
-            contextlib.redirect_stderr(silence),
-            np.errstate(over="ignore"),
-        ):
-            mesh = meshio.read(path)
-        parts = [np.empty((0, 3), dtype=np.int32)]
-        for block in mesh.cells:
-            if block.type == "triangle":
-                parts.append(block.data)
-            elif block.type == "quad":
-                parts += [block.data[:, [0, 1, 2]], block.data[:, [0, 2, 3]]]
-        points = np.asarray(mesh.points, dtype=np.float64)
-        return points.reshape(len(points), 3), np.concatenate(parts).astype(np.int32)
-    except (Exception, SystemExit) as error:
-        raise MeshError(
-            "this is not a surface that can be read: give an OBJ, STL, PLY or VTK file"
-        ) from error
+    mesh = read_with_meshio(
+        path, "this is not a surface that can be read: give an OBJ, STL, PLY or VTK file"
+    )
+    parts = [np.empty((0, 3), dtype=np.int64)]
+    for block in mesh.cells:
+        if block.type in _CORNERS and block.data.shape[1:] != (_CORNERS[block.type],):
+            raise MeshError(f"the file has a {block.type} of {block.data.shape[1:]} corners")
+        if block.type == "triangle":
+            parts.append(block.data.astype(np.int64))
+        elif block.type == "quad":
+            quads = block.data.astype(np.int64)
+            parts += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+    points = np.asarray(mesh.points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise MeshError(f"the file has points of shape {points.shape}: give three coordinates")
+    return points, np.concatenate(parts)
 
 
 def _steps(name: str, length: float, spacing: float) -> NDArray[np.float64]:

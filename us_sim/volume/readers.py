@@ -13,7 +13,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,19 @@ from us_sim.volume.volume import Volume
 
 __all__ = ["read_placement", "read_volume"]
 
+# Not what else SimpleITK reads: a damaged DICOM file ends the process that reads it.
+_READERS = {
+    "mha": "MetaImageIO",
+    "mhd": "MetaImageIO",
+    "nrrd": "NrrdImageIO",
+    "nhdr": "NrrdImageIO",
+    "nii": "NiftiImageIO",
+}
+
 _METRES = 1e-3  # these formats hold millimetres
+_SPACINGS = (1e-4, 1e2)  # mm, from a microscope's to one voxel for half a limb
+_FARTHEST = 1e5  # mm
+_ORTHONORMAL = 1e-3  # what rounding may do to the products of a direction matrix's columns
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
@@ -39,8 +53,9 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 
     Raises:
         VolumeError: the file is missing or no image, holds fewer or more bytes than its header
-            says, is not a scalar three-dimensional image of two voxels or more along each axis,
-            or has a spacing or direction that places no volume.
+            says, is larger than `LARGEST_VOLUME` or the free memory, is not a scalar
+            three-dimensional image of two voxels or more along each axis, or has a spacing,
+            origin or direction that places no volume.
     """
     path = Path(path)
     header, index_to_patient = _header(path)
@@ -66,12 +81,13 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 
 def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
     """The reader of a file, its header read, and the placement of the volume."""
-    if not path.exists():
+    if not os.path.exists(path):
         raise VolumeError(f"{path}: there is no such file")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD or NIfTI volume")
-    check_stored_size(path)
+    stored = check_stored_size(path)
     header = sitk.ImageFileReader()
+    header.SetImageIO(_READERS[path.name.lower().removesuffix(".gz").rpartition(".")[2]])
     header.SetFileName(str(path))
     try:
         header.ReadImageInformation()
@@ -83,7 +99,13 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         raise VolumeError(
             f"{path}: is a sequence of tracked frames, not a volume; reconstruct a volume from it"
         )
-    return header, _placement(path, header)
+    placement = _placement(path, header)
+    value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
+    if stored.expected != math.prod(header.GetSize()) * value:
+        raise VolumeError(
+            f"{path}: its header says more than one thing about its size; export it again"
+        )
+    return header, placement
 
 
 def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
@@ -115,6 +137,21 @@ def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
         raise VolumeError(f"{path}: has an origin or a direction matrix that is not finite")
     if abs(np.linalg.det(direction)) < 1e-6:
         raise VolumeError(f"{path}: has a singular direction matrix, so its axes span no volume")
+    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
+        raise VolumeError(
+            f"{path}: has axes that are sheared or scaled by its direction matrix; resample it on "
+            f"a grid with right angles"
+        )
+    if not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):
+        raise VolumeError(
+            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; that of a "
+            f"body is {_SPACINGS[0]:g} to {_SPACINGS[1]:g} mm: correct it"
+        )
+    if np.abs(origin).max() > _FARTHEST:
+        raise VolumeError(
+            f"{path}: lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} "
+            f"m are possible at most: correct it"
+        )
     placement = np.eye(4)
     placement[:3, :3] = direction * spacing * _METRES
     placement[:3, 3] = origin * _METRES

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 __all__ = ["frame_fields", "frame_matrix", "frame_time"]
 
-_FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
+_FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
 
 
 def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
@@ -47,13 +47,10 @@ def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
         matrix = np.array(numbers).reshape(4, 4)
     except ValueError:
         raise ValueError("a transform that is not 16 numbers") from None
-    steps = np.linalg.norm(matrix[:3, :3], axis=0)
-    if not (
-        np.isfinite(matrix).all()
-        and steps.all()
-        and np.array_equal(matrix[3], [0, 0, 0, 1])
-        and abs(np.linalg.det(matrix[:3, :3] / steps)) > 1e-6
-    ):
+    with np.errstate(all="ignore"):
+        steps = np.linalg.norm(matrix[:3, :3], axis=0)
+        spans = abs(np.linalg.det(matrix[:3, :3] / steps)) > 1e-6
+    if not (np.isfinite(matrix).all() and spans and np.array_equal(matrix[3], [0, 0, 0, 1])):
         raise ValueError("a transform that is singular or not finite")
     return matrix
 

@@ -25,9 +25,7 @@ class VolumeSettings(Settings):
     section = "volume"
     error = VolumeError
 
-    file: str | None = setting(
-        description="MHA, NRRD, NIfTI, or what else SimpleITK reads", default=None, file=True
-    )
+    file: str | None = setting(description="MHA, NRRD or NIfTI", default=None, file=True)
     phantom: str | None = setting(
         description="procedural phantom in place of a file", choice=PHANTOMS, default=None
     )

@@ -28,6 +28,7 @@ array([ 8,  9, 10, 11], dtype=uint8)
 from __future__ import annotations
 
 import math
+import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -38,13 +39,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.metaimage import metaimage_header, metaimage_voxels
 from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
-from us_sim.volume.stored_size import check_stored_size, metaimage_header
+from us_sim.volume.stored_voxels import StoredVoxels
 
 __all__ = ["Sweep", "read_sweep"]
 
 _METRES = 1e-3  # the format holds millimetres
 _CHUNK = 1 << 20
+_LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
+_MOST_FRAMES = 1 << 20  # four hours at 60 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +100,7 @@ def read_sweep(path: Path, *, tracked: bool = True) -> Sweep:
             of it can be used.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise VolumeError(f"{path}: there is no such file; give a sequence (.igs.mha) of Plus")
     # The first bytes tell, so that a vast file of another kind is not read as a header.
     with path.open("rb") as file:
@@ -109,7 +113,9 @@ def read_sweep(path: Path, *, tracked: bool = True) -> Sweep:
             f"{path}: holds no tracked frames (Seq_Frame0000_...); give a sequence of Plus"
         )
     columns, rows, count = _size(path, header)
-    check_stored_size(path)
+    voxels = metaimage_voxels(path, header, header_bytes)
+    if not voxels.packed:  # packed images are checked as they are read
+        voxels.check_bytes()
     numbers, times, matrices = [], [], []
     left_out: dict[str, int] = {}
     for number in range(count):
@@ -132,7 +138,7 @@ def read_sweep(path: Path, *, tracked: bool = True) -> Sweep:
         np.array(times),
         np.array(matrices),
         left_out,
-        _Data.of(path, header, header_bytes, columns * rows),
+        _Data(voxels, columns * rows),
     )
 
 
@@ -153,6 +159,11 @@ def _size(path: Path, header: Mapping[str, str]) -> tuple[int, int, int]:
         raise VolumeError(
             f"{path}: holds poses without images ({columns} × {rows} pixels, {count} frames); "
             f"record the images too"
+        )
+    if columns * rows > _LARGEST_IMAGE or count > _MOST_FRAMES:
+        raise VolumeError(
+            f"{path}: says it holds {count} images of {columns} × {rows} pixels; {_MOST_FRAMES} of "
+            f"{_LARGEST_IMAGE} pixels are read at most: export a part of it"
         )
     element = header.get("ElementType")
     if element != "MET_UCHAR" or channels != 1:
@@ -196,20 +207,10 @@ def _nothing_usable(
 
 @dataclass(frozen=True)
 class _Data:
-    """The place of the images, one after another: in the file after its header, or in another."""
+    """The images, one after another: in the file after its header, or in another."""
 
-    path: Path
-    first: int  # byte
+    voxels: StoredVoxels
     frame: int  # bytes
-    compressed: bool
-
-    @classmethod
-    def of(cls, path: Path, header: Mapping[str, str], header_bytes: int, frame: int) -> _Data:
-        name = header.get("ElementDataFile", "LOCAL")
-        compressed = header.get("CompressedData", "False").lower() == "true"
-        if name.upper() == "LOCAL":
-            return cls(path, header_bytes, frame, compressed)
-        return cls(path.parent / name, 0, frame, compressed)
 
     def frames(self, wanted: Iterable[int]) -> Iterator[bytes]:
         """The bytes of frames, whose numbers ascend.
@@ -217,9 +218,9 @@ class _Data:
         Raises:
             EOFError, zlib.error: there are fewer than promised, or they are damaged.
         """
-        with self.path.open("rb") as file:
-            file.seek(self.first)
-            stream: BinaryIO | _Inflated = _Inflated(file) if self.compressed else file
+        with self.voxels.file.open("rb") as file:
+            file.seek(self.voxels.start)
+            stream: BinaryIO | _Inflated = _Inflated(file) if self.voxels.packed else file
             at = 0
             for number in wanted:
                 while at < number:
@@ -237,7 +238,7 @@ class _Inflated:
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._inflate = zlib.decompressobj()
+        self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)  # zlib or gzip
 
     def read(self, count: int) -> bytes:
         """The next ``count`` bytes; fewer at the end."""

@@ -10,6 +10,8 @@ from tissue_block import block_mesh
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.mesh.file import read_mesh
+from us_sim.tissue.mesh.gmsh import parse_gmsh
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 
 GMSH = """$NOD
 4
@@ -162,3 +164,55 @@ def test_a_missing_meshio_is_named_where_it_is_needed(tmp_path, monkeypatch):
     other.write_text("<VTKFile/>")
     with pytest.raises(MeshError, match=r"reading a \.vtu file needs meshio; install it"):
         read_mesh(other)
+
+
+def _as_gmsh(file, form, binary):
+    """A box by meshio, in Gmsh's format; its nodes and tetrahedra."""
+    planes = np.linspace(0.0, 0.1, 3)
+    box = box_mesh(planes, planes, planes)
+    meshio.write(
+        file, meshio.Mesh(box.nodes, [("tetra", box.tetrahedra)]), file_format=form, binary=binary
+    )
+    return box
+
+
+@pytest.mark.parametrize("form", ["gmsh22", "gmsh"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_gmsh_files_are_read_as_meshio_reads_them(tmp_path, form, binary):
+    box = _as_gmsh(tmp_path / "box.msh", form, binary)
+    points, tetrahedra, quadratic = parse_gmsh((tmp_path / "box.msh").read_bytes())
+    np.testing.assert_array_equal(points, box.nodes)
+    np.testing.assert_array_equal(tetrahedra, box.tetrahedra)
+    assert quadratic == 0
+
+
+@pytest.mark.parametrize("form", ["gmsh22", "gmsh"])
+def test_a_gmsh_node_0_is_none(tmp_path, form):
+    file = tmp_path / "box.msh"
+    box = _as_gmsh(file, form, binary=False)
+    first = " ".join(str(number + 1) for number in box.tetrahedra[0])
+    text = file.read_text()
+    assert text.count(f" {first}\n") == 1
+    file.write_text(text.replace(f" {first}\n", f" 0 {first.split(' ', 1)[1]}\n"))
+    with pytest.raises(MeshError, match="names node 0, which is not there"):
+        read_mesh(file)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("$Nodes\n1 27 ", "$Nodes\n1 28 ", "says it has 28 nodes, and holds 27"),
+        ("$Nodes\n1 27 ", "$Nodes\n2 27 ", "fewer numbers than it says"),
+        ("$Elements\n1 40 ", "$Elements\n1 4800000000 ", "says it has 4800000000 elements"),
+        ("4.1 0 8", "4.1 0 4", "save it as version"),
+        ("$EndNodes", "$End", "no whole part"),
+    ],
+)
+def test_gmsh_counts_that_do_not_fit_are_refused(tmp_path, old, new, words):
+    file = tmp_path / "box.msh"
+    _as_gmsh(file, "gmsh", binary=False)
+    text = file.read_text()
+    assert old in text, text[:300]
+    file.write_text(text.replace(old, new))
+    with pytest.raises(MeshError, match=words):
+        read_mesh(file)

@@ -13,7 +13,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = ["adjugate", "is_solid"]
 

@@ -18,10 +18,10 @@ cluster whose nodes all lie beyond one and the same side of the image is left ou
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.section import finite_nodes
 from us_sim.slicing.probe.plane import SlicePlane
 

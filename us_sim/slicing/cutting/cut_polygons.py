@@ -14,9 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 from us_sim.slicing.cutting.clusters import ON_PLANE
 

@@ -22,8 +22,8 @@ array([[0, 0, 0, 0, 0],
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.section import INSIDE, row_span
 
 __all__ = ["BLACK", "cells", "leave_black", "subdivide_rows"]

@@ -26,9 +26,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.kernels import njit
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import label_voxels
 from us_sim.slicing.cutting.row_bands import parallel_rows

@@ -23,10 +23,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.location import BLACK
 from us_sim.slicing.cutting.rest_outline import NO_OUTLINE
 from us_sim.slicing.cutting.row_bands import parallel_rows

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.cut_polygons import FACES, cross_edge, face_cut, place_node
 from us_sim.slicing.cutting.spans import closed_columns, up_to
 from us_sim.slicing.probe.plane import SlicePlane

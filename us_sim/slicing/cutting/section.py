@@ -22,10 +22,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 from us_sim.slicing.probe.plane import SlicePlane
 

@@ -12,8 +12,8 @@ their value; beyond that everything is 0. Values are rounded half up.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from us_sim.kernels import njit
 from us_sim.slicing.cutting.rest_outline import mark_covered
 from us_sim.slicing.cutting.simd import LANES, load_pairs, write_ramp
 from us_sim.slicing.cutting.spans import CUT_SHIFT, END_SHIFT

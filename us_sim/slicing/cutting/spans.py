@@ -8,7 +8,8 @@ side between them from the same corners, no pixel is missed there and none is wr
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = ["CUT_SHIFT", "END_SHIFT", "closed_columns", "convert_cuts", "up_to"]
 

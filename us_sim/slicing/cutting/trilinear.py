@@ -17,7 +17,8 @@ array([[15, 25, 35, 45]], dtype=uint8)
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = ["SLACK", "inside_volume", "sample_linear"]
 

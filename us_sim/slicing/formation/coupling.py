@@ -15,11 +15,11 @@ array([0., 0., 1., 1., 1., 1., 1., 1.], dtype=float32)
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["FULL_PRESS", "GEL_BEAD", "GEL_FILM", "LIGHT_CONTACT", "ContactSurface"]

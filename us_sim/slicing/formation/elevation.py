@@ -14,9 +14,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.beams import beam_width, depth_steps, focus_of, step_depths
 from us_sim.slicing.probe.probe import Probe

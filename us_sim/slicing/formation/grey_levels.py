@@ -16,9 +16,9 @@ array([[  0, 151, 255]], dtype=uint8)
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.beams import depth_steps, step_depths
 from us_sim.slicing.probe.probe import Probe

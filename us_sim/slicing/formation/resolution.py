@@ -26,9 +26,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.beams import beam_width, focus_of
 from us_sim.slicing.probe.probe import LinearProbe, Probe

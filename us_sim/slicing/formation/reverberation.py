@@ -24,9 +24,9 @@ array([124, 124, 124, 124, 124, 124, 124, 124], dtype=uint8)
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.probe import Probe
 

@@ -18,8 +18,9 @@ Opsearch 11, 1974).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from us_sim.kernels import njit
 
 __all__ = ["pivot", "solve_active", "unilateral"]
 

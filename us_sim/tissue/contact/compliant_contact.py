@@ -22,11 +22,11 @@ True
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import pivot, solve_active
 from us_sim.tissue.contact.penetration import only_forward, pushing_gap
 

@@ -21,11 +21,11 @@ array([[0.05, 0.  , 0.5 ]])
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.tissue.contact.compliant_contact import (
     CLOSED,
     SKIRT,

@@ -31,10 +31,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.tissue.contact.flared_probe import FlaredProbe
 
 __all__ = ["PenaltyContact"]

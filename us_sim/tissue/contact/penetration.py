@@ -15,12 +15,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import curved_box_distance
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 
 __all__ = [
     "GAP_TOLERANCE",

@@ -15,9 +15,9 @@ array([ 0.2 , -0.25])
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import unilateral
 
 __all__ = ["predict_forces"]

@@ -25,9 +25,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["SurfacePoints", "add_springs", "add_turns", "point_size"]

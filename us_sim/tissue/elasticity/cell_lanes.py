@@ -26,8 +26,8 @@ True
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.lanes import LANES, put_six, three
 from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, LOOP
 

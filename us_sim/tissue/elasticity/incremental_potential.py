@@ -30,9 +30,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors, push_corners
 

@@ -15,9 +15,9 @@ True
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.neo_hookean_point import INLINED
 
 __all__ = ["LANES", "five", "in_lanes", "nine", "put_nine", "put_six", "three"]

@@ -36,10 +36,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, ONE, crowding_below
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split

@@ -16,9 +16,9 @@ of its own, so that a tissue without vessels takes no longer.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.cell_lanes import gradients
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes
 from us_sim.tissue.elasticity.lumen import emptying

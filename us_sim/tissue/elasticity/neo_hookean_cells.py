@@ -19,10 +19,10 @@ over the lanes, which LLVM turns into vector instructions. The same input gives 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike
 
 from us_sim.errors import MeshError
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.cell_lanes import (
     FIELD,
     OUT,

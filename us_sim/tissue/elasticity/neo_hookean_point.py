@@ -34,7 +34,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = [
     "HALF",

@@ -19,9 +19,9 @@ turns into vector instructions. The same input gives the same bytes.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import DTypeLike
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.lanes import LANES, in_lanes, nine, put_nine, put_six, three
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.lumen import neo_hookean_constants

@@ -15,9 +15,9 @@ tissue is put back to its undeformed state, which is then the state of rest.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.volume_term import area_vectors
 from us_sim.tissue.model import TissueModel
 

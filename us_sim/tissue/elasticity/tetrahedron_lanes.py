@@ -15,8 +15,8 @@ array([3.5, 2.5, 1.5, 0.5])
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.lanes import LANES, nine, three
 from us_sim.tissue.elasticity.neo_hookean_point import INLINED
 

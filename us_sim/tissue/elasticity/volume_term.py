@@ -30,10 +30,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split

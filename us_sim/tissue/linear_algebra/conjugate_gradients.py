@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from us_sim.kernels import njit
 
 __all__ = ["conjugate_gradients", "product_rows"]
 

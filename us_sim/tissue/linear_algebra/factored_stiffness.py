@@ -23,11 +23,11 @@ True
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.lumen import emptying, neo_hookean_constants
 from us_sim.tissue.elasticity.neo_hookean_point import crowding

@@ -30,8 +30,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from us_sim.kernels import njit
 
 __all__ = ["LowRankFields"]
 

@@ -35,12 +35,12 @@ from dataclasses import dataclass
 from io import FileIO
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.sparse import block_array, csr_array, dia_array
 
 from us_sim.errors import SolverError
+from us_sim.kernels import njit
 from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure
 from us_sim.tissue.linear_algebra.nested_dissection import Part, nested_dissection
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh

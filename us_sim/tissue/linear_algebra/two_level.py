@@ -27,9 +27,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 
 __all__ = [

@@ -16,11 +16,11 @@ Each vertex keeps its barycentric coordinates in the tetrahedron that it lies in
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.normals import vertex_normals
+from us_sim.kernels import njit
 from us_sim.tissue.mesh.point_location import Location, locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 

@@ -13,22 +13,27 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
+import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.geometry.pose import Pose
+from us_sim.tissue.mesh.gmsh import VERSIONS, parse_gmsh
 from us_sim.tissue.mesh.gmsh_one import parse_gmsh_one
 from us_sim.tissue.mesh.repair import repair
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["read_mesh"]
+
+_NO_MESH = (
+    "this is not a tetrahedral mesh that can be read: give a Gmsh, VTK or VTU file, whole and of "
+    "an unstructured grid"
+)
 
 _SIZES = (1e-3, 10.0)
 """Sizes of bodies, m: a smaller or larger one is in the wrong unit."""
@@ -55,13 +60,14 @@ def read_mesh(
             a body, the mesh cannot be used, or meshio is needed and not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshError(f"{path}: there is no such mesh file")
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
     try:
         points, tetrahedra, left_out = _read(path)
-        nodes = points * metres_per_unit
+        with np.errstate(over="ignore"):
+            nodes = points * metres_per_unit
         if pose is not None:
             nodes = pose.apply(nodes)
         mesh, repaired = repair(nodes, tetrahedra)
@@ -81,7 +87,10 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
         start = file.read(64).lstrip()
     if start.startswith(b"$NOD"):
         return *parse_gmsh_one(path.read_text(encoding="utf-8", errors="replace")), ()
-    content = _read_with_meshio(path)
+    if start.startswith(b"$MeshFormat") and _version(start) in VERSIONS:
+        points, tetrahedra, quadratic = parse_gmsh(path.read_bytes())
+        return points, tetrahedra, (_straightened(quadratic),) if quadratic else ()
+    content = read_with_meshio(path, _NO_MESH)
     parts: list[NDArray[np.integer]] = []
     report = []
     for block in content.cells:
@@ -89,7 +98,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
             parts.append(block.data)
         elif block.type == "tetra10":
             parts.append(block.data[:, :4])
-            report.append(f"straightened the edges of {len(block.data)} quadratic tetrahedra")
+            report.append(_straightened(len(block.data)))
         elif block.type not in _ON_THEIR_SURFACE and len(block.data):
             raise MeshError(
                 f"the file has {len(block.data)} cells of type {block.type}: mesh the body with "
@@ -103,25 +112,10 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
     return points, np.concatenate(parts), tuple(report)
 
 
-def _read_with_meshio(path: Path) -> Any:
-    try:
-        import meshio
-    except ImportError as error:
-        raise MeshError(
-            f"reading a {path.suffix or 'mesh'} file needs meshio; install it with "
-            f"`pip install meshio`"
-        ) from error
-    try:
-        # For a file that none of its readers takes, meshio prints and then leaves the process.
-        silence = io.StringIO()
-        with (
-            contextlib.redirect_stdout(silence),
-            contextlib.redirect_stderr(silence),
-            np.errstate(all="ignore"),
-        ):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        raise MeshError(
-            "this is not a tetrahedral mesh that can be read: give a Gmsh, VTK or VTU file, whole "
-            "and of an unstructured grid"
-        ) from error
+def _version(start: bytes) -> str:
+    """Of Gmsh's format."""
+    return b" ".join(start.split()[1:2]).decode("latin-1")
+
+
+def _straightened(count: int) -> str:
+    return f"straightened the edges of {count} quadratic tetrahedra"

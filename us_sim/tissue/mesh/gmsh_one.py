@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.tissue.mesh.gmsh import row_numbers
 
 __all__ = ["parse_gmsh_one"]
 
@@ -64,16 +65,7 @@ def parse_gmsh_one(text: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         raise MeshError("a tetrahedron of the file does not have four nodes")
     if not named:
         raise MeshError("the file has no tetrahedra")
-    order = np.argsort(numbers, kind="stable")
-    twice = np.flatnonzero(np.diff(numbers[order]) == 0)
-    if len(twice):
-        raise MeshError(f"two nodes of the file have the number {numbers[order[twice[0]]]}")
-    corners = np.array(named)
-    place = np.searchsorted(numbers, corners, sorter=order).clip(0, len(numbers) - 1)
-    tetrahedra = order[place]
-    if (numbers[tetrahedra] != corners).any():
-        lost = corners[numbers[tetrahedra] != corners][0]
-        raise MeshError(f"a tetrahedron of the file names node {lost}, which is not there")
+    tetrahedra = row_numbers(numbers, np.array(named))
     return points, tetrahedra
 
 

@@ -26,9 +26,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tissue.contact.penetration import pushing_gap
 from us_sim.tissue.elasticity.springs import spring_forces
 from us_sim.tissue.elasticity.volume_term import add_volume_forces

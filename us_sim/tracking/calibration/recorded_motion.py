@@ -16,6 +16,7 @@ array([[0.01, 0.02, 0.03]])
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -30,8 +31,8 @@ from us_sim.tracking.calibration.position_signal import (
     signal_of_images,
     signal_of_positions,
 )
+from us_sim.volume.metaimage import metaimage_header
 from us_sim.volume.sequence_header import frame_fields
-from us_sim.volume.stored_size import metaimage_header
 from us_sim.volume.sweep import Sweep, read_sweep
 
 __all__ = ["read_motion", "read_signal", "seconds_of"]
@@ -100,7 +101,7 @@ def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
 
 
 def _has_transforms(path: Path) -> bool:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise CalibrationError(f"{path}: there is no such file")
     frames = frame_fields(metaimage_header(path)[0])
     return any(key.endswith("Transform") for fields in frames.values() for key in fields)

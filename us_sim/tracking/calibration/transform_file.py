@@ -32,6 +32,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = [
     "TransformFile",
@@ -153,18 +154,15 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = load_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise CalibrationError(
             f"{path}: there is no such file; `us-sim calibrate` writes transforms"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}:" if mark else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        raise CalibrationError(f"{path}:{where} is not YAML: {problem}") from error
+    except YamlError as error:
+        raise CalibrationError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise CalibrationError(
             f"{path}: holds no transform; it needs the keys position and orientation"

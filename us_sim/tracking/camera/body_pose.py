@@ -19,10 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 from us_sim.tracking.camera.model import CameraModel, project_points
 from us_sim.tracking.camera.plane_pose import plane_poses

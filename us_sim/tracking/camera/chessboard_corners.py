@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
 __all__ = ["refined_crossing"]

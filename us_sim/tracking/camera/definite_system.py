@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from us_sim.kernels import njit
 
 __all__ = ["solve_definite"]
 

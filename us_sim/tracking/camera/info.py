@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 
 from us_sim.errors import TrackingError
+from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.model import CameraModel
 
 __all__ = ["read_camera_info", "write_camera_info"]
@@ -33,10 +34,10 @@ def read_camera_info(path: Path | str) -> CameraModel:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except (UnicodeDecodeError, YamlError) as error:
         raise TrackingError(f"{path}: not a YAML file of camera info: {_line(error)}") from error
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: not camera info; it must be a mapping")

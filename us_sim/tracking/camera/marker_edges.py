@@ -22,9 +22,9 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
 __all__ = ["refined_corners"]

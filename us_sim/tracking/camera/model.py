@@ -17,10 +17,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
+from us_sim.kernels import njit
 
 __all__ = ["DISTORTION_MODELS", "CameraModel", "project_points"]
 

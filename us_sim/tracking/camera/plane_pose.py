@@ -17,9 +17,9 @@ Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109 (2014
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
 __all__ = ["plane_poses"]

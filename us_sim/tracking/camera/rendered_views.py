@@ -23,11 +23,11 @@ from fractions import Fraction
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
+from us_sim.kernels import njit
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import Chessboard, RigidBody

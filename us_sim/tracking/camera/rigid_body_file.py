@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import PoseError, TrackingError
@@ -33,6 +32,7 @@ from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.markers import square
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.settings import MARKER_SIZE
@@ -218,9 +218,9 @@ def _yaml(text: str) -> Mapping[str, Any]:
     if lines and lines[0].startswith("%YAML:"):
         lines[0] = ""
     try:
-        content = yaml.safe_load("\n".join(lines))
-    except yaml.YAMLError as error:
-        raise TrackingError(f"not a YAML file: {str(error).splitlines()[0]}") from error
+        content = load_yaml("\n".join(lines))
+    except YamlError as error:
+        raise TrackingError(f"not a YAML file: {error}") from error
     if not isinstance(content, Mapping):
         raise TrackingError("it must be a mapping with dictionary and markers or board")
     return content

@@ -49,7 +49,7 @@ class VideoSource:
         self._capture: cv2.VideoCapture | None = None
         path = Path(self.name).expanduser()
         is_live = self.name.isdigit() or "://" in self.name
-        if not is_live and not path.exists():
+        if not is_live and not os.path.exists(path):
             if self.name.startswith("/dev/"):
                 is_live = True  # it may be plugged in later
             else:

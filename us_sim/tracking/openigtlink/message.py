@@ -20,12 +20,12 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import PoseError, TrackingError
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 
 __all__ = [
     "HEADER",
@@ -236,7 +236,7 @@ def _crc_table() -> NDArray[np.uint64]:
 _CRC_TABLE = _crc_table()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _crc64(data, table):
     crc = np.uint64(0)
     for byte in data:

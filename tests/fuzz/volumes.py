@@ -1,0 +1,94 @@
+"""Volumes, sweeps and tracker recordings."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+
+from tests.fuzz.target import target
+from us_sim.recording.path import read_path
+from us_sim.volume.readers import read_volume
+from us_sim.volume.sweep import read_sweep
+
+VOXELS = np.arange(6 * 5 * 4, dtype=np.int16).reshape(6, 5, 4)
+
+FRAME = """Seq_Frame{0:04}_ImageToReferenceTransform = 0.2 0 0 -10 0 0 -0.2 0 0 0.2 0 {0} 0 0 0 1
+Seq_Frame{0:04}_ImageToReferenceTransformStatus = OK
+Seq_Frame{0:04}_ProbeToTrackerTransform = 1 0 0 {0} 0 1 0 0 0 0 1 0 0 0 0 1
+Seq_Frame{0:04}_ProbeToTrackerTransformStatus = OK
+Seq_Frame{0:04}_Timestamp = 0.{0}
+"""
+
+
+def image(kind: int = sitk.sitkUInt8) -> sitk.Image:
+    """A small one, placed aslant."""
+    made = sitk.Cast(sitk.GetImageFromArray(VOXELS), kind)
+    turn = sitk.VersorRigid3DTransform()
+    turn.SetRotation((0.3, -0.5, 0.8), 0.7)
+    made.SetDirection(turn.GetMatrix())
+    made.SetSpacing((0.5, 0.25, 2.0))
+    made.SetOrigin((-12.5, 40.0, 7.75))
+    return made
+
+
+def seeds_of(suffix: str) -> Callable[[Path], Iterator[bytes]]:
+    """Makes files of a format, packed and not, of several types."""
+
+    def seeds(folder: Path) -> Iterator[bytes]:
+        for kind in (sitk.sitkUInt8, sitk.sitkInt16, sitk.sitkFloat32):
+            for packed in (False, True):
+                file = folder / f"volume{suffix}"
+                sitk.WriteImage(image(kind), str(file), packed)
+                yield file.read_bytes()
+
+    return seeds
+
+
+def read(path: Path) -> None:
+    """The volume, which lies somewhere."""
+    volume = read_volume(path)
+    assert min(volume.shape) >= 2
+    assert np.isfinite(volume.index_to_patient).all()
+    assert np.isfinite(volume.patient_to_index).all()
+    assert np.isfinite(volume.extent).all()
+    assert volume.intensities.max() <= 255
+
+
+for name in ("mha", "nrrd", "nii", "nii.gz"):
+    target(name.replace(".", "-"), f".{name}", seeds_of(f".{name}"))(read)
+
+
+def sequence_seeds(_: Path) -> Iterator[bytes]:
+    """Tracked frames, packed and not."""
+    frames = "".join(FRAME.format(number) for number in range(4))
+    pixels = bytes(range(96))
+    packed = zlib.compress(pixels)
+    for data, more in (
+        (pixels, ""),
+        (packed, f"CompressedData = True\nCompressedDataSize = {len(packed)}\n"),
+    ):
+        header = (
+            "ObjectType = Image\nNDims = 3\nDimSize = 6 4 4\nElementType = MET_UCHAR\n"
+            f"UltrasoundImageOrientation = MFA\n{more}{frames}ElementDataFile = LOCAL\n"
+        )
+        yield header.encode() + data
+
+
+@target("sweep", ".igs.mha", sequence_seeds)
+def sweep(path: Path) -> None:
+    """All images, and where they are."""
+    read = read_sweep(path)
+    assert np.isfinite(read.image_to_reference).all()
+    assert all(image.shape == (read.rows, read.columns) for image in read.images())
+
+
+@target("tracker", ".igs.mha", sequence_seeds)
+def tracker(path: Path) -> None:
+    """A path of it."""
+    poses = read_path(path, "ProbeToTracker")
+    assert np.isfinite(poses.positions).all()
+    assert np.isfinite(poses.orientations).all()

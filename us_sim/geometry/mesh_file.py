@@ -1,0 +1,98 @@
+"""Mesh files of unknown origin through meshio, which believes what they say of themselves.
+
+>>> import tempfile
+>>> from pathlib import Path
+>>> from us_sim.geometry.mesh_file import read_with_meshio
+>>> file = Path(tempfile.mkdtemp()) / "triangle.off"
+>>> _ = file.write_text("OFF\\n3 1 0\\n0 0 0\\n1 0 0\\n0 1 0\\n3 0 1 2\\n")
+>>> read_with_meshio(file, "give a mesh").cells[0].data.tolist()
+[[0, 1, 2]]
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from us_sim.errors import MeshError
+
+__all__ = ["read_with_meshio"]
+
+_MEMORY = 1 << 30
+"""Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size."""
+_MEMORY_PER_BYTE = 64
+
+
+def read_with_meshio(path: Path, refusal: str) -> Any:
+    """The mesh that meshio makes of a file.
+
+    Args:
+        path: of the file.
+        refusal: the error of a file that cannot be read.
+
+    Raises:
+        MeshError: it cannot be read, or not within bounded memory, or meshio is not installed.
+    """
+    try:
+        import meshio
+    except ImportError as error:
+        raise MeshError(
+            f"reading a {path.suffix or 'mesh'} file needs meshio; install it with "
+            f"`pip install meshio`"
+        ) from error
+    if path.suffix.lower() == ".ply" and not _has_ply_header(path):
+        raise MeshError(refusal)
+    try:
+        # For a file that none of its readers takes, meshio prints and then leaves the process.
+        silence = io.StringIO()
+        with (
+            contextlib.redirect_stdout(silence),
+            contextlib.redirect_stderr(silence),
+            np.errstate(all="ignore"),
+            _bounded_memory(_MEMORY + _MEMORY_PER_BYTE * path.stat().st_size),
+        ):
+            mesh = meshio.read(path)
+            count = len(mesh.points)
+            for block in mesh.cells:
+                # An index below 0 would count from the last point.
+                if len(block.data) and not 0 <= np.min(block.data) <= np.max(block.data) < count:
+                    raise MeshError(
+                        f"the file has cells that name points beyond the {count} that are there"
+                    )
+            return mesh
+    except MeshError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise MeshError(refusal) from error
+
+
+def _has_ply_header(path: Path) -> bool:
+    """Whether the header of a PLY file ends; meshio would look for its end for ever."""
+    with path.open("rb") as file:
+        return any(line.strip() == b"end_header" for line in file)
+
+
+@contextlib.contextmanager
+def _bounded_memory(more: int) -> Iterator[None]:
+    """This process takes no more than so many bytes more, where the system can see to that."""
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        before = resource.getrlimit(resource.RLIMIT_AS)
+    except (ImportError, OSError, ValueError):
+        yield
+        return
+    bound = pages * resource.getpagesize() + more
+    if before[0] != resource.RLIM_INFINITY:
+        bound = min(bound, before[0])
+    resource.setrlimit(resource.RLIMIT_AS, (bound, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
