@@ -54,6 +54,19 @@ def slicer(bench, small_scene):
     return node, mesh, images, poses, nodes
 
 
+def test_a_mesh_of_nothing_leaves_the_one_before(bench, slicer):
+    node, mesh, images, poses, nodes = slicer
+    rest = bench.publisher(PointCloud2, "tissue/rest")
+    rest.publish(cloud(np.zeros((0, 3)), pose_at(0.0, 1)))
+    bench.publisher(Int32MultiArray, "tissue/tetrahedra").publish(
+        tetrahedra_message(np.zeros((0, 4), np.int32))
+    )
+    bench.spin_until(lambda: node.health.problems("mesh") >= 1)
+    poses.publish(pose_at(0.003, 1))
+    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 1)))
+    bench.spin_until(lambda: images)
+
+
 def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_scene):
     _, mesh, images, poses, nodes = slicer
     moved = (mesh.nodes + np.array([0.0, 0.0, 0.002])).astype(np.float32).astype(np.float64)

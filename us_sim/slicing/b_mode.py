@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.errors import MeshError
 from us_sim.geometry.mesh_faces import boundary_triangles
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import Settings
@@ -103,8 +104,11 @@ class BMode:
         """Let this mesh carry the volume: (N, 3) m at rest, and (M, 4) indices into them.
 
         Raises:
-            MeshError: the mesh cannot be used; then the one before still carries the volume.
+            MeshError: the mesh cannot be used, or there is none in it; then the one before still
+                carries the volume.
         """
+        if not (np.size(rest_nodes) and np.size(tetrahedra)):
+            raise MeshError("the mesh has no tetrahedra, so it cannot carry a volume")
         slicer = create_slicer(
             self._method,
             self._volume,
