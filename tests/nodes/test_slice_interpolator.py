@@ -33,6 +33,9 @@ probe: {aperture: 40 mm, depth: 40 mm, image: [60, 50]}
 """
 
 
+KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 def cloud(points, pose):
     return cloud_message(dict(zip("xyz", points.T, strict=True)), pose.header.stamp, "patient")
 
@@ -43,9 +46,8 @@ def slicer(bench, small_scene):
     scene = load_scene(small_scene)
     mesh = tissue_model_of(scene, volume_of(scene)).mesh
     images = bench.collect(Image, "ultrasound/image")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    rest = bench.peer.create_publisher(PointCloud2, "tissue/rest", latched)
-    tetrahedra = bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", latched)
+    rest = bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT)
+    tetrahedra = bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT)
     rest.publish(cloud(mesh.nodes, pose_at(0.0, 1)))
     tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
     poses = bench.publisher(PoseStamped, "probe/pose")
@@ -56,9 +58,10 @@ def slicer(bench, small_scene):
 
 def test_a_mesh_of_nothing_leaves_the_one_before(bench, slicer):
     node, mesh, images, poses, nodes = slicer
-    rest = bench.publisher(PointCloud2, "tissue/rest")
-    rest.publish(cloud(np.zeros((0, 3)), pose_at(0.0, 1)))
-    bench.publisher(Int32MultiArray, "tissue/tetrahedra").publish(
+    bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT).publish(
+        cloud(np.zeros((0, 3)), pose_at(0.0, 1))
+    )
+    bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT).publish(
         tetrahedra_message(np.zeros((0, 4), np.int32))
     )
     bench.spin_until(lambda: node.health.problems("mesh") >= 1)
