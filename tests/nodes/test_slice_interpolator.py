@@ -58,16 +58,19 @@ def slicer(bench, small_scene):
 
 def test_a_mesh_of_nothing_leaves_the_one_before(bench, slicer):
     node, mesh, images, poses, nodes = slicer
+    poses.publish(pose_at(0.003, 1))
+    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 1)))
+    bench.spin_until(lambda: len(images) == 1)
     bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT).publish(
         cloud(np.zeros((0, 3)), pose_at(0.0, 1))
     )
     bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT).publish(
         tetrahedra_message(np.zeros((0, 4), np.int32))
     )
-    bench.spin_until(lambda: node.health.problems("mesh") >= 1)
-    poses.publish(pose_at(0.003, 1))
-    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 1)))
-    bench.spin_until(lambda: images)
+    bench.spin_until(lambda: node.health.problems("mesh") == 2)
+    poses.publish(pose_at(0.003, 2))
+    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 2)))
+    bench.spin_until(lambda: len(images) == 2)
 
 
 def test_an_image_is_cut_at_the_pose_with_the_nodes_stamp(bench, slicer, small_scene):
