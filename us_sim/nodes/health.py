@@ -15,6 +15,8 @@ from us_sim.nodes.qos import STREAM, overridable
 
 __all__ = ["Health"]
 
+SAY_S = 5.0
+"""How long a problem of the same kind is not said again."""
 ANOTHER_CLOCK_S = 10.0
 """From the present to a stamp: from there on it is of another clock, or of an earlier day."""
 
@@ -37,6 +39,7 @@ class Health:
         self._latencies: deque[float] = deque(maxlen=1000)
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
+        self._said: dict[str, float] = {}
         self._last_problem = ""
         self.warning = ""  # what is wrong for as long as it is
         self._failures_told = 0
@@ -72,10 +75,13 @@ class Health:
         return 1e-9 * (time.monotonic_ns() - getattr(self._node, "arrived", time.monotonic_ns()))
 
     def problem(self, kind: str, sentence: str) -> None:
-        """Count a problem of that kind; it is logged at most every five seconds."""
+        """Count a problem of that kind; of each kind one is logged every five seconds at most."""
         self._problems[kind] += 1
         self._last_problem = sentence
-        self._node.get_logger().warning(sentence, throttle_duration_sec=5.0)
+        now = time.monotonic()
+        if now - self._said.get(kind, -SAY_S) >= SAY_S:
+            self._said[kind] = now
+            self._node.get_logger().warning(sentence)
 
     def problems(self, kind: str) -> int:
         """How many of that kind there were."""
