@@ -265,6 +265,22 @@ def test_a_compressed_image_larger_than_can_be_decoded_is_refused():
         grey_from_compressed(CompressedImage(format="png", data=png + chunk(b"IEND", b"")))
 
 
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [("png", []), ("jpg", []), ("jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])],
+)
+def test_a_compressed_image_is_decoded_only_as_far_as_a_camera_goes(kind, options):
+    pixels = np.full((97, 203), 90, np.uint8)
+    data = cv2.imencode(f".{kind}", pixels, options)[1].tobytes()
+    decoded = grey_from_compressed(CompressedImage(format=kind, data=data))
+    np.testing.assert_array_equal(decoded, pixels)
+    size = struct.pack(">II", 203, 97) if kind == "png" else struct.pack(">HH", 97, 203)
+    assert data.count(size) == 1
+    claimed = struct.pack(">II" if kind == "png" else ">HH", 8193, 8192)
+    with pytest.raises(TrackingError, match=r"8193 × 8192|8192 × 8193"):
+        grey_from_compressed(CompressedImage(format=kind, data=data.replace(size, claimed)))
+
+
 def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):
     node, poses = tracker(SECTION)
     images = bench.publisher(Image, "camera/image_raw")

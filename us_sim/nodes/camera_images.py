@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import struct
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +37,11 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
 }
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_MOST_SEGMENTS = 1000  # of a JPEG before its picture
+_MOST_PIXELS = 1 << 26
+"""Of a compressed image: as many as 8192 × 8192."""
 
 _LARGEST = 1e9
 """Pixels, or a coefficient of the distortion."""
@@ -103,15 +111,37 @@ def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
     """(rows, columns) grey pixels of a JPEG or PNG.
 
     Raises:
-        TrackingError: it cannot be decoded.
+        TrackingError: it cannot be decoded, or is larger than any camera's.
     """
     data = np.frombuffer(message.data, dtype=np.uint8)
-    try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    except cv2.error:  # the header says that it is larger than OpenCV takes
-        pixels = None
+    columns, rows = _stated_size(data.tobytes())
+    pixels = None
+    if columns * rows <= _MOST_PIXELS:
+        with contextlib.suppress(cv2.error):
+            pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if columns and rows else None
     if pixels is None:
         raise TrackingError(
-            f"the compressed image ('{message.format}', {data.size} bytes) cannot be decoded"
+            f"the compressed image ('{message.format}', {data.size} bytes for {columns} × {rows} "
+            f"pixels) cannot be decoded: it must be a JPEG or PNG of {_MOST_PIXELS} pixels at most"
         )
     return np.asarray(pixels, dtype=np.uint8)
+
+
+def _stated_size(data: bytes) -> tuple[int, int]:
+    """Columns and rows by a PNG's or JPEG's header; 0 and 0 where it is neither.
+
+    A few bytes may say that they are gigabytes, and are taken at their word when decoded.
+    """
+    if data.startswith(_PNG) and len(data) >= 24:
+        columns, rows = struct.unpack_from(">II", data, 16)
+        return columns, rows
+    place = 2
+    for _ in range(_MOST_SEGMENTS):
+        if not data.startswith(_JPEG) or place + 9 > len(data) or data[place] != 0xFF:
+            break
+        marker, length = data[place + 1], struct.unpack_from(">H", data, place + 2)[0]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            rows, columns = struct.unpack_from(">HH", data, place + 5)
+            return columns, rows
+        place += 1 if marker == 0xFF else 2 + length
+    return 0, 0
