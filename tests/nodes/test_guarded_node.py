@@ -13,6 +13,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
+from rosgraph_msgs.msg import Clock
 
 from us_sim.errors import PoseError
 from us_sim.nodes import guarded_node, process
@@ -90,6 +91,15 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
     poses.publish(pose_at(0.0, 1))
     bench.spin_until(lambda: broken.health.problems("pose") == 1)
     assert not broken.failures
+
+
+def test_what_is_said_is_one_line_however_a_message_is_quoted(broken):
+    broken.refused("/pose", PoseError("in frame '\x1b[2J\n" + "a" * 10_000))
+    broken.failed("/pose", ValueError("\x07\n" * 10_000))
+    for sentence in (broken.health._last_problem, broken.last_failure):
+        assert sentence.startswith("/pose: ")
+        assert sentence.isprintable()
+        assert len(sentence) < 600
 
 
 def test_timers_and_guard_conditions_go_on(bench, broken):
@@ -186,6 +196,18 @@ def test_one_message_over_the_network_does_not_end_the_tracker(bench, small_scen
     assert [(p.header.stamp.sec, p.pose.position.z) for p in poses] == [(9, 0.002)]
     assert node.health.problems(kind) == 1
     assert not node.failures
+
+
+def test_a_clock_that_is_none_leaves_the_time_as_it_was(bench):
+    node = bench.make(Broken, use_sim_time=True)
+    clocks = bench.publisher(Clock, "/clock")
+    for stamp in (Time(sec=50), Time(sec=-1), Time(sec=2**31 - 1, nanosec=2**32 - 1)):
+        clocks.publish(Clock(clock=stamp))
+        bench.spin_for(3)
+    bench.spin_until(lambda: node.health.problems("stamp") == 2)
+    assert node.get_clock().now().nanoseconds == 50 * 10**9
+    clocks.publish(Clock(clock=Time(sec=51)))
+    bench.spin_until(lambda: node.get_clock().now().nanoseconds == 51 * 10**9)
 
 
 def test_a_source_that_fails_is_reset_and_goes_on(bench, small_scene, tmp_path, monkeypatch):

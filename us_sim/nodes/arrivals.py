@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import EVERY
 
 __all__ = ["HOPS", "Arrivals"]
@@ -32,7 +32,7 @@ _HEADER = struct.Struct("<4xiI")
 """Where a serialized message with a header has its stamp."""
 
 
-class Arrivals(Node):
+class Arrivals(GuardedNode):
     """Subscribes to topics without looking at more of their messages than the stamps.
 
     Args:

@@ -20,7 +20,7 @@ from us_sim.nodes.conversions.stamps import require_stamp
 if TYPE_CHECKING:
     from us_sim.nodes.health import Health
 
-__all__ = ["GuardedNode", "decoded", "kind_of"]
+__all__ = ["GuardedNode", "decoded", "kind_of", "shown"]
 
 SAY_S = 1.0
 """How long the same failure is not said again."""
@@ -53,7 +53,7 @@ class GuardedNode(Node):
 
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
-        sentence = _shortened(f"{where}: {error}; it is not used")
+        sentence = shown(f"{where}: {error}; it is not used")
         if hasattr(self, "health"):
             self.health.problem(kind_of(error), sentence)
         elif self._is_time_to_say(where):
@@ -61,9 +61,8 @@ class GuardedNode(Node):
 
     def failed(self, where: str, error: Exception) -> None:
         """Count and say an exception that nobody expected; any thread may."""
-        text = " ".join(str(error).split())
         self.failures[where] += 1
-        self.last_failure = _shortened(f"{where}: {type(error).__name__}: {text}")
+        self.last_failure = shown(f"{where}: {type(error).__name__}: {error}")
         if self._is_time_to_say(where):
             self.get_logger().error(
                 f"{self.last_failure}; the node goes on (failure {self.failures[where]} of this "
@@ -192,5 +191,7 @@ def _name(callback: Any) -> str:
     return getattr(callback, "__qualname__", type(callback).__name__)
 
 
-def _shortened(sentence: str) -> str:
-    return sentence if len(sentence) <= LONGEST else f"{sentence[:LONGEST]} …"
+def shown(sentence: str) -> str:
+    """The sentence on one line, not too long, of what can be printed: it may quote a message."""
+    cut = sentence if len(sentence) <= LONGEST else f"{sentence[:LONGEST]} …"
+    return "".join(c if c.isprintable() else "?" for c in " ".join(cut.split()))

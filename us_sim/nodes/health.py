@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from us_sim.nodes.conversions.stamps import nanoseconds_of
+from us_sim.nodes.guarded_node import shown
 from us_sim.nodes.qos import STREAM, overridable
 
 __all__ = ["Health"]
@@ -77,7 +78,7 @@ class Health:
     def problem(self, kind: str, sentence: str) -> None:
         """Count a problem of that kind; of each kind one is logged every five seconds at most."""
         self._problems[kind] += 1
-        self._last_problem = sentence
+        self._last_problem = sentence = shown(sentence)
         now = time.monotonic()
         if now - self._said.get(kind, -SAY_S) >= SAY_S:
             self._said[kind] = now
