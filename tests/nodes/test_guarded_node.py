@@ -1,5 +1,6 @@
 """A node goes on whatever comes in: bad input is refused, a failure counted, said and survived."""
 
+import struct
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2, PointField
 
 from us_sim.errors import PoseError
 from us_sim.nodes import guarded_node, process
@@ -166,6 +168,18 @@ def test_bytes_that_are_no_message_never_reach_a_callback(broken, data):
     assert (broken.calls, broken.health.problems("message")) == (0, 1)
     take(GOOD)
     assert broken.calls == 1
+
+
+def test_a_sequence_of_more_than_there_is_never_reaches_rclpy(broken, monkeypatch):
+    """Fast DDS's type support would make room for it: 19 GB."""
+    cloud = PointCloud2(fields=[PointField(name="x")])
+    good = bytes(serialize_message(cloud))
+    claimed = good.replace(struct.pack("<II", 1, 2), struct.pack("<II", 2**28, 2), 1)
+    assert claimed != good
+    take = broken.guarded("/cloud", guarded_node.decoded(PointCloud2, broken.work))
+    monkeypatch.setattr(guarded_node, "deserialize_message", pytest.fail)
+    take(claimed)
+    assert (broken.calls, broken.health.problems("message")) == (0, 1)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
 from us_sim.errors import MessageError, UsSimError
+from us_sim.nodes.conversions.serialized import require_sequences
 from us_sim.nodes.conversions.stamps import require_stamp
 
 if TYPE_CHECKING:
@@ -164,13 +165,15 @@ def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes],
 
     It raises MessageError for bytes that are none, and StampError where its stamp is no time. That
     is not left to subscriptions: of a message that is cut off, rmw_fastrtps says nothing, and
-    rmw_cyclonedds hands on what it had read until then.
+    rmw_cyclonedds hands on what it had read until then; and of one whose sequences claim more than
+    there is, `require_sequences` says what may become.
     """
 
     def take(data: bytes) -> None:
         try:
             if len(data) < HEADER_SIZE:
                 raise ValueError("there is not even a header")  # and nobody else looks for one
+            require_sequences(data, message_type)
             message = deserialize_message(data, message_type)
         except Exception as error:  # which, differs between middlewares
             raise MessageError(
