@@ -6,7 +6,7 @@ else may write it, and its checksum is right. Any other is compiled again, and a
 `NUMBA_CACHE_DIR` names another folder than `kernels` in that of `us_sim.cache`.
 
 >>> from us_sim.kernels import njit
->>> @njit(cache=True)
+>>> @njit(nogil=True)  # and cache=True in a module; an example like this has no file
 ... def twice(x):
 ...     return 2 * x
 >>> twice(21)
