@@ -54,7 +54,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     def decorate(kernel: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(kernel)
         if cache and isinstance(dispatcher, Dispatcher):
-            dispatcher._cache = _KernelCache(kernel)
+            dispatcher._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return dispatcher
 
     return decorate if function is None else decorate(function)
@@ -66,7 +66,8 @@ class _Locator(UserProvidedCacheLocator):
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
         self._py_file = py_file
         self._lineno = py_func.__code__.co_firstlineno
-        folder = Path(config.CACHE_DIR) if config.CACHE_DIR else cache_folder() / "kernels"
+        given = getattr(config, "CACHE_DIR", "")
+        folder = Path(given) if given else cache_folder() / "kernels"
         self._cache_path = str(folder / self.get_suitable_cache_subpath(py_file))
 
     @classmethod
@@ -88,7 +89,7 @@ class _KernelCache(FunctionCache):
 
     def __init__(self, py_func: Callable[..., Any]) -> None:
         super().__init__(py_func)
-        self._cache_file: _CheckedFiles = _CheckedFiles(
+        self._cache_file: Any = _CheckedFiles(
             Path(self._cache_path), self._impl.filename_base, self._impl.locator.get_source_stamp()
         )
 
