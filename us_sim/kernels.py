@@ -27,7 +27,7 @@ from typing import Any
 
 import numba
 from numba.core import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
@@ -60,7 +60,11 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     return decorate if function is None else decorate(function)
 
 
-class _Locator(UserProvidedCacheLocator):
+# Its name differs between numba's versions.
+_UserProvidedCacheLocator: Any = CompileResultCacheImpl._locator_classes[0]
+
+
+class _Locator(_UserProvidedCacheLocator):
     """The folder of a source file's kernels, which is made when there is something to keep."""
 
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
