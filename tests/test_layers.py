@@ -124,4 +124,4 @@ def test_nothing_is_imported_in_circles():
 def test_a_module_is_no_longer_than_400_lines_and_few_are_at_the_top():
     lines = {name: len(file.read_text().splitlines()) for name, file in FILES.items()}
     assert {name for name, count in lines.items() if count > 400} == set()
-    assert len(list(ROOT.glob("*.py"))) <= 6
+    assert len(list(ROOT.glob("*.py"))) <= 7

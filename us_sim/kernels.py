@@ -6,7 +6,7 @@ else may write it, and its checksum is right. Any other is compiled again, and a
 `NUMBA_CACHE_DIR` names another folder than `kernels` in that of `us_sim.cache`.
 
 >>> from us_sim.kernels import njit
->>> @njit(cache=True)
+>>> @njit(nogil=True)  # and cache=True in a module; an example like this has no file
 ... def twice(x):
 ...     return 2 * x
 >>> twice(21)
@@ -27,7 +27,7 @@ from typing import Any
 
 import numba
 from numba.core import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
@@ -54,19 +54,24 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     def decorate(kernel: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(kernel)
         if cache and isinstance(dispatcher, Dispatcher):
-            dispatcher._cache = _KernelCache(kernel)
+            dispatcher._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return dispatcher
 
     return decorate if function is None else decorate(function)
 
 
-class _Locator(UserProvidedCacheLocator):
+# Its name differs between numba's versions.
+_UserProvidedCacheLocator: Any = CompileResultCacheImpl._locator_classes[0]
+
+
+class _Locator(_UserProvidedCacheLocator):
     """The folder of a source file's kernels, which is made when there is something to keep."""
 
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
         self._py_file = py_file
         self._lineno = py_func.__code__.co_firstlineno
-        folder = Path(config.CACHE_DIR) if config.CACHE_DIR else cache_folder() / "kernels"
+        given = getattr(config, "CACHE_DIR", "")
+        folder = Path(given) if given else cache_folder() / "kernels"
         self._cache_path = str(folder / self.get_suitable_cache_subpath(py_file))
 
     @classmethod
@@ -88,7 +93,7 @@ class _KernelCache(FunctionCache):
 
     def __init__(self, py_func: Callable[..., Any]) -> None:
         super().__init__(py_func)
-        self._cache_file: _CheckedFiles = _CheckedFiles(
+        self._cache_file: Any = _CheckedFiles(
             Path(self._cache_path), self._impl.filename_base, self._impl.locator.get_source_stamp()
         )
 

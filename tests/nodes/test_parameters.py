@@ -301,7 +301,7 @@ def test_parameters_of_the_command_line_have_units(scene, node, given, checked):
         ("slice_interpolator", {"depth": "60"}, "depth: 60 m is outside .*; did you mean '60 mm'"),
         ("slice_interpolator", {"grey_map": "purple"}, "grey_map: 'purple' is not one of linear,"),
         ("slice_interpolator", {"contact": "3"}, "contact: must be true or false, not 3$"),
-        ("slice_interpolator", {"gain": "[1"}, r"gain=\[1: is not YAML$"),
+        ("slice_interpolator", {"gain": "[1"}, r"gain=\[1: is not YAML: "),
         ("slice_interpolator", {"time_gain": "3"}, "time_gain: must be a list, not 3$"),
         ("slice_interpolator", {"lines": "3"}, "lines' is not one of "),  # not while it runs
         ("slice_interpolator", {"gain": "2001-99-99"}, "gain=2001-99-99: is not YAML"),

@@ -6,6 +6,7 @@ anything is started; the tables of `docs/reference.md` are made from them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -319,7 +320,8 @@ def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
     try:
         return load_yaml(text)
     except YamlError as error:
-        raise UsSimError(f"--param {node}.{name}={text[:80]}: {error}") from error
+        what = re.sub("^line [0-9]+: ", "", str(error))
+        raise UsSimError(f"--param {node}.{name}={text[:80]}: {what}") from error
 
 
 def _checked(node: str, name: str, value: object, settings: type[Settings], field: str) -> object:

@@ -68,6 +68,7 @@ def _check(text: str) -> None:
     sizes: list[int] = [0]  # of what is open
     names: list[str | None] = []  # their anchors
     anchored: dict[str, int] = {}
+    event: Any  # of a class by what it is
     for event in yaml.parse(text, _Loader):
         line = event.start_mark.line + 1
         size = 0
@@ -76,7 +77,7 @@ def _check(text: str) -> None:
                 raise YamlError(
                     f"line {line}: is not YAML that can be read: `*{event.anchor}` is within itself"
                 )
-            size = anchored.get(event.anchor, 1)
+            size = anchored.get(str(event.anchor), 1)
         elif isinstance(event, yaml.ScalarEvent):
             size = 1
             if event.anchor:

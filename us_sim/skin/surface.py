@@ -161,6 +161,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
         raise MeshError(f"{path}: there is no such surface file")
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
+    faces: NDArray[np.integer]
     try:
         if path.suffix.lower() == ".obj":
             points, faces = parse_wavefront(path.read_text(errors="replace"))

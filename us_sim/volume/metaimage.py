@@ -8,7 +8,7 @@
 ...     _ = path.write_bytes(f"{header}ElementDataFile = LOCAL\\n".encode() + bytes(240))
 ...     voxels = metaimage_voxels(path, *metaimage_header(path))
 >>> voxels.size, voxels.value, voxels.start
-((4, 5, 6), 2, 90)
+((4, 5, 6), 2, 93)
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@
 ...     _ = path.write_bytes(header + bytes(240))
 ...     voxels = nrrd_voxels(path)
 >>> voxels.size, voxels.value, voxels.start
-((4, 5, 6), 2, 63)
+((4, 5, 6), 2, 62)
 """
 
 from __future__ import annotations
