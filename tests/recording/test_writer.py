@@ -199,11 +199,15 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):
     assert "first 91 messages are kept" in str(caught.value)
     with pytest.raises(BagError, match="cannot be written"):
         bag.write("/note", HI, EPOCH)
-    bag.close()
+    assert bag.lost == {"/note": 11}  # ten in the chunk that did not fit, and the last
     read = read_bag(tmp_path / "session.mcap")
-    assert not read.complete
-    assert read.message_count >= 91
-    assert not (tmp_path / "metadata.yaml").exists()
+    assert read.complete
+    assert read.message_count == bag.message_count == 91
+    assert bag.resume()
+    bag.write("/note", HI, EPOCH + 10**12)
+    bag.close()
+    with AnyReader([tmp_path]) as reader:
+        assert reader.message_count == 92
 
 
 def test_an_empty_bag_is_a_bag(tmp_path):
