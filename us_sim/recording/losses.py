@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Mapping
 from typing import NamedTuple
 
-__all__ = ["Loss", "Losses"]
+__all__ = ["Loss", "Losses", "news"]
 
 
 class Loss(NamedTuple):
@@ -23,7 +24,6 @@ class Losses:
         self._lock = threading.Lock()
         self._in_transport: Counter[str] = Counter()
         self._in_recorder: Counter[str] = Counter()
-        self._told: dict[str, Loss] = {}
 
     @property
     def total(self) -> int:
@@ -43,15 +43,15 @@ class Losses:
             topics = sorted({*+self._in_transport, *+self._in_recorder})
             return {t: Loss(self._in_transport[t], self._in_recorder[t]) for t in topics}
 
-    def news(self) -> dict[str, Loss]:
-        """What was lost since this was asked last, of topics that lost something since."""
-        now, before = self.by_topic(), self._told
-        self._told = now
-        return {
-            topic: Loss(
-                loss.in_transport - before.get(topic, Loss(0, 0)).in_transport,
-                loss.in_recorder - before.get(topic, Loss(0, 0)).in_recorder,
-            )
-            for topic, loss in now.items()
-            if loss != before.get(topic)
-        }
+
+def news(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
+    """What was lost between two looks at `Losses.by_topic`, of topics that lost something."""
+    none = Loss(0, 0)
+    return {
+        topic: Loss(
+            loss.in_transport - before.get(topic, none).in_transport,
+            loss.in_recorder - before.get(topic, none).in_recorder,
+        )
+        for topic, loss in now.items()
+        if loss != before.get(topic)
+    }

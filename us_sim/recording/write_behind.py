@@ -23,14 +23,12 @@ from functools import partial
 from typing import NamedTuple
 
 from us_sim.errors import BagError
-from us_sim.recording.losses import Losses
+from us_sim.recording.losses import Loss, Losses, news
 from us_sim.recording.schemas import definitions, schema_text
+from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
-__all__ = ["LOST", "Message", "WriteBehind"]
-
-LOST = "messages_lost"
-"""The metadata record that says how many messages of each topic are missing so far."""
+__all__ = ["Message", "WriteBehind"]
 
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
 _RETRY = 1.0  # s, between looks at a disk that was full
@@ -69,7 +67,7 @@ class WriteBehind:
         self._sequences: Counter[str] = Counter()
         self._changed = threading.Condition()
         self._ending = False
-        self._noted = 0  # losses in the bag's last note
+        self._noted: dict[str, Loss] = {}  # losses that the bag tells of
         self._disk_lost: Counter[str] = Counter()  # of the bag's, that are counted
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
@@ -200,9 +198,8 @@ class WriteBehind:
 
     def _note_losses(self) -> None:
         """Say in the file what is missing, if more is missing than it says."""
-        total = self.losses.total
-        if total > self._noted and not self.problem:
-            by_topic = self.losses.by_topic()
-            values = {topic: str(sum(loss)) for topic, loss in by_topic.items()}
-            self._bag.note(LOST, values)
-            self._noted = total
+        lost = self.losses.by_topic()
+        if lost != self._noted and not self.problem:
+            new = news(lost, self._noted)
+            self._bag.note(LOST, {topic: str(sum(loss)) for topic, loss in new.items()})
+            self._noted = lost
