@@ -53,7 +53,8 @@ class WriteBehind:
 
     Args:
         bag: open, and used by nobody else from now on.
-        max_cache_size: bytes of messages that may wait to be written.
+        max_cache_size: bytes of messages that may wait to be written; 0 makes `put` wait for the
+            disk instead of losing any.
     """
 
     def __init__(self, bag: BagWriter, max_cache_size: int) -> None:
@@ -94,10 +95,11 @@ class WriteBehind:
         sent = log_time if publish_time is None else publish_time
         with self._changed:
             self._sequences[topic] += 1
-            if self._bytes + len(data) > self._limit or self._ending:
-                fits = False
-            else:
-                fits = True
+            if not self._limit:
+                self._changed.wait_for(lambda: self._bytes < _BATCH or self._ending)
+            fits = not self._limit or self._bytes + len(data) <= self._limit
+            fits = fits and not self._ending
+            if fits:
                 self._append(Message(topic, data, log_time, sent, self._sequences[topic]))
         if not fits:
             self.losses.add(topic, in_recorder=1)
@@ -171,6 +173,8 @@ class WriteBehind:
         self._try(partial(self._bag.write, *message), message.topic)
         with self._changed:
             self._bytes -= len(message.data)
+            if not self._limit:
+                self._changed.notify_all()
 
     def _flush(self) -> float:
         """Hand everything to the operating system; s until that is to be done again."""

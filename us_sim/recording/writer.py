@@ -80,7 +80,8 @@ class BagWriter:
         is_folder = path.suffix != ".mcap"
         self._stem = path.resolve().name if is_folder else path.stem
         self.path = path / f"{self._stem}_0.mcap" if is_folder else path
-        if further and self.path.exists():
+        is_further = further and self.path.exists()
+        if is_further:
             self.path, sidecar = self._further(), False
         self.custom_data = dict(custom_data or {})
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
@@ -94,7 +95,8 @@ class BagWriter:
         self._last_flush: int | None = None
         self._closed_because = ""
         self._ended = False
-        self._refuse_to_overwrite(is_folder=is_folder, folder=path)
+        if not is_further:
+            self._refuse_to_overwrite(is_folder=is_folder, folder=path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._output = self._opened(self.path)
