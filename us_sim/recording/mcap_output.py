@@ -133,10 +133,10 @@ class McapOutput:
         channel = self._channels[topic]
         if topic not in self._declared and topic not in self._declared_here:
             self._declare(topic)
-        self._index[topic].append((log_time, self._pending))
         header = _MESSAGE.pack(
             Opcode.MESSAGE, 22 + len(data), channel.id, sequence, log_time, publish_time
         )
+        self._index[topic].append((log_time, self._pending))
         self._put(header)
         self._put(data)
         self.counts[topic] += 1

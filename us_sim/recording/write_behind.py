@@ -134,6 +134,8 @@ class WriteBehind:
             self._ending = True
             self._changed.notify()
         self._thread.join()
+        if self._bag.resume():
+            self.problem = ""
         try:
             self._note_losses()
             self._bag.custom_data["messages_lost"] = str(self.losses.total)
