@@ -94,7 +94,9 @@ def main(times: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             after = random.uniform(0, 3)
             lost.append(kill_once(Path(folder), after, random.choice(["none", "zstd"])))
-    print(f"{times} times killed: {max(lost):.3f} s lost at most, {sum(lost) / times:.3f} s usually")
+    print(
+        f"{times} times killed: {max(lost):.3f} s lost at most, {sum(lost) / times:.3f} s usually"
+    )
 
 
 if __name__ == "__main__":
