@@ -12,12 +12,6 @@ import sys
 import time
 from pathlib import Path
 
-import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
-import rclpy
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from std_msgs.msg import String
-
 from us_sim.recording.reader import read_bag
 
 SIZE = 1_000_000  # bytes
@@ -31,6 +25,12 @@ def processor_time(pid: int) -> float:
 
 def main(rate: float, duration: float, folder: Path) -> int:
     """Publish ``rate`` MB/s for ``duration`` s to a recorder in ``folder``."""
+    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+    import rclpy
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
+    from std_msgs.msg import String
+
     file = folder / "session.mcap"
     command = [sys.executable, "-m", "us_sim.nodes.session_recorder", "--ros-args"]
     recorder = subprocess.Popen([*command, "-p", f"file:={file}", "-p", "topics:=[/load]"])

@@ -23,7 +23,9 @@ LARGEST = 4 * 1024 * 1024
 """Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
 
 
-def session_attachments(scene: str | None, files: Iterable[str]) -> dict[str, tuple[str, bytes]]:
+def session_attachments(
+    scene: str | None, volume: str | None, files: Iterable[str]
+) -> dict[str, tuple[str, bytes]]:
     """Media types and contents by file names.
 
     ``scene.yaml`` is the scene with all that it is based on. It names attached files as they are
@@ -31,6 +33,7 @@ def session_attachments(scene: str | None, files: Iterable[str]) -> dict[str, tu
 
     Args:
         scene: that is recorded: a name, or a file.
+        volume: file in place of the scene's.
         files: more, to be attached as they are.
 
     Raises:
@@ -40,14 +43,17 @@ def session_attachments(scene: str | None, files: Iterable[str]) -> dict[str, tu
     for name in files:
         _attach(attached, Path(name).expanduser())
     if scene is not None:
-        _attach_scene(attached, scene)
+        _attach_scene(attached, scene, volume)
     return attached
 
 
-def _attach_scene(attached: dict[str, tuple[str, bytes]], scene: str) -> None:
+def _attach_scene(attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None) -> None:
     document, _ = read_document(find_scene(scene), find_scene)
+    if volume:
+        kept = {key: value for key, value in document["volume"].items() if key != "phantom"}
+        document["volume"] = kept | {"file": volume}
     listed, places = [], {}
-    for path in sorted(set(_files(load_scene(scene)))):
+    for path in sorted(set(_files(load_scene(scene, volume=volume)))):
         small = path.is_file() and path.stat().st_size <= LARGEST
         places[path] = path.name if small and _attach(attached, path) else str(path)
         listed.append(f"{_checksum(path)}  {path}")

@@ -209,6 +209,9 @@ class SessionRecorderSettings(Settings):
         description="scene that is recorded, to be attached with the files that it names",
         default=None,
     )
+    volume: str | None = setting(
+        description="volume file in place of the scene's", default=None, file=True
+    )
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
 

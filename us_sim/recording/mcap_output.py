@@ -15,8 +15,8 @@ import struct
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -49,7 +49,8 @@ _LENGTH = struct.Struct("<Q")
 _COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
 
 
-class _WrittenChunk(NamedTuple):
+@dataclass(frozen=True)
+class _WrittenChunk:
     """A chunk in the file."""
 
     index: ChunkIndex
@@ -297,11 +298,11 @@ class McapOutput:
 
     def _drop_last_chunk(self) -> None:
         """Take back the last chunk, and what was written after it."""
-        index, counts = self._chunks.pop()
-        self._cut(index.chunk_start_offset)
+        chunk = self._chunks.pop()
+        self._cut(chunk.index.chunk_start_offset)
         self._attachments = [each for each in self._attachments if each.offset < self._size]
         self._metadata = [each for each in self._metadata if each.offset < self._size]
-        self._drop(counts)
+        self._drop(chunk.counts)
 
     def _summary(self) -> list[bytes]:
         """What comes after the messages."""

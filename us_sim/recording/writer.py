@@ -87,7 +87,7 @@ class BagWriter:
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
         self.on_split: Callable[[str, str], None] | None = None
         self._metadata_file = self.path.with_name("metadata.yaml") if sidecar else None
-        self._options = {"compression": _COMPRESSIONS[compression], "chunk_size": chunk_size}
+        self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._flush_interval = round(flush_interval * 1e9)
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
         self._contents = Contents()
@@ -322,7 +322,9 @@ class BagWriter:
 
     def _opened(self, path: Path) -> McapOutput:
         """A new file that knows all topics so far, with what is attached."""
-        output = McapOutput(path, _library(), **self._options)
+        output = McapOutput(
+            path, _library(), compression=self._compression, chunk_size=self._chunk_size
+        )
         for topic in self.topics:
             self._contents.introduce(topic, output)
         try:

@@ -28,6 +28,7 @@ __all__ = [
     "ProcessGroup",
     "keep_on_this_host",
     "player_settings",
+    "scene_settings",
     "simulation_nodes",
     "video_settings",
 ]
@@ -76,9 +77,7 @@ def simulation_nodes(
         UsSimError: a parameter is for a node that this scene does not run.
     """
     given = dict(parameters or {})
-    common: dict[str, object] = {"scene": scene.origin}
-    if scene.volume.file:
-        common["volume"] = scene.volume.file
+    common = scene_settings(scene)
     nodes = [
         NodeProcess(
             part.node,
@@ -94,6 +93,14 @@ def simulation_nodes(
             f"{', '.join(process.node for process in nodes)}"
         )
     return nodes
+
+
+def scene_settings(scene: Scene) -> dict[str, object]:
+    """The parameters that tell a node the scene, as every node takes them."""
+    settings: dict[str, object] = {"scene": scene.origin}
+    if scene.volume.file:
+        settings["volume"] = scene.volume.file
+    return settings
 
 
 def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:

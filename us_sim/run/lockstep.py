@@ -15,6 +15,7 @@ from us_sim.run.graph import (
     Parameters,
     keep_on_this_host,
     player_settings,
+    scene_settings,
     simulation_nodes,
 )
 from us_sim.run.in_process import node_in_process
@@ -118,6 +119,8 @@ def _nodes(
         "file": str(out / "session.mcap"),
         "compression": "zstd",
         "exclude": ["/diagnostics"],
+        "max_cache_size": 0,  # lose nothing, wait for the disk
+        **scene_settings(scene),
     }
     player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [

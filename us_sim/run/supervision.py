@@ -18,6 +18,7 @@ from us_sim.run.graph import (
     Parameters,
     ProcessGroup,
     player_settings,
+    scene_settings,
     simulation_nodes,
     video_settings,
 )
@@ -82,6 +83,7 @@ def plan_of(
     processes = []
     if record is not None:
         settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
+        settings |= scene_settings(scene)
         if video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
         processes.append(NodeProcess("session_recorder", settings, taken("session_recorder")))
