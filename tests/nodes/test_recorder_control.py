@@ -1,6 +1,7 @@
 """The recorder's services, events, markers and attachments, and what it is asked to survive."""
 
 import dataclasses
+import errno
 import sys
 import threading
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 import rclpy
 from bench import pose_at
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
@@ -17,6 +19,7 @@ from us_sim.nodes.message_types import message_type
 from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.recording.attached import extract
+from us_sim.recording.mcap_output import McapOutput
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.reading import load_scene
@@ -316,3 +319,43 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     end(bench, recorder)
     assert file.read_bytes() == b"precious"
     assert read_bag(tmp_path / "session_1.mcap").complete
+
+
+def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
+    full = [False]
+    end_chunk = McapOutput.end_chunk
+
+    def unless_full(output):
+        if full[0]:
+            output.dropped["/note"] += 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+        end_chunk(output)
+
+    monkeypatch.setattr(McapOutput, "end_chunk", unless_full)
+    monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.1)
+    monkeypatch.setattr("us_sim.recording.writer._ROOM", 2**62)
+    recorder, note, _, file = quiet()
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    say(bench, recorder, note, "one")
+    bench.spin_until(lambda: texts(file) == ["one"])
+    full[0] = True
+    say(bench, recorder, note, "two")
+
+    def told():
+        return [
+            status.message
+            for report in reports
+            for status in report.status
+            if status.name == "/session_recorder" and status.level == DiagnosticStatus.WARN
+        ]
+
+    bench.spin_until(lambda: any("No space left on device" in text for text in told()))
+    assert recorder.health.problems("disk") == 1
+    full[0] = False
+    monkeypatch.setattr("us_sim.recording.writer._ROOM", 0)
+    bench.spin_until(lambda: (tmp_path / "session_1.mcap").exists())
+    bench.spin_until(lambda: not recorder.health.warning)
+    say(bench, recorder, note, "three")
+    end(bench, recorder)
+    assert texts(tmp_path)[-1] == "three"
+    assert sum(read_bag(tmp_path).lost().values()) > 0

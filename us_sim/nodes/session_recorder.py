@@ -231,8 +231,7 @@ class SessionRecorder(Node):
                 self._bag.add_topic(topic.name, self._types[topic.name], new)
         if self._bag is None:
             return
-        if self._bag.problem:
-            self.health.problem("disk", self._bag.problem)
+        self.health.warning = self._bag.problem
         self._tell_losses(self._bag)
 
     def _tell_losses(self, bag: WriteBehind) -> None:
@@ -240,6 +239,8 @@ class SessionRecorder(Node):
         new = news(lost, self._told)
         self._told = lost
         self.health.dropped = bag.losses.total
+        while bag.untold:
+            self.health.problem("disk", bag.untold.popleft())
         if new:
             self._events.lost(new)
             count = sum(map(sum, new.values()))

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -60,6 +60,7 @@ class WriteBehind:
     def __init__(self, bag: BagWriter, max_cache_size: int) -> None:
         self.losses = Losses()
         self.problem = ""  # why nothing is written at present
+        self.untold: deque[str] = deque(maxlen=100)  # problems, for whoever tells a person
         self._bag = bag
         self._limit = max_cache_size
         self._waiting: list[Message | Callable[[], None]] = []
@@ -192,15 +193,20 @@ class WriteBehind:
         try:
             work()
         except BagError as error:
-            self.problem = str(error)
+            self._complain(str(error))
         except Exception as error:  # nothing may end the thread, and nothing be lost unsaid
-            self.problem = f"a message on {topic} cannot be written: {error!r}"
+            self._complain(f"a message on {topic} cannot be written: {error!r}")
             if topic is not None:
                 self.losses.add(topic, in_recorder=1)
         if self._bag.lost != self._disk_lost:
             for name, count in (self._bag.lost - self._disk_lost).items():
                 self.losses.add(name, in_recorder=count)
             self._disk_lost = self._bag.lost.copy()
+
+    def _complain(self, problem: str) -> None:
+        if problem != self.problem:
+            self.problem = problem
+            self.untold.append(problem)
 
     def _note_losses(self) -> None:
         """Say in the file what is missing, if more is missing than it says."""
