@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
+import yaml
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
@@ -167,12 +168,20 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
     scene = tmp_path / "arm.yaml"
     scene.write_text("name: arm\nbased_on: upper_arm\nprobe: {depth: 35 mm}\n")
     file = tmp_path / "out" / "session.mcap"
-    recorder = bench.make(SessionRecorder, file=str(file), scene=str(scene), attach=[str(info)])
+    recorder = bench.make(
+        SessionRecorder,
+        file=str(file),
+        scene=str(scene),
+        attach=[str(info)],
+        parameters="tissue_deformer: {ros__parameters: {solver: fem}}\n",
+    )
     end(bench, recorder)
     scene_text = scene.read_text()
     scene.unlink()
     made = {path.name: path for path in extract(file, tmp_path / "again")}
     assert made["info.yaml"].read_text() == "image_width: 640\n"
+    given = yaml.safe_load(made["parameters.yaml"].read_text())
+    assert given == {"tissue_deformer": {"ros__parameters": {"solver": "fem"}}}
     assert f"python {sys.version.split()[0]}\n" in made["versions.txt"].read_text()
     again = load_scene(made["scene.yaml"])
     scene.write_text(scene_text)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import mimetypes
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from us_sim.errors import BagError, UsSimError
+from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.attached import versions
 from us_sim.scene.document import read_document
 from us_sim.scene.reading import find_scene, load_scene
@@ -23,27 +24,22 @@ LARGEST = 4 * 1024 * 1024
 """Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
 
 
-def session_attachments(
-    scene: str | None, volume: str | None, files: Iterable[str]
-) -> dict[str, tuple[str, bytes]]:
+def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[str, bytes]]:
     """Media types and contents by file names.
 
     ``scene.yaml`` is the scene with all that it is based on. It names attached files as they are
     extracted beside it, and others by their paths, which `files.txt` lists with their checksums.
 
-    Args:
-        scene: that is recorded: a name, or a file.
-        volume: file in place of the scene's.
-        files: more, to be attached as they are.
-
     Raises:
         UsSimError: there is no such scene or file, or it cannot be read.
     """
     attached = {"versions.txt": ("text/plain", versions().encode())}
-    for name in files:
+    if settings.parameters:
+        attached["parameters.yaml"] = "application/yaml", settings.parameters.encode()
+    for name in settings.attach:
         _attach(attached, Path(name).expanduser())
-    if scene is not None:
-        _attach_scene(attached, scene, volume)
+    if settings.scene is not None:
+        _attach_scene(attached, settings.scene, settings.volume)
     return attached
 
 

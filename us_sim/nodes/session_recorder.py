@@ -57,7 +57,7 @@ class SessionRecorder(Node):
         self._excluded.add(self.resolve_topic_name(RecorderEvents.LOST))  # it is in the metadata
         self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._chosen
         self._marker_topic = self.resolve_topic_name(MARKERS)
-        self._attachments = session_attachments(settings.scene, settings.volume, settings.attach)
+        self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
         self._types: dict[str, str] = {}

@@ -212,6 +212,9 @@ class SessionRecorderSettings(Settings):
     volume: str | None = setting(
         description="volume file in place of the scene's", default=None, file=True
     )
+    parameters: str = setting(
+        description="those of all nodes, as YAML: attached as parameters.yaml", default=""
+    )
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
 

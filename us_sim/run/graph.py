@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+import yaml
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError
@@ -27,6 +28,7 @@ __all__ = [
     "Parameters",
     "ProcessGroup",
     "keep_on_this_host",
+    "parameters_file",
     "player_settings",
     "scene_settings",
     "simulation_nodes",
@@ -101,6 +103,13 @@ def scene_settings(scene: Scene) -> dict[str, object]:
     if scene.volume.file:
         settings["volume"] = scene.volume.file
     return settings
+
+
+def parameters_file(processes: Sequence[NodeProcess]) -> str:
+    """The parameters of nodes as ROS reads them with ``--params-file``."""
+    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
+    text: str = yaml.safe_dump(document, sort_keys=False)
+    return text
 
 
 def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:

@@ -14,6 +14,7 @@ from us_sim.progress import Progress
 from us_sim.run.graph import (
     Parameters,
     keep_on_this_host,
+    parameters_file,
     player_settings,
     scene_settings,
     simulation_nodes,
@@ -121,6 +122,7 @@ def _nodes(
         "exclude": ["/diagnostics"],
         "max_cache_size": 0,  # lose nothing, wait for the disk
         **scene_settings(scene),
+        "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
     }
     player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [

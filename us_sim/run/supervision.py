@@ -17,6 +17,7 @@ from us_sim.run.graph import (
     NodeProcess,
     Parameters,
     ProcessGroup,
+    parameters_file,
     player_settings,
     scene_settings,
     simulation_nodes,
@@ -90,6 +91,8 @@ def plan_of(
     player = taken("path_player") if path is not None else {}
     driver = taken("camera_driver") if video is not None else {}
     processes += simulation_nodes(scene, parameters, played=path is not None)
+    for recorder in processes[: record is not None]:
+        recorder.parameters["parameters"] = parameters_file(processes)
     if video is not None:
         settings = video_settings(scene, video.file, video.camera_info, recorded=record is not None)
         processes.append(NodeProcess("camera_driver", settings, driver))
