@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from us_sim.errors import BagError, UsSimError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.message_types import message_type
 from us_sim.nodes.parameters import declared
@@ -38,7 +38,7 @@ MARKERS = "session/marker"
 """What is said there marks a moment."""
 
 
-class SessionRecorder(Node):
+class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
     Its parameters are those of `SessionRecorderSettings`; its services and events are those of

@@ -118,14 +118,14 @@ class Bag:
     def markers(self) -> list[tuple[int, str]]:
         """The moments that a person marked: ns since the epoch, and the text."""
         marked = [note.values for note in self.notes() if note.name == MARKER]
-        return [(int(v["time"]), v.get("text", "")) for v in marked if v.get("time", "").isdigit()]
+        return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
 
     def lost(self) -> Counter[str]:
         """How many messages the recorder says that it lost, by topic."""
         counts = [note.values for note in self.notes() if note.name == LOST]
         lost: Counter[str] = Counter()
         for count in counts:
-            lost.update({topic: int(n) for topic, n in count.items() if n.isdigit()})
+            lost.update({topic: _count(text) for topic, text in count.items()})
         return lost
 
     def messages(
@@ -222,6 +222,11 @@ class Bag:
                 f"definition: record it again with MCAP, which carries definitions"
             )
         return store
+
+
+def _count(text: str) -> int:
+    """A number that a note holds; 0 for what is none."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
 
 
 def read_bag(path: str | Path) -> Bag:
