@@ -26,7 +26,7 @@ def nodes(context):
         file = Path(record).expanduser().resolve()
         if file.exists():
             raise UsSimError(f"{file} exists already: choose another name or remove it")
-        actions.append(node("session_recorder", {"file": str(file)}))
+        actions.append(node("session_recorder", {"file": str(file)} | parameters))
     for part in scene.parts():
         if part.needed:
             actions.append(node(part.node, parameters))

@@ -34,6 +34,7 @@ MESSAGES = [
     "diagnostic_msgs",
     "geometry_msgs",
     "rcl_interfaces",
+    "rosbag2_interfaces",
     "sensor_msgs",
     "shape_msgs",
     "std_msgs",

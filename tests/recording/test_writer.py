@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Reader
 
 from us_sim.errors import BagError
 from us_sim.recording import writer
+from us_sim.recording.metadata import read_metadata
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
@@ -199,11 +200,15 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):
     assert "first 91 messages are kept" in str(caught.value)
     with pytest.raises(BagError, match="cannot be written"):
         bag.write("/note", HI, EPOCH)
-    bag.close()
+    assert bag.lost == {"/note": 11}  # ten in the chunk that did not fit, and the last
     read = read_bag(tmp_path / "session.mcap")
-    assert not read.complete
-    assert read.message_count >= 91
-    assert not (tmp_path / "metadata.yaml").exists()
+    assert read.complete
+    assert read.message_count == bag.message_count == 91
+    assert bag.resume()
+    bag.write("/note", HI, EPOCH + 10**12)
+    bag.close()
+    with AnyReader([tmp_path]) as reader:
+        assert reader.message_count == 92
 
 
 def test_an_empty_bag_is_a_bag(tmp_path):
@@ -277,3 +282,71 @@ def test_misuse(tmp_path):
     ):
         with pytest.raises(BagError, match="is closed"):
             late()
+
+
+def test_a_bag_split_as_a_real_one_has_its_metadata(shared_data, tmp_path):
+    folder = shared_data / "mcap-rosbag2/rosbag2_py/test/resources/mcap/wbag"
+    real = read_metadata(folder / "metadata.yaml")
+    split_files = []
+    with BagWriter(tmp_path / "wbag") as ours:
+        ours.on_split = lambda *names: split_files.append(names)
+        for entry in real.topics:
+            ours.add_topic(entry.name, entry.type_name)
+        for part in real.files:
+            if part != real.files[0]:
+                ours.split()
+            for message in read_bag(folder / part.path).messages():
+                ours.write(message.topic, message.data, message.log_time, message.publish_time)
+    made = read_bag(tmp_path / "wbag").metadata
+    assert made.files == real.files
+    whole = read_bag(folder)  # its metadata's times are not those of its messages
+    assert (made.start, made.duration) == (whole.start, whole.end - whole.start)
+    assert made.message_count == real.message_count
+    counts = [{topic.name: topic.message_count for topic in each.topics} for each in (made, real)]
+    assert counts[0] == counts[1]
+    paths = [str(tmp_path / "wbag" / part.path) for part in real.files]
+    assert split_files == list(zip(paths, [*paths[1:], ""], strict=True))
+    assert list(read_bag(tmp_path / "wbag").messages()) == list(whole.messages())
+    with AnyReader([tmp_path / "wbag"]) as reader:
+        assert reader.message_count == real.message_count
+
+
+def test_files_are_begun_by_size_and_by_time(tmp_path):
+    with BagWriter(tmp_path / "sized.mcap", max_size=3000) as sized:
+        sized.add_topic("/note", STRING)
+        for k in range(10):
+            sized.write("/note", text("x" * 991), EPOCH + k)  # 1031 bytes with all
+    with BagWriter(tmp_path / "timed" / "timed.mcap", max_duration=2.0) as timed:
+        timed.add_topic("/note", STRING)
+        for k in range(10):
+            timed.write("/note", text(f"{k}"), EPOCH + k * 10**9)
+    sizes = [read_bag(file).message_count for file in sorted(tmp_path.glob("*.mcap"))]
+    assert sum(sizes) == 10
+    assert set(sizes[1:-1]) == {sizes[1]} <= {2, 3}  # as many as make 3000 bytes
+    assert [file.name for file in sorted(tmp_path.glob("*.mcap"))][:2] == [
+        *("sized.mcap", "sized_1.mcap")
+    ]
+    files = sorted((tmp_path / "timed").glob("*.mcap"))
+    assert [read_bag(file).message_count for file in files] == [3, 3, 3, 1]
+    assert read_bag(tmp_path).message_count == read_bag(tmp_path / "timed").message_count == 10
+
+
+def test_a_further_file_is_the_next_that_is_free(tmp_path):
+    for expected in ("a.mcap", "a_1.mcap", "a_2.mcap"):
+        with BagWriter(tmp_path / "a.mcap", further=True) as bag:
+            assert bag.path == tmp_path / expected
+            bag.add_topic("/note", STRING)
+    with BagWriter(tmp_path / "folder"):
+        pass
+    with BagWriter(tmp_path / "folder", further=True) as bag:
+        assert bag.path == tmp_path / "folder/folder_1.mcap"
+
+
+def test_quality_of_service_that_is_offered_later_is_in_the_metadata(tmp_path):
+    weak = QosProfile(reliability="best_effort")
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.add_topic("/note", STRING, [QosProfile()])
+        bag.add_topic("/note", STRING, [QosProfile(), weak])
+        bag.split()
+    assert read_bag(tmp_path).metadata.topics[0].qos == (QosProfile(), weak)
+    assert read_bag(tmp_path / "bag_1.mcap").topics[0].qos == (QosProfile(), weak)

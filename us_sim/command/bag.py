@@ -1,4 +1,4 @@
-"""The command `us-sim bag info`."""
+"""The command `us-sim bag`: what is in a recording, its attached files, and its repair."""
 
 from __future__ import annotations
 
@@ -16,6 +16,20 @@ def add_bag(commands: Any) -> None:
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)
     info.set_defaults(command=_info)
+    extract = bag_commands.add_parser(
+        "extract", help="write the files attached to a recording, such as its scene"
+    )
+    extract.add_argument("file", type=Path)
+    extract.add_argument("--out", type=Path, required=True, help="folder to write to")
+    extract.set_defaults(command=_extract)
+    repair = bag_commands.add_parser(
+        "repair", help="all that can be read of a damaged or cut recording, as a new one"
+    )
+    repair.add_argument("file", type=Path)
+    repair.add_argument(
+        "--out", type=Path, help="new folder or .mcap file (default: FILE_repaired beside it)"
+    )
+    repair.set_defaults(command=_repair)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -23,4 +37,23 @@ def _info(args: argparse.Namespace) -> int:
     from us_sim.recording.report import describe
 
     print(describe(read_bag(args.file)))
+    return 0
+
+
+def _extract(args: argparse.Namespace) -> int:
+    from us_sim.recording.attached import extract
+
+    for file in extract(args.file, args.out):
+        print(file)
+    return 0
+
+
+def _repair(args: argparse.Namespace) -> int:
+    from us_sim.recording.repair import repair
+
+    file: Path = args.file
+    made = repair(file, args.out or file.with_name(f"{file.stem}_repaired"))
+    for fault in made.faults:
+        print(fault)
+    print(f"{made.message_count} messages are in {made.path}")
     return 0

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-import importlib
+import contextlib
 import sys
+from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import String
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
+from us_sim.nodes.message_types import message_type
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
+from us_sim.nodes.recorded_topic import RecordedTopic
+from us_sim.nodes.recorder_services import RecorderEvents, offer_services
+from us_sim.nodes.session_attachments import session_attachments
 from us_sim.nodes.settings import SessionRecorderSettings
+from us_sim.recording.losses import Loss, news
+from us_sim.recording.pre_roll import PreRoll
+from us_sim.recording.topic import MARKER
+from us_sim.recording.write_behind import Message, WriteBehind
 from us_sim.recording.writer import BagWriter
 
 __all__ = ["SessionRecorder", "main"]
@@ -22,99 +34,229 @@ __all__ = ["SessionRecorder", "main"]
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
 FOR_THE_EYE = ("tissue/structures", "ultrasound/image_annotated")
 """What is not computed either where only a recorder would want it."""
-QUEUE = 1000
-"""Messages a topic may be ahead of the disk."""
+MARKERS = "session/marker"
+"""What is said there marks a moment."""
 
 
 class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
-    Its parameters are those of `SessionRecorderSettings`. ``tissue/structures`` and
-    ``ultrasound/image_annotated`` are recorded only where ``topics`` names them: they are large,
-    and follow from the other topics.
+    Its parameters are those of `SessionRecorderSettings`; its services and events are those of
+    rosbag2's recorder. ``tissue/structures`` and ``ultrasound/image_annotated`` are recorded only
+    where ``topics`` names them: they are large, and follow from the other topics.
+
+    A text on ``session/marker`` marks a moment of the recording.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)
-        settings = declared(self, SessionRecorderSettings())
-        file = settings.file
-        compression: Any = settings.compression
-        self._topics = set(settings.topics)
+        self._settings = declared(self, SessionRecorderSettings())
+        settings = self._settings
+        self._chosen = set(settings.topics)
         self._excluded = {*settings.exclude, *NOT_THE_SESSION}
-        self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._topics
-        self._refused: set[str] = set()
-        self._subscribed: set[str] = set()
-        taken = Path(file).with_name("metadata.yaml").exists()
-        if taken:
+        self._excluded.add(self.resolve_topic_name(RecorderEvents.LOST))  # it is in the metadata
+        self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._chosen
+        self._marker_topic = self.resolve_topic_name(MARKERS)
+        self._attachments = session_attachments(settings)
+        self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
+        self._topics: dict[str, RecordedTopic] = {}
+        self._types: dict[str, str] = {}
+        self._told: dict[str, Loss] = {}  # losses of which an event told
+        self._splits: deque[tuple[str, str]] = deque()
+        self._bag: WriteBehind | None = None
+        self.paused = settings.start_paused
+        self.health = Health(self, settings.file)
+        self._begin(settings.file, further=settings.if_exists == "further")
+        self._events = RecorderEvents(self)
+        if not offer_services(self, self):
+            self.get_logger().info(
+                "rosbag2_interfaces is not installed, so there are no services to control this"
+            )
+        self.create_timer(0.1, self._discover)
+        self.create_timer(1.0, self._look_after)
+
+    def pause(self) -> None:
+        """Record nothing until `resume`, but keep the newest of latched messages for that."""
+        self.paused = True
+        self._tell_state()
+
+    def resume(self) -> None:
+        """Go on recording."""
+        if self.paused and self._bag is not None and not self._settings.snapshot_mode:
+            self._bag.put_all(self._kept.take())
+        self.paused = False
+        self._tell_state()
+
+    def split(self) -> None:
+        """Go on in a further file."""
+        if self._bag is not None:
+            self._bag.split()
+
+    def snapshot(self) -> bool:
+        """Write what was kept in memory; False where nothing is kept."""
+        if self._bag is None or not self._settings.snapshot_mode:
+            return False
+        self._bag.put_all(self._kept.take())
+        return True
+
+    def stop(self) -> None:
+        """End the recording: its file gets its index, and can be moved away."""
+        bag, self._bag = self._bag, None
+        if bag is None:
+            return
+        problem = ""
+        try:
+            bag.close()
+        except BagError as error:
+            problem = str(error)
+        with contextlib.suppress(Exception):  # ROS may be shut down already
+            if problem:
+                self.health.problem("disk", problem)
+            self._tell_losses(bag)
+            self._tell_splits()
+        self._tell_state()
+
+    def record(self, file: str) -> str:
+        """Begin a further recording; why that cannot be, or nothing."""
+        if self._bag is not None:
+            return "a recording is running: stop it first"
+        try:
+            self._begin(file or self._settings.file, further=not file)
+        except UsSimError as error:
+            return str(error)
+        return ""
+
+    def destroy_node(self) -> None:
+        """Close the file, so that it has its index and metadata."""
+        self.stop()
+        super().destroy_node()
+
+    def _begin(self, file: str, *, further: bool) -> None:
+        """Open a file and let messages in."""
+        settings = self._settings
+        taken = Path(file).with_name("metadata.yaml").exists() and Path(file).suffix == ".mcap"
+        if taken and not further:
             self.get_logger().info(
                 "metadata.yaml in this folder belongs to another recording, so none is written; "
                 "the file can be read and played without"
             )
-        self._writer = BagWriter(file, compression=compression, sidecar=not taken)
-        self.health = Health(self, str(file))
-        self.health.state = "recording"
-        self.create_timer(0.1, self._discover)
-        self.create_timer(1.0, self._flush)
-        self.get_logger().info(f"recording to {file}")
+        compression: Any = settings.compression
+        bag = BagWriter(
+            file,
+            compression=compression,
+            max_size=settings.max_bagfile_size,
+            max_duration=settings.max_bagfile_duration,
+            sidecar=not taken,
+            further=further,
+        )
+        bag.on_split = lambda *files: self._splits.append(files)
+        self._bag = WriteBehind(bag, settings.max_cache_size)
+        self._told = {}
+        self._kept = PreRoll(
+            settings.max_cache_size if settings.snapshot_mode else 0, settings.snapshot_duration
+        )
+        now = self.get_clock().now().nanoseconds
+        for name, (media_type, data) in self._attachments.items():
+            self._bag.attach(name, media_type, data, now)
+        for topic in self._topics.values():
+            self._bag.add_topic(topic.name, self._types[topic.name], topic.offered)
+        self._tell_state()
+        self.get_logger().info(f"recording to {bag.path}")
 
     def _discover(self) -> None:
         """Subscribe to what has appeared."""
+        self._tell_splits()
         for topic, types in self.get_topic_names_and_types():
-            known = topic in self._subscribed or topic in self._refused
-            if known or topic in self._excluded or (self._topics and topic not in self._topics):
+            if topic in self._excluded or (self._chosen and topic not in self._chosen):
                 continue
-            offered = self.get_publishers_info_by_topic(topic)
-            if not offered:
-                continue
-            try:
-                self._subscribe(topic, types[0], [info.qos_profile for info in offered])
-            except (BagError, ImportError, AttributeError) as error:
-                self._refused.add(topic)
-                self.health.problem("topic", f"{topic} ({types[0]}) is not recorded: {error}")
+            for type_name in types:
+                if type_name == self._types.get(topic) or (topic, type_name) in self._refused:
+                    continue
+                try:
+                    self._subscribe(topic, type_name)
+                except Exception as error:  # the names on a network may be anything
+                    self._refused.add((topic, type_name))
+                    self.health.problem("topic", f"{topic} is not recorded: {error}")
 
-    def _subscribe(self, topic: str, type_name: str, offered: list[QoSProfile]) -> None:
-        package, _, name = type_name.split("/")
-        message_type = getattr(importlib.import_module(f"{package}.msg"), name)
-        self._writer.add_topic(topic, type_name, offered)
-
-        def write(data: bytes, info: Any) -> None:
-            now = self.get_clock().now().nanoseconds
-            self._write(topic, data, now, info["source_timestamp"])
-
-        self.create_subscription(message_type, topic, write, _adopted(offered), raw=True)
-        self._subscribed.add(topic)
-
-    def _write(self, topic: str, data: bytes, received: int, sent: int) -> None:
-        self.health.received += 1
-        try:
-            self._writer.write(topic, data, received, sent if sent > 0 else received)
-        except BagError as error:
-            self.health.problem("disk", str(error))
+    def _subscribe(self, topic: str, type_name: str) -> None:
+        cls = message_type(type_name)
+        if topic in self._types:
+            raise BagError(f"it is recorded as {self._types[topic]} and cannot be {type_name}, too")
+        offered = self._offered(topic, type_name)
+        if not offered:
             return
-        self.health.published(topic)
+        if self._bag is not None:
+            self._bag.add_topic(topic, type_name, offered)
+        self._types[topic] = type_name
+        self._topics[topic] = RecordedTopic(self, topic, cls, offered, self._take, self._lost)
 
-    def _flush(self) -> None:
+    def _offered(self, topic: str, type_name: str) -> list[QoSProfile]:
+        """What the publishers of that type offer."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        return [each.qos_profile for each in publishers if each.topic_type == type_name]
+
+    def _take(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
+        self.health.received += 1
+        now = self.get_clock().now().nanoseconds
+        sent = info["source_timestamp"]
+        message = Message(topic, data, now, sent if sent > 0 else now)
+        if self._bag is None:
+            return
+        if topic == self._marker_topic:
+            self._mark(data, now)
+        if self.paused or self._settings.snapshot_mode:
+            self._kept.add(message, latched=self._topics[topic].is_latched)
+        elif self._bag.put(topic, data, now, message.publish_time):
+            self.health.published(topic)
+
+    def _mark(self, data: bytes, now: int) -> None:
+        """Put a marker beside the messages, too, where it is found at once."""
         try:
-            self._writer.flush()
-        except BagError as error:
-            self.health.problem("disk", str(error))
+            text = deserialize_message(data, String).data
+        except Exception as error:  # what this raises differs between versions of ROS
+            self.health.problem("marker", f"what came on {MARKERS} is no text: {error}")
+            return
+        assert self._bag is not None
+        self._bag.note(MARKER, {"time": str(now), "text": text})
 
-    def destroy_node(self) -> None:
-        """Close the file, so that it has its index and metadata."""
-        self._writer.close()
-        super().destroy_node()
+    def _lost(self, topic: str, count: int) -> None:
+        if self._bag is not None and not self.paused:
+            self._bag.losses.add(topic, in_transport=count)
 
+    def _look_after(self) -> None:
+        """Follow what publishers offer, and say what is wrong."""
+        for topic in self._topics.values():
+            new = topic.follow(self._offered(topic.name, self._types[topic.name]))
+            if new and self._bag is not None:
+                self._bag.add_topic(topic.name, self._types[topic.name], new)
+        if self._bag is None:
+            return
+        self.health.warning = self._bag.problem
+        self._tell_losses(self._bag)
 
-def _adopted(offered: list[QoSProfile]) -> QoSProfile:
-    """What every one of the publishers can serve, as rosbag2 chooses it."""
-    reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
-    latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=QUEUE,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    def _tell_losses(self, bag: WriteBehind) -> None:
+        lost = bag.losses.by_topic()
+        new = news(lost, self._told)
+        self._told = lost
+        self.health.dropped = bag.losses.total
+        while bag.untold:
+            self.health.problem("disk", bag.untold.popleft())
+        if new:
+            self._events.lost(new)
+            count = sum(map(sum, new.values()))
+            self.health.problem("lost", f"{count} messages of {', '.join(new)} were not recorded")
+
+    def _tell_splits(self) -> None:
+        while self._splits:
+            self._events.split(*self._splits.popleft())
+
+    def _tell_state(self) -> None:
+        if self._bag is None:
+            self.health.state = "stopped"
+        elif self.paused:
+            self.health.state = "paused"
+        else:
+            self.health.state = "waiting" if self._settings.snapshot_mode else "recording"
 
 
 def main(args: list[str] | None = None) -> int:

@@ -45,6 +45,8 @@ __all__ = [
 _SPEED = Quantity("number", 0.01, 100.0)
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
 _AGE = Quantity("time", 0.01, 3600.0)
+_SPAN = Quantity("time", 0.0, 1e6)
+_BYTES = Quantity("number", 0, 2**53)
 
 
 @dataclass(frozen=True)
@@ -173,12 +175,48 @@ class SessionPlayerSettings(Settings):
 class SessionRecorderSettings(Settings):
     """Of ``session_recorder``."""
 
-    file: str = setting(description="MCAP file to write", default="session.mcap")
+    file: str = setting(
+        description="MCAP file to write, or a new folder for a bag", default="session.mcap"
+    )
+    if_exists: str = setting(
+        description="a recording of that name that is there already: refuse to start, or go on in "
+        "a further file beside it",
+        choices=("refuse", "further"),
+        default="refuse",
+    )
     compression: str = setting(
         description="of the file's chunks", choices=("none", "zstd"), default="none"
     )
     topics: tuple[str, ...] = setting(description="full names; none: all", default=())
     exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+    max_cache_size: int = setting(
+        _BYTES,
+        "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
+        default=100 * 1024 * 1024,
+    )
+    max_bagfile_size: int = setting(
+        _BYTES, "bytes after which a further file is begun; 0: never", default=0
+    )
+    max_bagfile_duration: float = setting(
+        _SPAN, "after which a further file is begun; 0: never", default=0.0
+    )
+    start_paused: bool = setting(description="wait for the service ~/resume", default=False)
+    snapshot_mode: bool = setting(
+        description="keep messages in memory, max_cache_size at most, until ~/snapshot writes them",
+        default=False,
+    )
+    snapshot_duration: float = setting(_SPAN, "how old they may be; 0: any", default=0.0)
+    scene: str | None = setting(
+        description="scene that is recorded, to be attached with the files that it names",
+        default=None,
+    )
+    volume: str | None = setting(
+        description="volume file in place of the scene's", default=None, file=True
+    )
+    parameters: str = setting(
+        description="those of all nodes, as YAML: attached as parameters.yaml", default=""
+    )
+    attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
 
 @dataclass(frozen=True)

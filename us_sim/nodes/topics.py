@@ -216,6 +216,23 @@ TOPICS = (
         latched=True,
     ),
     Topic(
+        "session/marker",
+        "std_msgs/String",
+        "a text that marks a moment of the recording",
+    ),
+    Topic(
+        "events/write_split",
+        "rosbag2_interfaces/WriteSplitEvent",
+        "a file of the recording was ended, and which one was begun",
+        publishers=("session_recorder",),
+    ),
+    Topic(
+        "events/rosbag2_messages_lost",
+        "rosbag2_interfaces/MessagesLostEvent",
+        "how many messages were lost, by topic; where ROS has this type, which Jazzy has not",
+        publishers=("session_recorder",),
+    ),
+    Topic(
         "diagnostics",
         "diagnostic_msgs/DiagnosticArray",
         "once a second: state, rate, latency, what was dropped or refused",

@@ -9,6 +9,7 @@ The format: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import struct
 import zlib
@@ -23,13 +24,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Schema
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.summary import Summary
 
 from us_sim.errors import BagError
 from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 __all__ = ["MAGIC", "McapFile"]
@@ -85,6 +86,8 @@ class McapFile:
         self._channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()
         self._runs: list[_Run] = []
+        self._attachments: list[tuple[int, int]] = []  # offset and length of each record
+        self._notes: list[tuple[int, int]] = []
         self.start: int | None = None
         self.end: int | None = None
         with path.open("rb") as stream:
@@ -97,11 +100,31 @@ class McapFile:
                 self._scan(stream)
         self.topics = self._topics()
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+    def attachments(self) -> Iterator[BagAttachment]:
+        """The files within this one; those that are damaged are left out."""
+        for content in self._contents(self._attachments):
+            with contextlib.suppress(*_DAMAGE):
+                record = Attachment.read(_data_stream(content))
+                yield BagAttachment(record.name, record.media_type, record.log_time, record.data)
+
+    def notes(self) -> Iterator[BagNote]:
+        """The metadata records; those that are damaged are left out."""
+        for content in self._contents(self._notes):
+            with contextlib.suppress(*_DAMAGE):
+                record = Metadata.read(_data_stream(content))
+                yield BagNote(record.name, record.metadata)
+
+    def messages(
+        self, topics: Collection[str], damage: list[str] | None = None
+    ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
+        Args:
+            topics: their names.
+            damage: takes a sentence for each damaged chunk, which is then left out.
+
         Raises:
-            BagError: a chunk is damaged.
+            BagError: a chunk is damaged, and ``damage`` is None.
         """
         wanted = {
             id: (channel.topic, _type_name(self._schemas.get(channel.schema_id)))
@@ -118,7 +141,7 @@ class McapFile:
                     message = heapq.heappop(pending)[-1]
                     held -= len(message.data)
                     yield message
-                for index, content in enumerate(self._run_messages(stream, run)):
+                for index, content in enumerate(self._run_messages(stream, run, damage)):
                     channel, log_time, publish_time, data = content
                     if channel in wanted:
                         message = BagMessage(*wanted[channel], log_time, publish_time, bytes(data))
@@ -132,6 +155,14 @@ class McapFile:
         while pending:
             yield heapq.heappop(pending)[-1]
 
+    def _contents(self, places: list[tuple[int, int]]) -> Iterator[memoryview]:
+        """The records at these places, without opcode and length."""
+        with self._path.open("rb") as stream:
+            for offset, length in places:
+                with contextlib.suppress(*_DAMAGE):
+                    for _, content in _records(stream, offset, length, self._label):
+                        yield content
+
     def _take(self, summary: Summary) -> None:
         """Believes the summary of a whole file."""
         assert summary.statistics is not None
@@ -142,6 +173,8 @@ class McapFile:
             _Run(chunk.message_start_time, chunk.chunk_start_offset, chunk.chunk_length)
             for chunk in summary.chunk_indexes
         )
+        self._attachments = [(each.offset, each.length) for each in summary.attachment_indexes]
+        self._notes = [(each.offset, each.length) for each in summary.metadata_indexes]
         if summary.statistics.message_count:
             self.start = summary.statistics.message_start_time
             self.end = summary.statistics.message_end_time
@@ -169,6 +202,10 @@ class McapFile:
                     break
             if not whole:
                 break
+            if opcode == Opcode.ATTACHMENT:
+                self._attachments.append((position, _RECORD.size + length))
+            elif opcode == Opcode.METADATA:
+                self._notes.append((position, _RECORD.size + length))
             position += _RECORD.size + length
         self._runs.sort()
         stream.seek(max(0, size - len(MAGIC)))
@@ -202,7 +239,7 @@ class McapFile:
             self._runs.append(_Run(first, offset, length))
 
     def _run_messages(
-        self, stream: BinaryIO, run: _Run
+        self, stream: BinaryIO, run: _Run, damage: list[str] | None = None
     ) -> Iterator[tuple[int, int, int, memoryview]]:
         """Channel, log time, publish time and data of each message of a run."""
         try:
@@ -211,9 +248,10 @@ class McapFile:
                     channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
                     yield channel, log_time, publish_time, content[_MESSAGE.size :]
         except _DAMAGE as error:
-            raise BagError(
-                f"{self._label} is damaged in its chunk at byte {run.offset}: {error}"
-            ) from None
+            sentence = f"{self._label} is damaged in its chunk at byte {run.offset}: {error}"
+            if damage is None:
+                raise BagError(sentence) from None
+            damage.append(sentence)
 
     def _topics(self) -> tuple[BagTopic, ...]:
         topics: dict[str, BagTopic] = {}

@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
 from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
-from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 __all__ = ["Bag", "read_bag"]
@@ -106,14 +107,41 @@ class Bag:
             f"{self.path} has no topic {name}; it has {', '.join(sorted(self._topics)) or 'none'}"
         )
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+    def attachments(self) -> dict[str, BagAttachment]:
+        """The files within the bag, such as the scene that was recorded, by their names."""
+        return {each.name: each for storage in self._storages for each in storage.attachments()}
+
+    def notes(self) -> list[BagNote]:
+        """The texts that the bag holds beside its messages."""
+        return [note for storage in self._storages for note in storage.notes()]
+
+    def markers(self) -> list[tuple[int, str]]:
+        """The moments that a person marked: ns since the epoch, and the text."""
+        marked = [note.values for note in self.notes() if note.name == MARKER]
+        return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
+
+    def lost(self) -> Counter[str]:
+        """How many messages the recorder says that it lost, by topic."""
+        counts = [note.values for note in self.notes() if note.name == LOST]
+        lost: Counter[str] = Counter()
+        for count in counts:
+            lost.update({topic: _count(text) for topic, text in count.items()})
+        return lost
+
+    def messages(
+        self, topics: Collection[str] | None = None, damage: list[str] | None = None
+    ) -> Iterator[BagMessage]:
         """The messages of all topics or of these, in the order of their log times.
 
+        Args:
+            topics: their names; None for all.
+            damage: takes a sentence for each damaged chunk, which is then left out.
+
         Raises:
-            BagError: the bag has no such topic, or is damaged.
+            BagError: the bag has no such topic, or is damaged and ``damage`` is None.
         """
         names = {self.topic(name).name for name in topics} if topics is not None else self._topics
-        streams = [storage.messages(names) for storage in self._storages]
+        streams = [storage.messages(names, damage) for storage in self._storages]
         for message in heapq.merge(*streams, key=lambda message: message.log_time):
             if self._decompress_messages:
                 try:
@@ -161,6 +189,12 @@ class Bag:
             "end": end,
             "duration": end - start if start is not None and end is not None else 0,
             "message_count": self.message_count,
+            "lost": dict(self.lost()),
+            "markers": [{"time": time, "text": text} for time, text in self.markers()],
+            "attachments": [
+                {"name": each.name, "media_type": each.media_type, "size": len(each.data)}
+                for each in self.attachments().values()
+            ],
             "topics": [
                 {
                     "name": topic.name,
@@ -188,6 +222,11 @@ class Bag:
                 f"definition: record it again with MCAP, which carries definitions"
             )
         return store
+
+
+def _count(text: str) -> int:
+    """A number that a note holds; 0 for what is none."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
 
 
 def read_bag(path: str | Path) -> Bag:

@@ -10,7 +10,10 @@ __all__ = ["describe"]
 
 
 def describe(bag: Bag) -> str:
-    """Path, times, and a line for each topic with its type, count, rate and offered quality."""
+    """Path, times, topics with type, count, rate and offered quality; then losses, marks, files.
+
+    The times of marks are those since the start.
+    """
     summary = bag.summary()
     seconds = summary["duration"] * 1e-9
     lines = [f"file      {summary['path']}"]
@@ -32,7 +35,24 @@ def describe(bag: Bag) -> str:
             f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  "
             f"{rate:>{widths[3]}}  {quality}"
         )
+    lines += _section("lost", [f"{count} of {topic}" for topic, count in summary["lost"].items()])
+    lines += _section(
+        "marked",
+        [
+            f"{(mark['time'] - (summary['start'] or mark['time'])) * 1e-9:.3f} s  {mark['text']}"
+            for mark in summary["markers"]
+        ],
+    )
+    lines += _section(
+        "attached",
+        [f"{each['name']} ({each['size']} bytes)" for each in summary["attachments"]],
+    )
     return "\n".join(_printable(line) for line in lines)
+
+
+def _section(title: str, entries: list[str]) -> list[str]:
+    """Lines under a title, or none."""
+    return ["", title, *(f"  {entry}" for entry in entries)] if entries else []
 
 
 def _printable(line: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from us_sim.errors import BagError
 from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
 
 __all__ = ["MAGIC", "SqliteFile"]
 
@@ -57,7 +57,19 @@ class SqliteFile:
             )
         self.note = "; ".join(notes)
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+    def attachments(self) -> Iterator[BagAttachment]:
+        """None: rosbag2 keeps no files in a database."""
+        return iter(())
+
+    def notes(self) -> Iterator[BagNote]:
+        """None."""
+        return iter(())
+
+    def messages(
+        self,
+        topics: Collection[str],
+        damage: list[str] | None = None,  # noqa: ARG002 (what SQLite finds damaged ends it)
+    ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
         Raises:

@@ -16,13 +16,15 @@ from us_sim.recording import mcap_file, sqlite_file
 from us_sim.recording.mcap_file import McapFile
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.sqlite_file import SqliteFile
-from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
 from us_sim.recording.unpacking import unpack_file
 
 __all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_PART = re.compile(r"(.*?)(?:_(\d+))?(\.(?:mcap|db3)(?:\.zstd)?)")
+"""A file of a bag: FOLDER_0.mcap, FOLDER_1.mcap or session.mcap, session_1.mcap and so on."""
 
 
 class Storage(Protocol):
@@ -33,8 +35,18 @@ class Storage(Protocol):
     end: int | None  # ns, highest log time
     note: str  # the fault of a file that was not closed properly; empty when whole
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], damage: list[str] | None = None
+    ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times."""
+        ...
+
+    def attachments(self) -> Iterator[BagAttachment]:
+        """The files within it."""
+        ...
+
+    def notes(self) -> Iterator[BagNote]:
+        """The texts beside its messages."""
         ...
 
 
@@ -74,12 +86,11 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
     if not files:
         raise BagError(f"{path} holds no bag: neither metadata.yaml nor an .mcap or .db3 file")
-    numbered = {file: re.fullmatch(r"(.*)_(\d+)(\..*)", file.name) for file in files}
-    parts = {(match[1], match[3]) if match else file for file, match in numbered.items()}
-    if len(parts) > 1:
+    parts = {file: _PART.fullmatch(file.name) for file in files}
+    if len({(part[1], part[3]) for part in parts.values() if part}) > 1:
         names = ", ".join(file.name for file in files)
         raise BagError(f"{path} holds several bags and no metadata.yaml: give one of {names}")
-    return sorted(files, key=lambda file: int(m[2]) if (m := numbered[file]) else 0), None
+    return sorted(files, key=lambda file: int(p[2] or -1) if (p := parts[file]) else 0), None
 
 
 def open_storage(file: Path, scratch: Scratch) -> Storage:

@@ -8,7 +8,12 @@ from typing import NamedTuple
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile
 
-__all__ = ["BagMessage", "BagTopic"]
+__all__ = ["LOST", "MARKER", "BagAttachment", "BagMessage", "BagNote", "BagTopic"]
+
+LOST = "messages_lost"
+"""The note that says how many messages of each topic are missing since the note before."""
+MARKER = "marker"
+"""The note of a moment that a person marked: its ``time`` in ns, and a ``text``."""
 
 
 @dataclass(frozen=True)
@@ -51,3 +56,19 @@ class BagMessage(NamedTuple):
     log_time: int  # ns since the epoch, when the recorder received it
     publish_time: int  # ns since the epoch, when it was sent; the log time where none is kept
     data: bytes
+
+
+class BagAttachment(NamedTuple):
+    """A file within a bag."""
+
+    name: str
+    media_type: str
+    time: int  # ns since the epoch
+    data: bytes
+
+
+class BagNote(NamedTuple):
+    """Texts by their names that a bag holds beside its messages."""
+
+    name: str
+    values: dict[str, str]

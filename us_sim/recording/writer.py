@@ -13,51 +13,48 @@ b'\\x89MCAP0\\r\\n'
 from __future__ import annotations
 
 import contextlib
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-from mcap.writer import CompressionType, Writer
-
 from us_sim.errors import BagError
-from us_sim.recording.metadata import BagMetadata, FileEntry, TopicEntry
-from us_sim.recording.qos import QosProfile, qos_to_yaml
-from us_sim.recording.schemas import definitions, schema_text
+from us_sim.recording.contents import Contents
+from us_sim.recording.mcap_output import McapOutput
 
 __all__ = ["BagWriter"]
 
 _CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
-_COMPRESSIONS = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD}
-
-
-@dataclass
-class _Channel:
-    """A topic being written."""
-
-    id: int
-    type_name: str
-    qos: tuple[QosProfile, ...]
-    type_hash: str
-    message_count: int = 0
+_ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
+_COMPRESSIONS = {"none": "", "zstd": "zstd"}
 
 
 class BagWriter:
-    """Writes one bag: an MCAP file and, when it is closed, its ``metadata.yaml``.
+    """Writes one bag: an MCAP file or several, and when it is closed, its ``metadata.yaml``.
 
     A message reaches the operating system at the latest when one comes that is a second younger,
     or with :meth:`flush`, and then survives the end of the process.
 
+    Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
+    one when there is room again, and :attr:`lost` tells what did not fit.
+
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
-            the file is called ``FOLDER_0.mcap`` as rosbag2 does. Missing folders are made.
+            the file is called ``FOLDER_0.mcap`` as rosbag2 does. Missing folders are made. Further
+            files are called ``FILE_1.mcap`` or ``FOLDER_1.mcap`` and so on.
         compression: of the chunks, ``"none"`` or ``"zstd"``.
         chunk_size: bytes after which a chunk is ended.
         flush_interval: s of log time after which everything is handed to the operating system.
+        max_size: bytes after which a further file is begun; 0 for never.
+        max_duration: s after which a further file is begun; 0 for never.
         sidecar: False leaves ``metadata.yaml`` away, for folders with several one-file bags.
+        further: where ``FILE.mcap`` exists, go on in ``FILE_1.mcap`` or the next that is free. No
+            ``metadata.yaml`` is written then: it would have to speak for files that are not this
+            writer's.
         custom_data: free text for the metadata.
 
     Raises:
@@ -71,51 +68,51 @@ class BagWriter:
         compression: Literal["none", "zstd"] = "none",
         chunk_size: int = _CHUNK_SIZE,
         flush_interval: float = 1.0,
+        max_size: int = 0,
+        max_duration: float = 0.0,
         sidecar: bool = True,
+        further: bool = False,
         custom_data: Mapping[str, str] | None = None,
     ) -> None:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
         path = Path(path)
-        if path.suffix == ".mcap":
-            self.path = path
-        else:
-            self.path = path / f"{path.resolve().name}_0.mcap"
+        is_folder = path.suffix != ".mcap"
+        self._stem = path.resolve().name if is_folder else path.stem
+        self.path = path / f"{self._stem}_0.mcap" if is_folder else path
+        is_further = further and self.path.exists()
+        if is_further:
+            self.path, sidecar = self._further(), False
+        self.custom_data = dict(custom_data or {})
+        self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
+        self.on_split: Callable[[str, str], None] | None = None
         self._metadata_file = self.path.with_name("metadata.yaml") if sidecar else None
+        self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._flush_interval = round(flush_interval * 1e9)
-        self._custom_data = dict(custom_data or {})
-        self._channels: dict[str, _Channel] = {}
-        self._schemas: dict[str, int] = {}
-        self._start: int | None = None
-        self._end: int | None = None
+        self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
+        self._contents = Contents()
+        self._attachments: dict[str, tuple[str, bytes, int]] = {}
         self._last_flush: int | None = None
-        self._message_count = 0
-        self._safe_count = 0
         self._closed_because = ""
-        self._refuse_to_overwrite(is_folder=path.suffix != ".mcap", folder=path)
+        self._ended = False
+        if not is_further:
+            self._refuse_to_overwrite(is_folder=is_folder, folder=path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("xb")
+            self._output = self._opened(self.path)
         except OSError as error:
             raise BagError(f"{self.path} cannot be made: {error.strerror}") from None
-        self._writer = Writer(
-            self._file, chunk_size=chunk_size, compression=_COMPRESSIONS[compression]
-        )
-        with self._writing():
-            self._writer.start(profile="ros2", library=_library())
-            # rosbag2 does this too: readers find the distribution even in a file that is cut.
-            self._add_metadata()
-            self._file.flush()
 
     @property
     def message_count(self) -> int:
         """Number of messages written."""
-        return self._message_count
+        present = 0 if self._is_finished else self._output.message_count
+        return sum(file.message_count for file in self._contents.files) + present
 
     @property
     def topics(self) -> tuple[str, ...]:
         """Names of the topics added."""
-        return tuple(self._channels)
+        return self._contents.topics
 
     def add_topic(
         self,
@@ -126,43 +123,23 @@ class BagWriter:
         *,
         schema: str | None = None,
     ) -> None:
-        """Makes a topic known; adding it again with the same type changes nothing.
+        """Makes a topic known; adding it again with the same type adds what is offered anew.
 
         Args:
             topic: full name.
             type_name: ``package/msg/Type``.
-            qos: what its publishers offer, in any form that ``QosProfile.of`` takes.
+            qos: what its publishers offer, in any form that ``QosProfile.of`` takes. What is added
+                later is in ``metadata.yaml`` and in files begun after that.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
 
         Raises:
             BagError: the type is unknown, differs from before, or the bag is closed.
         """
-        self._check_open()
-        if not topic or any(character.isspace() for character in topic):
-            raise BagError(f"{topic!r} is not a topic name")
-        if (known := self._channels.get(topic)) is not None:
-            if known.type_name != type_name:
-                raise BagError(
-                    f"topic {topic} is recorded as {known.type_name}: it cannot also be {type_name}"
-                )
-            return
-        profiles = tuple(map(QosProfile.of, qos))
-        text = schema_text(type_name) if schema is None else schema
-        if type_hash is None:
-            type_hash = definitions(type_name, text).hash_rihs01(type_name)
-        with self._writing():
-            if type_name not in self._schemas:
-                self._schemas[type_name] = self._writer.register_schema(
-                    type_name, "ros2msg", text.encode()
-                )
-            id = self._writer.register_channel(
-                topic,
-                "cdr",
-                self._schemas[type_name],
-                {"offered_qos_profiles": qos_to_yaml(profiles), "topic_type_hash": type_hash},
-            )
-        self._channels[topic] = _Channel(id, type_name, profiles, type_hash)
+        if self._ended:
+            raise BagError(self._closed_because)
+        if self._contents.add_topic(topic, type_name, qos, type_hash, schema):
+            self._contents.introduce(topic, self._output)
 
     def write(
         self,
@@ -170,6 +147,7 @@ class BagWriter:
         cdr: bytes | bytearray | memoryview,
         log_time_ns: int,
         publish_time_ns: int | None = None,
+        sequence: int = 0,
     ) -> None:
         """Writes one serialized message.
 
@@ -178,15 +156,17 @@ class BagWriter:
             cdr: the message with its encapsulation header, as it came from the wire.
             log_time_ns: ns since the epoch, when it was received.
             publish_time_ns: ns since the epoch, when it was sent; the log time by default.
+            sequence: number of the message on its topic, where one is kept.
 
         Raises:
             BagError: the topic is unknown, a time is negative, the bag is closed, or the disk is
                 full; what was written before stays readable.
         """
-        self._check_open()
-        channel = self._channels.get(topic)
-        if channel is None:
+        if topic not in self._contents:
             raise BagError(f"topic {topic} was not added to {self.path}: call add_topic first")
+        if self._closed_because:
+            self.lost[topic] += 1
+            raise BagError(self._closed_because)
         if publish_time_ns is None:
             publish_time_ns = log_time_ns
         if log_time_ns < 0 or publish_time_ns < 0:
@@ -194,17 +174,46 @@ class BagWriter:
                 f"a message on {topic} has a time before 1970: log time {log_time_ns} ns, publish "
                 f"time {publish_time_ns} ns"
             )
+        if self._is_long(log_time_ns):
+            self.split()
         with self._writing():
-            self._writer.add_message(channel.id, log_time_ns, bytes(cdr), publish_time_ns)
-        channel.message_count += 1
-        self._message_count += 1
-        self._start = log_time_ns if self._start is None else min(self._start, log_time_ns)
-        self._end = log_time_ns if self._end is None else max(self._end, log_time_ns)
+            self._output.add_message(
+                topic,
+                log_time_ns,
+                publish_time_ns,
+                sequence & 0xFFFFFFFF,
+                bytes(cdr),
+            )
         if self._last_flush is None:
             self._last_flush = log_time_ns
         elif log_time_ns - self._last_flush >= self._flush_interval:
             self.flush()
             self._last_flush = log_time_ns
+
+    def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
+        """Puts a file into each of the bag's, such as the scene that is recorded.
+
+        Args:
+            name: of the file.
+            media_type: such as ``text/plain``.
+            data: its content.
+            time_ns: ns since the epoch, when it was as it is.
+
+        Raises:
+            BagError: the bag is closed, or the disk is full.
+        """
+        self._attachments[name] = media_type, data, time_ns
+        with self._writing():
+            self._output.add_attachment(name, *self._attachments[name])
+
+    def note(self, name: str, values: Mapping[str, str]) -> None:
+        """Puts texts by their names into the present file, as a metadata record of MCAP.
+
+        Raises:
+            BagError: the bag is closed, or the disk is full.
+        """
+        with self._writing():
+            self._output.add_metadata(name, dict(values))
 
     def flush(self) -> None:
         """Ends the chunk and hands everything to the operating system.
@@ -212,10 +221,30 @@ class BagWriter:
         Raises:
             BagError: the bag is closed, or the disk is full.
         """
-        self._check_open()
         with self._writing():
-            self._writer.flush()
-        self._safe_count = self._message_count
+            self._output.end_chunk()
+
+    def split(self) -> None:
+        """Ends the present file and goes on in a further one.
+
+        Raises:
+            BagError: the bag is closed, or the disk is full.
+        """
+        with self._writing():
+            self._add_metadata(self._output)
+            closed = self._output.path
+            self._finish()
+            self._output = self._opened(self._further())
+        if self.on_split is not None:
+            self.on_split(str(closed), str(self._output.path))
+
+    def resume(self) -> bool:
+        """After the disk was full: whether there is room again, and a further file is begun."""
+        if self._closed_because and shutil.disk_usage(self.path.parent).free >= _ROOM:
+            with contextlib.suppress(OSError):
+                self._output = self._opened(self._further())
+                self._closed_because = ""
+        return not self._closed_because
 
     def close(self) -> None:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
@@ -223,18 +252,28 @@ class BagWriter:
         Raises:
             BagError: the disk is full; what was written before stays readable.
         """
-        if self._closed_because:
+        self._ended = True
+        if not self._closed_because:
+            with self._writing():
+                self._add_metadata(self._output)
+                self._finish()
+            self._closed_because = f"{self.path} is closed: nothing can be written to it any more"
+            if self.on_split is not None:
+                self.on_split(str(self._output.path), "")
+        if self._metadata_file is None:
             return
-        with self._writing():
-            self._writer.flush()
-            self._safe_count = self._message_count
-            self._add_metadata()
-            self._writer.finish()
-            self._file.close()
-            if self._metadata_file is not None:
-                with self._metadata_file.open("x", encoding="utf-8") as file:
-                    file.write(self._metadata().document())
-        self._closed_because = f"{self.path} is closed: nothing can be written to it any more"
+        metadata_file, self._metadata_file = self._metadata_file, None
+        try:
+            with metadata_file.open("x", encoding="utf-8") as file:
+                file.write(self._contents.metadata(None, self.custom_data).document())
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                if not isinstance(error, FileExistsError):
+                    metadata_file.unlink()
+            raise BagError(
+                f"{metadata_file} cannot be written ({error.strerror}): the recording can be read "
+                f"without it, and `ros2 bag reindex -s mcap {metadata_file.parent}` makes it"
+            ) from None
 
     def __enter__(self) -> BagWriter:
         return self
@@ -259,46 +298,76 @@ class BagWriter:
                 f"own, such as {own}"
             )
 
-    def _check_open(self) -> None:
-        if self._closed_because:
-            raise BagError(self._closed_because)
+    @property
+    def _is_finished(self) -> bool:
+        """Whether the present file has been closed."""
+        files = self._contents.files
+        return bool(files) and files[-1].path == self._output.path.name
+
+    def _is_long(self, time: int) -> bool:
+        """Whether the file is as large or long as one may be, before a message of that time."""
+        file = self._output
+        if self._max_size and file.size >= self._max_size:
+            return True
+        late = file.start is not None and time - file.start > self._max_duration
+        return bool(self._max_duration and late)
+
+    def _further(self) -> Path:
+        """The next file's name."""
+        numbers = count(1)
+        while True:
+            path = self.path.with_name(f"{self._stem}_{next(numbers)}.mcap")
+            if not path.exists():
+                return path
+
+    def _opened(self, path: Path) -> McapOutput:
+        """A new file that knows all topics so far, with what is attached."""
+        output = McapOutput(
+            path, _library(), compression=self._compression, chunk_size=self._chunk_size
+        )
+        for topic in self.topics:
+            self._contents.introduce(topic, output)
+        try:
+            # rosbag2 does this too: readers find the distribution even in a file that is cut.
+            self._add_metadata(output)
+            for name, attachment in self._attachments.items():
+                output.add_attachment(name, *attachment)
+        except OSError:
+            with contextlib.suppress(OSError):
+                output.finish()
+            path.unlink()
+            raise
+        return output
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         """Turns a failure of the disk into an error that says what is kept, and stops there."""
+        if self._closed_because:
+            raise BagError(self._closed_because)
         try:
             yield
         except OSError as error:
-            self._closed_because = (
-                f"{self.path} cannot be written ({error.strerror}): the recording stops, and its "
-                f"first {self._safe_count} messages are kept and can be read"
-            )
             with contextlib.suppress(OSError):
-                self._file.close()
+                self._finish()
+            self._closed_because = (
+                f"{self._output.path} cannot be written ({error.strerror}): the recording stops, "
+                f"and its first {self.message_count} messages are kept and can be read"
+            )
             raise BagError(self._closed_because) from None
 
-    def _add_metadata(self) -> None:
-        self._writer.add_metadata(
-            "rosbag2", {"serialized_metadata": "\n".join(self._metadata().lines())}
-        )
+    def _finish(self) -> None:
+        """Give the present file its index, close it and count what is in it."""
+        if self._is_finished:
+            return
+        try:
+            self._output.finish()
+        finally:
+            self._contents.keep(self._output)
+            self.lost += self._output.dropped
 
-    def _metadata(self) -> BagMetadata:
-        empty = FileEntry(self.path.name)
-        start = empty.start if self._start is None else self._start
-        duration = 0 if self._start is None or self._end is None else self._end - self._start
-        return BagMetadata(
-            files=(FileEntry(self.path.name, start, duration, self._message_count),),
-            topics=tuple(
-                TopicEntry(name, channel.type_name, channel.qos, channel.type_hash, count)
-                for name, channel in self._channels.items()
-                for count in [channel.message_count]
-            ),
-            start=start,
-            duration=duration,
-            message_count=self._message_count,
-            ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
-            custom_data=self._custom_data,
-        )
+    def _add_metadata(self, output: McapOutput) -> None:
+        lines = self._contents.metadata(output, self.custom_data).lines()
+        output.add_metadata("rosbag2", {"serialized_metadata": "\n".join(lines)})
 
 
 def _library() -> str:

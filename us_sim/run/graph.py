@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+import yaml
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError
@@ -27,7 +28,9 @@ __all__ = [
     "Parameters",
     "ProcessGroup",
     "keep_on_this_host",
+    "parameters_file",
     "player_settings",
+    "scene_settings",
     "simulation_nodes",
     "video_settings",
 ]
@@ -76,9 +79,7 @@ def simulation_nodes(
         UsSimError: a parameter is for a node that this scene does not run.
     """
     given = dict(parameters or {})
-    common: dict[str, object] = {"scene": scene.origin}
-    if scene.volume.file:
-        common["volume"] = scene.volume.file
+    common = scene_settings(scene)
     nodes = [
         NodeProcess(
             part.node,
@@ -94,6 +95,21 @@ def simulation_nodes(
             f"{', '.join(process.node for process in nodes)}"
         )
     return nodes
+
+
+def scene_settings(scene: Scene) -> dict[str, object]:
+    """The parameters that tell a node the scene, as every node takes them."""
+    settings: dict[str, object] = {"scene": scene.origin}
+    if scene.volume.file:
+        settings["volume"] = scene.volume.file
+    return settings
+
+
+def parameters_file(processes: Sequence[NodeProcess]) -> str:
+    """The parameters of nodes as ROS reads them with ``--params-file``."""
+    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
+    text: str = yaml.safe_dump(document, sort_keys=False)
+    return text
 
 
 def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:

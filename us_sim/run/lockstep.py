@@ -14,7 +14,9 @@ from us_sim.progress import Progress
 from us_sim.run.graph import (
     Parameters,
     keep_on_this_host,
+    parameters_file,
     player_settings,
+    scene_settings,
     simulation_nodes,
 )
 from us_sim.run.in_process import node_in_process
@@ -118,6 +120,9 @@ def _nodes(
         "file": str(out / "session.mcap"),
         "compression": "zstd",
         "exclude": ["/diagnostics"],
+        "max_cache_size": 0,  # lose nothing, wait for the disk
+        **scene_settings(scene),
+        "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
     }
     player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [

@@ -17,7 +17,9 @@ from us_sim.run.graph import (
     NodeProcess,
     Parameters,
     ProcessGroup,
+    parameters_file,
     player_settings,
+    scene_settings,
     simulation_nodes,
     video_settings,
 )
@@ -82,12 +84,15 @@ def plan_of(
     processes = []
     if record is not None:
         settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
+        settings |= scene_settings(scene)
         if video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
         processes.append(NodeProcess("session_recorder", settings, taken("session_recorder")))
     player = taken("path_player") if path is not None else {}
     driver = taken("camera_driver") if video is not None else {}
     processes += simulation_nodes(scene, parameters, played=path is not None)
+    for recorder in processes[: record is not None]:
+        recorder.parameters["parameters"] = parameters_file(processes)
     if video is not None:
         settings = video_settings(scene, video.file, video.camera_info, recorded=record is not None)
         processes.append(NodeProcess("camera_driver", settings, driver))

@@ -1,6 +1,7 @@
 """What ROS 2 Jazzy's interfaces are made of: fields, constants, defaults and type hashes.
 
-The .msg files come from rosbags' type store; the services, which it lacks, are written down here.
+The .msg files come from rosbags' type store; what it lacks is written down here: the services, and
+events of rosbag2 that are newer than Jazzy.
 
 >>> from us_sim.standalone.interfaces import interface, type_hash
 >>> [(field.name, field.idl_type) for field in interface("sensor_msgs/msg/Image").fields][-2:]
@@ -54,9 +55,27 @@ _SERVICES = {
         "rcl_interfaces/Parameter[] parameters",
         "rcl_interfaces/SetParametersResult result",
     ),
+    "rosbag2_interfaces/srv/IsPaused": ("", "bool paused"),
+    "rosbag2_interfaces/srv/Pause": ("", ""),
+    "rosbag2_interfaces/srv/Record": ("string uri", "int32 return_code\nstring error_string"),
+    "rosbag2_interfaces/srv/Resume": ("", ""),
+    "rosbag2_interfaces/srv/Snapshot": ("", "bool success"),
+    "rosbag2_interfaces/srv/SplitBagfile": ("", ""),
+    "rosbag2_interfaces/srv/Stop": ("", ""),
+    "rosbag2_interfaces/srv/TogglePaused": ("", ""),
     "std_srvs/srv/Empty": ("", ""),
     "std_srvs/srv/SetBool": ("bool data", "bool success\nstring message"),
     "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
+}
+
+# Newer than Jazzy, as is the service Record.
+_MESSAGES = {
+    "rosbag2_interfaces/msg/MessagesLostEvent": (
+        "string node_name\nMessagesLostEventTopicStat[] messages_lost_statistics"
+    ),
+    "rosbag2_interfaces/msg/MessagesLostEventTopicStat": (
+        "string topic_name\nuint64 messages_lost_in_transport\nuint64 messages_lost_in_recorder"
+    ),
 }
 
 # The defaults that Jazzy's .msg files declare (rosbags drops them).
@@ -186,6 +205,8 @@ def _typestore() -> Any:
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, (constants, fields) in store.fielddefs.items():
         store.fielddefs[name] = constants, [(field, _without_char(kind)) for field, kind in fields]
+    for message, text in _MESSAGES.items():
+        store.fielddefs.update(get_types_from_msg(text, message))
     for service, texts in _SERVICES.items():
         package = service.split("/")[0]
         for part, text in zip(("Request", "Response"), texts, strict=True):

@@ -1,0 +1,370 @@
+"""The recorder's services, events, markers and attachments, and what it is asked to survive."""
+
+import dataclasses
+import errno
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from bench import pose_at
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from us_sim.errors import BagError
+from us_sim.nodes.message_types import message_type
+from us_sim.nodes.recorded_topic import RecordedTopic
+from us_sim.nodes.session_recorder import SessionRecorder
+from us_sim.recording.attached import extract
+from us_sim.recording.mcap_output import McapOutput
+from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
+from us_sim.scene.reading import load_scene
+
+srv = pytest.importorskip("rosbag2_interfaces.srv")
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+standalone_only = pytest.mark.skipif(
+    rclpy.__name__ == "rclpy", reason="needs writers of foreign types, which rclpy does not make"
+)
+newer_than_jazzy = pytest.mark.skipif(
+    not hasattr(srv, "Record"), reason="this rosbag2_interfaces has neither Record nor losses"
+)
+
+
+def call(bench, service, name, **fields):
+    """What one of the recorder's services answers."""
+    client = bench.peer.create_client(service, f"/session_recorder/{name}")
+    bench.spin_until(client.service_is_ready)
+    answer = client.call_async(service.Request(**fields))
+    bench.spin_until(answer.done)
+    return answer.result()
+
+
+def end(bench, recorder):
+    bench.executor.remove_node(recorder)
+    recorder.destroy_node()
+
+
+def texts(file, topic="/note"):
+    bag = read_bag(file)
+    if topic not in {each.name for each in bag.topics}:
+        return []
+    return [bag.deserialize(message).data for message in bag.messages([topic])]
+
+
+def say(bench, recorder, publisher, *words):
+    """Publish, and wait until the recorder has it."""
+    before = recorder.health.received
+    for word in words:
+        publisher.publish(String(data=word))
+    bench.spin_until(lambda: recorder.health.received >= before + len(words))
+
+
+@pytest.fixture
+def quiet(bench, tmp_path):
+    """A recorder of two topics, a publisher of each, the second one latched."""
+
+    def make(**parameters):
+        file = tmp_path / "session.mcap"
+        recorder = bench.make(
+            SessionRecorder, file=str(file), topics=["/note", "/mesh"], **parameters
+        )
+        note = bench.publisher(String, "note")
+        mesh = bench.peer.create_publisher(String, "mesh", LATCHED)
+        say(bench, recorder, mesh, "mesh")
+        return recorder, note, mesh, file
+
+    return make
+
+
+def test_pause_and_resume(bench, quiet):
+    recorder, note, mesh, file = quiet(start_paused=True)
+    assert call(bench, srv.IsPaused, "is_paused").paused
+    say(bench, recorder, note, "paused")
+    call(bench, srv.Resume, "resume")
+    assert not call(bench, srv.IsPaused, "is_paused").paused
+    say(bench, recorder, note, "one")
+    call(bench, srv.TogglePaused, "toggle_paused")
+    say(bench, recorder, note, "paused again")
+    say(bench, recorder, mesh, "other mesh")
+    call(bench, srv.Pause, "pause")
+    call(bench, srv.TogglePaused, "toggle_paused")
+    say(bench, recorder, note, "two")
+    end(bench, recorder)
+    assert texts(file) == ["one", "two"]
+    assert texts(file, "/mesh") == ["mesh", "other mesh"]  # what came while paused still holds
+
+
+def test_split_says_which_files(bench, quiet, tmp_path):
+    from rosbag2_interfaces.msg import WriteSplitEvent
+
+    recorder, note, _, file = quiet()
+    events = bench.collect(WriteSplitEvent, "events/write_split")
+    bench.spin_until(lambda: bench.peer.count_publishers("events/write_split") > 0)
+    say(bench, recorder, note, "one")
+    call(bench, srv.SplitBagfile, "split_bagfile")
+    bench.spin_until(lambda: events)
+    say(bench, recorder, note, "two")
+    call(bench, srv.Stop, "stop")
+    bench.spin_until(lambda: len(events) == 2)
+    further = str(tmp_path / "session_1.mcap")
+    assert [(e.closed_file, e.opened_file) for e in events] == [(str(file), further), (further, "")]
+    assert events[0].node_name == "/session_recorder"
+    assert (texts(file), texts(further), texts(tmp_path)) == (["one"], ["two"], ["one", "two"])
+
+
+@newer_than_jazzy
+def test_stop_and_record(bench, quiet, tmp_path):
+    recorder, note, _, file = quiet()
+    say(bench, recorder, note, "one")
+    assert call(bench, srv.Record, "record").error_string == (
+        "a recording is running: stop it first"
+    )
+    call(bench, srv.Stop, "stop")
+    assert read_bag(file).complete
+    say(bench, recorder, note, "nobody records")
+    assert call(bench, srv.Record, "record", uri=str(file)).return_code == 1
+    other = tmp_path / "other" / "two.mcap"
+    assert call(bench, srv.Record, "record", uri=str(other)).return_code == 0
+    say(bench, recorder, note, "two")
+    end(bench, recorder)
+    assert (texts(file), texts(other)) == (["one"], ["two"])
+
+
+def test_a_snapshot_holds_what_was_before_it(bench, quiet):
+    recorder, note, _mesh, file = quiet(snapshot_mode=True, max_cache_size=200)
+    said = [f"{k:010}" for k in range(30)]  # 19 bytes each
+    say(bench, recorder, note, *said)
+    assert call(bench, srv.Snapshot, "snapshot").success
+    say(bench, recorder, note, "not written")
+    end(bench, recorder)
+    assert texts(file) == said[-10:]
+    assert texts(file, "/mesh") == ["mesh"]
+
+
+def test_no_snapshot_without_its_mode(bench, quiet):
+    quiet()
+    assert not call(bench, srv.Snapshot, "snapshot").success
+
+
+def test_markers(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/session/marker"])
+    marker = bench.publisher(String, "session/marker")
+    say(bench, recorder, marker, "needle in", "needle out")
+    end(bench, recorder)
+    assert [text for _, text in read_bag(file).markers()] == ["needle in", "needle out"]
+    assert texts(file, "/session/marker") == ["needle in", "needle out"]
+
+
+def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
+    info = tmp_path / "calibration" / "info.yaml"
+    info.parent.mkdir()
+    info.write_text("image_width: 640\n")
+    scene = tmp_path / "arm.yaml"
+    scene.write_text("name: arm\nbased_on: upper_arm\nprobe: {depth: 35 mm}\n")
+    file = tmp_path / "out" / "session.mcap"
+    recorder = bench.make(
+        SessionRecorder,
+        file=str(file),
+        scene=str(scene),
+        attach=[str(info)],
+        parameters="tissue_deformer: {ros__parameters: {solver: fem}}\n",
+    )
+    end(bench, recorder)
+    scene_text = scene.read_text()
+    scene.unlink()
+    made = {path.name: path for path in extract(file, tmp_path / "again")}
+    assert made["info.yaml"].read_text() == "image_width: 640\n"
+    given = yaml.safe_load(made["parameters.yaml"].read_text())
+    assert given == {"tissue_deformer": {"ros__parameters": {"solver": "fem"}}}
+    assert f"python {sys.version.split()[0]}\n" in made["versions.txt"].read_text()
+    again = load_scene(made["scene.yaml"])
+    scene.write_text(scene_text)
+    assert Path(again.path).read_bytes() == Path(load_scene(scene).path).read_bytes()
+    assert Path(again.path).parent == tmp_path / "again"
+    replace = dataclasses.replace
+    assert replace(again, path=None, origin="") == replace(load_scene(scene), path=None, origin="")
+
+
+def test_a_missing_attachment_is_refused(bench, tmp_path):
+    with pytest.raises(BagError, match=r"none\.yaml cannot be attached: No such file"):
+        bench.make(
+            SessionRecorder, file=str(tmp_path / "a.mcap"), attach=[str(tmp_path / "none.yaml")]
+        )
+
+
+@newer_than_jazzy
+def test_losses_are_told(bench, quiet, monkeypatch):
+    from rosbag2_interfaces.msg import MessagesLostEvent
+
+    may_write = threading.Event()
+    write = BagWriter.write
+    monkeypatch.setattr(
+        BagWriter, "write", lambda *arguments: (may_write.wait(30), write(*arguments))
+    )
+    recorder, note, _, file = quiet(max_cache_size=1000)
+    events = bench.collect(MessagesLostEvent, "events/rosbag2_messages_lost")
+    bench.spin_until(lambda: bench.peer.count_publishers("events/rosbag2_messages_lost") > 0)
+    try:
+        say(bench, recorder, note, *("x" * 93 for _ in range(30)))  # 100 bytes each
+        bench.spin_until(lambda: events)
+        bench.spin_until(lambda: recorder.health.dropped > 0)
+    finally:
+        may_write.set()
+    end(bench, recorder)
+    told = {}
+    for event in events:
+        for each in event.messages_lost_statistics:
+            assert each.messages_lost_in_transport == 0
+            told[each.topic_name] = told.get(each.topic_name, 0) + each.messages_lost_in_recorder
+    assert told == read_bag(file).lost() == {"/note": 30 - len(texts(file))}
+    assert 0 < len(texts(file)) < 10
+
+
+def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
+    first = bench.peer.create_publisher(String, "note", LATCHED)
+    first.publish(String(data="before"))
+    bench.spin_until(lambda: recorder.health.received > 0)
+    weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    late = bench.peer.create_publisher(String, "note", weak)
+    bench.spin_until(lambda: late.get_subscription_count() > 0)  # the recorder has followed
+    said = ["before"]
+    for k in range(100):
+        for name, publisher in (("first", first), ("late", late)):
+            said.append(f"{name} {k}")
+            publisher.publish(String(data=said[-1]))
+        bench.spin_for(1)
+    bench.spin_until(lambda: first.get_subscription_count() == 1)  # the old one is gone
+    bench.spin_until(lambda: recorder.health.received >= len(said))
+    end(bench, recorder)
+    assert sorted(texts(file)) == sorted(said)
+    profiles = read_bag(tmp_path).metadata.topics[0].qos
+    assert [(q.reliability, q.durability) for q in profiles] == [
+        ("reliable", "transient_local"),
+        ("best_effort", "volatile"),
+    ]
+
+
+def test_gaps_in_a_publishers_numbers_are_losses(bench):
+    lost = []
+    topic = RecordedTopic(
+        bench.peer,
+        "/note",
+        String,
+        [QoSProfile(depth=1)],
+        lambda *_: None,
+        lambda name, count: lost.append((name, count)),
+    )
+    for number in (7, 8, 11, None, 12, 12, 20):
+        topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
+    assert lost == [("/note", 2), ("/note", 7)]
+    topic.follow([QoSProfile(depth=1), QoSProfile(depth=1)])  # whose numbers cannot be told apart
+    for number in (30, 1, 31):
+        topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
+    assert len(lost) == 2
+
+
+@standalone_only
+def test_foreign_types_are_said_once_and_nothing_is_imported_for_them(bench, tmp_path, monkeypatch):
+    from us_sim.standalone.endpoint_qos import EndpointQos
+    from us_sim.standalone.transport import Participant
+
+    package = tmp_path / "innocent"
+    package.mkdir()
+    (package / "__init__.py").write_text("raise SystemExit('code of a stranger runs')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    file = tmp_path / "session.mcap"
+    foreign = {
+        "/a": "a::b::c::msg::dds_::X_",
+        "/innocent": "innocent::msg::dds_::X_",
+        "/plain": "X",
+        "/empty": "::msg::dds_::_",
+        "/lower": "std_msgs::msg::dds_::string_",
+        "/dotted": "os.path::msg::dds_::X_",
+    }
+    with Participant(bench.context.get_domain_id()) as stranger:
+        writers = [
+            stranger.create_writer(f"rt{topic}", dds_type, EndpointQos())
+            for topic, dds_type in foreign.items()
+        ]
+        poses = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+        recorder = bench.make(SessionRecorder, file=str(file))
+        said = recorder.health
+        bench.spin_until(lambda: said.problems("topic") >= len(writers))
+        bench.spin_until(lambda: poses.get_subscription_count() > 0)
+        poses.publish(pose_at(0.001, 1))
+        bench.spin_until(lambda: said.problems("topic") >= len(writers))
+        bench.spin_for(30)
+        assert said.problems("topic") == len(writers)
+    end(bench, recorder)
+    assert "innocent" not in sys.modules
+    assert read_bag(file).topic("/tracker/pose").message_count == 1
+
+
+@pytest.mark.parametrize("name", ["a/b/c/msg/X", "X", "", "os/msg/path", "std_msgs/srv/String"])
+def test_names_that_are_no_types(name):
+    with pytest.raises(BagError, match="is no message type"):
+        message_type(name)
+
+
+def test_types_that_are_not_here():
+    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown: install"):
+        message_type("my_msgs/msg/Unheard")
+
+
+def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    file.write_bytes(b"precious")
+    with pytest.raises(BagError, match="exists already"):
+        bench.make(SessionRecorder, file=str(file))
+    recorder = bench.make(SessionRecorder, file=str(file), if_exists="further")
+    end(bench, recorder)
+    assert file.read_bytes() == b"precious"
+    assert read_bag(tmp_path / "session_1.mcap").complete
+
+
+def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
+    full = [False]
+    end_chunk = McapOutput.end_chunk
+
+    def unless_full(output):
+        if full[0]:
+            output.dropped["/note"] += 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+        end_chunk(output)
+
+    monkeypatch.setattr(McapOutput, "end_chunk", unless_full)
+    monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.1)
+    monkeypatch.setattr("us_sim.recording.writer._ROOM", 2**62)
+    recorder, note, _, file = quiet()
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    say(bench, recorder, note, "one")
+    bench.spin_until(lambda: texts(file) == ["one"])
+    full[0] = True
+    say(bench, recorder, note, "two")
+
+    def told():
+        return [
+            status.message
+            for report in reports
+            for status in report.status
+            if status.name == "/session_recorder" and status.level == DiagnosticStatus.WARN
+        ]
+
+    bench.spin_until(lambda: any("No space left on device" in text for text in told()))
+    assert recorder.health.problems("disk") == 1
+    full[0] = False
+    monkeypatch.setattr("us_sim.recording.writer._ROOM", 0)
+    bench.spin_until(lambda: (tmp_path / "session_1.mcap").exists())
+    bench.spin_until(lambda: not recorder.health.warning)
+    say(bench, recorder, note, "three")
+    end(bench, recorder)
+    assert texts(tmp_path)[-1] == "three"
+    assert sum(read_bag(tmp_path).lost().values()) > 0

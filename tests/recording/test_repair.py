@@ -1,0 +1,120 @@
+"""Recordings that were cut or damaged, made whole; and what is attached to them, taken out."""
+
+import pytest
+from killed import kill_once
+from mcap.reader import make_reader
+
+from us_sim.command.main import main
+from us_sim.errors import BagError
+from us_sim.recording.qos import QosProfile
+from us_sim.recording.reader import read_bag
+from us_sim.recording.repair import repair
+from us_sim.recording.writer import BagWriter
+
+STRING = "std_msgs/msg/String"
+EPOCH = 1_700_000_000_000_000_000
+
+
+def text(content):
+    """A std_msgs/String of ASCII text as CDR."""
+    return b"\0\1\0\0" + (len(content) + 1).to_bytes(4, "little") + content.encode() + b"\0"
+
+
+@pytest.fixture
+def session(tmp_path):
+    """A recording with two chunks, an attachment, a marker and a loss."""
+    file = tmp_path / "session.mcap"
+    with BagWriter(file) as bag:
+        bag.add_topic("/note", STRING, [QosProfile(depth=3)])
+        bag.attach("scene.yaml", "application/yaml", b"name: arm\n", EPOCH)
+        bag.attach("camera.yaml", "application/yaml", b"width: 640\n", EPOCH)
+        for k in range(20):
+            bag.write("/note", text(f"{k}"), EPOCH + k * 10**8)
+            if k == 15:
+                bag.note("marker", {"time": str(EPOCH + 15 * 10**8), "text": "needle in"})
+                bag.note("messages_lost", {"/note": "2"})
+                bag.note("messages_lost", {"/note": "1"})
+    return file
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+@pytest.mark.parametrize("after", [0.0, 0.9])
+def test_a_killed_recording_lacks_less_than_a_second_and_is_repaired(tmp_path, after, compression):
+    kill_once(tmp_path, after, compression)
+
+
+def test_a_cut_recording_is_made_whole(session, tmp_path):
+    content = session.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(content[: content.index(b"needle in") + 200])
+    made = repair(cut, tmp_path / "whole")
+    assert len(made.faults) == 1
+    assert "was not ended properly" in made.faults[0]
+    whole = read_bag(tmp_path / "whole")
+    assert whole.complete
+    assert list(whole.messages()) == list(read_bag(cut).messages())
+    assert made.message_count == whole.message_count == 11  # the first chunk's
+    assert whole.topic("/note").qos == (QosProfile(depth=3),)
+    assert whole.attachments().keys() == {"scene.yaml", "camera.yaml"}
+    assert whole.markers() == [(EPOCH + 15 * 10**8, "needle in")]
+    assert cut.read_bytes() == content[: len(cut.read_bytes())]  # untouched
+
+
+def test_a_damaged_chunk_is_left_out_and_said(session, tmp_path):
+    content = bytearray(session.read_bytes())
+    with session.open("rb") as stream:
+        first, *_ = make_reader(stream).get_summary().chunk_indexes
+    content[first.chunk_start_offset + first.chunk_length - 3] ^= 1
+    session.write_bytes(content)
+    made = repair(session, tmp_path / "whole")
+    assert [m.log_time for m in read_bag(made.path).messages()] == [
+        EPOCH + k * 10**8 for k in range(11, 20)
+    ]
+    assert "is damaged in its chunk" in made.faults[0]
+
+
+def test_the_files_of_a_restarted_recorder_become_one_bag(session, tmp_path):
+    content = session.read_bytes()
+    (tmp_path / "metadata.yaml").unlink()
+    session.write_bytes(content[: len(content) // 2])
+    with BagWriter(session, further=True) as bag:
+        bag.add_topic("/note", STRING)
+        bag.write("/note", text("later"), EPOCH + 10**10)
+    assert bag.path == tmp_path / "session_1.mcap"
+    assert repair(tmp_path, tmp_path / "whole").message_count == 12
+    assert session.read_bytes() == content[: len(content) // 2]
+
+
+def test_the_commands(session, tmp_path, capsys):
+    assert main(["bag", "info", str(session)]) == 0
+    told = capsys.readouterr().out
+    for line in ("3 of /note", "1.500 s  needle in", "scene.yaml (10 bytes)"):
+        assert f"  {line}\n" in f"{told}\n"
+    assert main(["bag", "extract", str(session), "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out/camera.yaml").read_text() == "width: 640\n"
+    assert main(["bag", "extract", str(session), "--out", str(tmp_path / "out")]) != 0
+    assert "exists already: choose another folder" in capsys.readouterr().err
+    assert main(["bag", "repair", str(session)]) == 0
+    whole = tmp_path / "session_repaired"
+    assert f"20 messages are in {whole}/session_repaired_0.mcap" in capsys.readouterr().out
+    assert main(["bag", "repair", str(session)]) != 0
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["", "..", "/etc/passwd", "a/../../b", "c:\\x", "x\ny"])
+def test_an_attachment_goes_nowhere_but_into_the_folder(tmp_path, name, capsys):
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        bag.attach(name, "text/plain", b"harm", EPOCH)
+    command = ["bag", "extract", str(tmp_path / "bag.mcap"), "--out", str(tmp_path / "out")]
+    assert main(command) != 0
+    assert "not a file's name" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_to_extract(tmp_path):
+    from us_sim.recording.attached import extract
+
+    with BagWriter(tmp_path / "bag.mcap"):
+        pass
+    with pytest.raises(BagError, match="has no files attached"):
+        extract(tmp_path / "bag.mcap", tmp_path / "out")

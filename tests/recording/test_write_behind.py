@@ -1,0 +1,144 @@
+"""A bag written from a thread of its own: nobody waits, and nothing is lost unsaid."""
+
+import resource
+import threading
+import time
+
+import pytest
+
+from us_sim.errors import BagError
+from us_sim.recording import writer
+from us_sim.recording.reader import read_bag
+from us_sim.recording.write_behind import Message, WriteBehind
+from us_sim.recording.writer import BagWriter
+
+STRING = "std_msgs/msg/String"
+EPOCH = 1_700_000_000_000_000_000
+
+
+def wait_until(condition, seconds=20):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def slow_disk(monkeypatch):
+    """An event before which nothing is written."""
+    may_write = threading.Event()
+    write = BagWriter.write
+
+    def when_allowed(self, *arguments):
+        may_write.wait(30)
+        write(self, *arguments)
+
+    monkeypatch.setattr(BagWriter, "write", when_allowed)
+    yield may_write
+    may_write.set()
+
+
+def test_nobody_waits_for_the_disk_and_what_is_too_much_is_counted(tmp_path, slow_disk):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=10_000)
+    for topic in ("/a", "/b"):
+        bag.add_topic(topic, STRING)
+    began = time.monotonic()
+    taken = [bag.put("/ab"[:1] + "ab"[k % 2], bytes(100), EPOCH + k) for k in range(300)]
+    assert time.monotonic() - began < 5  # the disk takes nothing for 30 s
+    assert taken == [True] * 100 + [False] * 200
+    slow_disk.set()
+    bag.close()
+    read = read_bag(tmp_path / "session.mcap")
+    assert [m.log_time - EPOCH for m in read.messages()] == list(range(100))
+    assert read.lost() == {"/a": 100, "/b": 100}
+    assert read_bag(tmp_path).metadata.custom_data == {"messages_lost": "200"}
+
+
+def test_numbers_show_where_messages_are_missing(tmp_path, slow_disk):
+    from mcap.reader import make_reader
+
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=300)
+    bag.add_topic("/a", STRING)
+    assert [bag.put("/a", bytes(100), EPOCH + k) for k in range(5)] == [True] * 3 + [False] * 2
+    slow_disk.set()
+    wait_until(lambda: bag.put("/a", bytes(250), EPOCH + 9))
+    bag.close()
+    with (tmp_path / "session.mcap").open("rb") as file:
+        numbers = [m.sequence for _, _, m in make_reader(file).iter_messages()]
+    lost = bag.losses.total
+    assert numbers == [1, 2, 3, 4 + lost]
+
+
+def test_without_a_queue_whoever_puts_waits_and_nothing_is_lost(tmp_path, slow_disk):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=0)
+    bag.add_topic("/a", STRING)
+    threading.Timer(0.2, slow_disk.set).start()
+    assert all(bag.put("/a", bytes(100_000), EPOCH + k) for k in range(30))
+    bag.close()
+    assert read_bag(tmp_path).message_count == 30
+
+
+def test_a_full_disk_is_written_to_again_when_there_is_room(tmp_path, monkeypatch):
+    monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.05)
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap", chunk_size=1000), 10**6)
+    bag.attach("scene.yaml", "text/plain", b"name: arm", EPOCH)
+    bag.add_topic("/a", STRING)
+    room = []
+    monkeypatch.setattr(writer.shutil, "disk_usage", lambda _: Usage(len(room) * 10**9))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        for k in range(100):
+            bag.put("/a", bytes(1000), EPOCH + k)
+        wait_until(lambda: "File too large" in bag.problem)
+        first = read_bag(tmp_path / "session.mcap")
+        assert first.complete  # with its index, while the disk is full
+        bag.put("/a", bytes(1000), EPOCH + 100)
+        wait_until(lambda: bag.losses.total == 101 - first.message_count)
+        room.append("more")
+        wait_until(lambda: not bag.problem)
+        bag.put("/a", bytes(1000), EPOCH + 200)
+        bag.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        *("metadata.yaml", "session.mcap", "session_1.mcap")
+    ]
+    whole = read_bag(tmp_path)
+    times = [message.log_time - EPOCH for message in whole.messages()]
+    assert times == [*range(first.message_count), 200]
+    assert whole.lost() == {"/a": 101 - first.message_count}
+    assert read_bag(tmp_path / "session_1.mcap").attachments()["scene.yaml"].data == b"name: arm"
+
+
+class Usage:
+    def __init__(self, free):
+        self.free = free
+
+
+def test_a_failure_of_any_kind_is_counted_and_ends_nothing(tmp_path):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), 10**6)
+    bag.add_topic("/a", STRING)
+    bag.put("/a", b"good", EPOCH)
+    bag.put("/a", b"no time", 2**70)
+    bag.put("/a", b"good", EPOCH + 1)
+    bag.close()
+    assert read_bag(tmp_path).message_count == 2
+    assert read_bag(tmp_path).lost() == {"/a": 1}
+
+
+def test_what_was_kept_in_memory_always_fits(tmp_path, slow_disk):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=100)
+    bag.add_topic("/a", STRING)
+    bag.put_all([Message("/a", bytes(100), EPOCH + k, EPOCH) for k in range(5)])
+    slow_disk.set()
+    bag.close()
+    assert read_bag(tmp_path).message_count == 5
+
+
+def test_an_unknown_type_is_refused_at_once(tmp_path):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), 10**6)
+    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown"):
+        bag.add_topic("/a", "my_msgs/msg/Unheard")
+    bag.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "bag writer"]

@@ -1,0 +1,125 @@
+"""The services by which rosbag2's recorder is controlled, and the events that it publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from rclpy.node import Node
+
+from us_sim.recording.losses import Loss
+
+__all__ = ["Controlled", "RecorderEvents", "offer_services"]
+
+
+class Controlled(Protocol):
+    """A recorder."""
+
+    paused: bool
+
+    def pause(self) -> None:
+        """Record nothing until `resume`."""
+        ...
+
+    def resume(self) -> None:
+        """Go on."""
+        ...
+
+    def split(self) -> None:
+        """Go on in a further file."""
+        ...
+
+    def stop(self) -> None:
+        """End the recording."""
+        ...
+
+    def record(self, file: str) -> str:
+        """Begin a further recording; why that cannot be, or nothing."""
+        ...
+
+    def snapshot(self) -> bool:
+        """Write what was kept in memory; False where nothing is kept."""
+        ...
+
+
+def offer_services(node: Node, recorder: Controlled) -> bool:
+    """Offer rosbag2's services; False where ``rosbag2_interfaces`` is not installed."""
+    try:
+        from rosbag2_interfaces import srv
+    except ImportError:
+        return False
+
+    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> None:
+        def answer(request: Any, response: Any) -> Any:
+            act(request, response)
+            return response
+
+        if hasattr(srv, service):  # Record is newer than Jazzy
+            node.create_service(getattr(srv, service), f"~/{name}", answer)
+
+    def toggle(_: Any, __: Any) -> None:
+        (recorder.resume if recorder.paused else recorder.pause)()
+
+    def record(request: Any, response: Any) -> None:
+        response.error_string = recorder.record(request.uri)
+        response.return_code = int(bool(response.error_string))
+
+    offer("Pause", "pause", lambda *_: recorder.pause())
+    offer("Resume", "resume", lambda *_: recorder.resume())
+    offer("TogglePaused", "toggle_paused", toggle)
+    offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", recorder.paused))
+    offer("SplitBagfile", "split_bagfile", lambda *_: recorder.split())
+    offer("Stop", "stop", lambda *_: recorder.stop())
+    offer("Record", "record", record)
+    offer(
+        "Snapshot",
+        "snapshot",
+        lambda _, answer: setattr(answer, "success", recorder.snapshot()),
+    )
+    return True
+
+
+class RecorderEvents:
+    """Publishes rosbag2's events, as far as ``rosbag2_interfaces`` has their types."""
+
+    SPLIT = "events/write_split"
+    LOST = "events/rosbag2_messages_lost"
+    """Its type is newer than Jazzy."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._msg: Any = None
+        self._split: Any = None
+        self._lost: Any = None
+        try:
+            from rosbag2_interfaces import msg
+        except ImportError:
+            return
+        self._msg = msg
+        self._split = node.create_publisher(msg.WriteSplitEvent, self.SPLIT, 1)
+        if hasattr(msg, "MessagesLostEvent"):
+            self._lost = node.create_publisher(msg.MessagesLostEvent, self.LOST, 10)
+
+    def split(self, closed: str, opened: str) -> None:
+        """A file was closed, and another one begun; none when the recording ended."""
+        if self._split is not None:
+            name = self._node.get_fully_qualified_name()
+            event = self._msg.WriteSplitEvent(
+                closed_file=closed, opened_file=opened, node_name=name
+            )
+            self._split.publish(event)
+
+    def lost(self, losses: Mapping[str, Loss]) -> None:
+        """Messages were lost since this was said last."""
+        if self._lost is None or not losses:
+            return
+        event = self._msg.MessagesLostEvent(node_name=self._node.get_fully_qualified_name())
+        event.messages_lost_statistics = [
+            self._msg.MessagesLostEventTopicStat(
+                topic_name=topic,
+                messages_lost_in_transport=loss.in_transport,
+                messages_lost_in_recorder=loss.in_recorder,
+            )
+            for topic, loss in losses.items()
+        ]
+        self._lost.publish(event)

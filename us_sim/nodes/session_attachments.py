@@ -1,0 +1,114 @@
+"""What a session was recorded with: its scene, the files that the scene names, and versions."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import mimetypes
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from us_sim.errors import BagError, UsSimError
+from us_sim.nodes.settings import SessionRecorderSettings
+from us_sim.recording.attached import versions
+from us_sim.scene.document import read_document
+from us_sim.scene.reading import find_scene, load_scene
+from us_sim.settings.setting import rules_of
+
+__all__ = ["session_attachments"]
+
+LARGEST = 4 * 1024 * 1024
+"""Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
+
+
+def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[str, bytes]]:
+    """Media types and contents by file names.
+
+    ``scene.yaml`` is the scene with all that it is based on. It names attached files as they are
+    extracted beside it, and others by their paths, which `files.txt` lists with their checksums.
+
+    Raises:
+        UsSimError: there is no such scene or file, or it cannot be read.
+    """
+    attached = {"versions.txt": ("text/plain", versions().encode())}
+    if settings.parameters:
+        attached["parameters.yaml"] = "application/yaml", settings.parameters.encode()
+    for name in settings.attach:
+        _attach(attached, Path(name).expanduser())
+    if settings.scene is not None:
+        _attach_scene(attached, settings.scene, settings.volume)
+    return attached
+
+
+def _attach_scene(attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None) -> None:
+    document, _ = read_document(find_scene(scene), find_scene)
+    if volume:
+        kept = {key: value for key, value in document["volume"].items() if key != "phantom"}
+        document["volume"] = kept | {"file": volume}
+    listed, places = [], {}
+    for path in sorted(set(_files(load_scene(scene, volume=volume)))):
+        small = path.is_file() and path.stat().st_size <= LARGEST
+        places[path] = path.name if small and _attach(attached, path) else str(path)
+        listed.append(f"{_checksum(path)}  {path}")
+    text = yaml.safe_dump(_placed(document, places), sort_keys=False, allow_unicode=True)
+    attached["scene.yaml"] = "application/yaml", text.encode()
+    if listed:
+        attached["files.txt"] = "text/plain", "\n".join([*listed, ""]).encode()
+
+
+def _attach(attached: dict[str, tuple[str, bytes]], path: Path) -> bool:
+    """Attach a file by its own name; False if another one has that name already."""
+    if path.name in (*attached, "scene.yaml", "files.txt"):
+        return False
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BagError(f"{path} cannot be attached: {error.strerror}") from None
+    attached[path.name] = mimetypes.guess_type(path.name)[0] or "application/octet-stream", data
+    return True
+
+
+def _files(settings: Any) -> Iterator[Path]:
+    """The files that settings, and settings within them, name."""
+    if isinstance(settings, dict):
+        for value in settings.values():
+            yield from _files(value)
+    elif isinstance(settings, list | tuple):
+        for value in settings:
+            yield from _files(value)
+    elif dataclasses.is_dataclass(settings):
+        rules = rules_of(type(settings))
+        for field in dataclasses.fields(settings):
+            value = getattr(settings, field.name)
+            rule = rules.get(field.name)
+            if rule is not None and rule.file and isinstance(value, str):
+                yield Path(value)
+            else:
+                yield from _files(value)
+
+
+def _placed(document: Any, places: dict[Path, str]) -> Any:
+    """The document with files named by where they are once it is extracted."""
+    if isinstance(document, dict):
+        return {key: _placed(value, places) for key, value in document.items()}
+    if isinstance(document, list):
+        return [_placed(value, places) for value in document]
+    if isinstance(document, str):
+        for path, place in places.items():
+            if document.endswith(path.name) and str(path).endswith(document.lstrip("./~")):
+                return place
+    return document
+
+
+def _checksum(path: Path) -> str:
+    """SHA-256 of a file; of a folder, nothing that could be compared."""
+    if not path.is_file():
+        return "-" * 64
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise UsSimError(f"{path} cannot be read: {error.strerror}") from None

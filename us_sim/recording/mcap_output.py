@@ -1,0 +1,356 @@
+"""One MCAP file while it is written: chunks, and an index of them at the end.
+
+A write that fails takes back what it began, so the file holds whole records at every moment, and
+its index can still be written where the disk is full: in the room of the last chunks, if need be.
+That, and the copies of each message that it saves, is why this is not ``mcap.writer.Writer``; the
+records themselves are those of the ``mcap`` package.
+
+The format: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+__all__ = ["MAGIC", "McapOutput"]
+
+MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
+_CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
+_FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of the summary, of its offsets
+_LENGTH = struct.Struct("<Q")
+
+_COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
+
+
+@dataclass(frozen=True)
+class _WrittenChunk:
+    """A chunk in the file."""
+
+    index: ChunkIndex
+    counts: Counter[str]  # messages by topic
+
+
+class McapOutput:
+    """A new MCAP file of ROS 2 messages.
+
+    Args:
+        path: a file that is not there yet.
+        library: what writes it.
+        compression: of the chunks: ``""`` or ``"zstd"``.
+        chunk_size: bytes after which a chunk is ended.
+
+    Raises:
+        FileExistsError: there is such a file.
+        OSError: it cannot be made.
+    """
+
+    def __init__(self, path: Path, library: str, *, compression: str, chunk_size: int) -> None:
+        self.path = path
+        self.counts: Counter[str] = Counter()  # messages by topic, of the chunk in progress too
+        self.dropped: Counter[str] = Counter()  # messages that were in `counts` and are not now
+        self.start: int | None = None  # ns, lowest log time
+        self.end: int | None = None  # ns, highest log time
+        self._compression = compression
+        self._chunk_size = chunk_size
+        self._schemas: dict[str, Schema] = {}  # by type
+        self._channels: dict[str, Channel] = {}  # by topic
+        self._declared: set[str] = set()  # topics whose channel's record is in the file
+        self._chunks: list[_WrittenChunk] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._begin_chunk()
+        self._size = 0  # bytes of whole records in the file
+        self._file = path.open("xb", buffering=0)
+        try:
+            self._append([MAGIC, _bytes_of(Header("ros2", library))])
+        except OSError:
+            self._file.close()
+            with contextlib.suppress(OSError):
+                path.unlink()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file, with those of the chunk in progress."""
+        return self._size + self._pending
+
+    @property
+    def message_count(self) -> int:
+        """Messages in the file and in the chunk in progress."""
+        return self.counts.total()
+
+    def add_topic(
+        self, topic: str, type_name: str, definition: str, metadata: dict[str, str]
+    ) -> None:
+        """Make a topic known, with the definition of its type."""
+        schemas, channels = self._schemas, self._channels
+        if type_name not in schemas:
+            schemas[type_name] = Schema(
+                id=len(schemas) + 1, data=definition.encode(), encoding="ros2msg", name=type_name
+            )
+        channels[topic] = Channel(
+            id=len(channels) + 1,
+            topic=topic,
+            message_encoding="cdr",
+            metadata=metadata,
+            schema_id=schemas[type_name].id,
+        )
+
+    def add_message(
+        self, topic: str, log_time: int, publish_time: int, sequence: int, data: bytes
+    ) -> None:
+        """A message in the chunk in progress, which is written when it is large enough.
+
+        Raises:
+            OSError: the chunk cannot be written; its messages are dropped.
+        """
+        channel = self._channels[topic]
+        if topic not in self._declared and topic not in self._declared_here:
+            self._declare(topic)
+        header = _MESSAGE.pack(
+            Opcode.MESSAGE, 22 + len(data), channel.id, sequence, log_time, publish_time
+        )
+        self._index[topic].append((log_time, self._pending))
+        self._put(header)
+        self._put(data)
+        self.counts[topic] += 1
+        if self.start is None or log_time < self.start:
+            self.start = log_time
+        if self.end is None or log_time > self.end:
+            self.end = log_time
+        if self._pending > self._chunk_size:
+            self.end_chunk()
+
+    def end_chunk(self) -> None:
+        """Write the chunk in progress, if there are messages in it.
+
+        Raises:
+            OSError: it cannot be written; its messages are dropped.
+        """
+        if not self._index:
+            return
+        records, index, declared = b"".join(self._parts), self._index, self._declared_here
+        counts = Counter({topic: len(entries) for topic, entries in index.items()})
+        self._begin_chunk()
+        times = [time for entries in index.values() for time, _ in entries]
+        first, last = min(times), max(times)
+        packed = _COMPRESS[self._compression](records)
+        name = self._compression.encode()
+        header = _CHUNK.pack(
+            *(Opcode.CHUNK, _CHUNK.size - 9 + len(name) + 8 + len(packed)),
+            *(first, last, len(records), zlib.crc32(records), len(name)),
+        )
+        header += name + _LENGTH.pack(len(packed))
+        start = self._size
+        offsets, tables, position = {}, [], start + len(header) + len(packed)
+        for topic, entries in index.items():
+            id = self._channels[topic].id
+            tables.append(_bytes_of(MessageIndex(channel_id=id, records=entries)))
+            offsets[id] = position
+            position += len(tables[-1])
+        try:
+            self._append([header, packed, *tables])
+        except OSError:
+            self._drop(counts)
+            raise
+        self._declared |= declared
+        written = ChunkIndex(
+            message_start_time=first,
+            message_end_time=last,
+            chunk_start_offset=start,
+            chunk_length=len(header) + len(packed),
+            message_index_offsets=offsets,
+            message_index_length=sum(map(len, tables)),
+            compression=self._compression,
+            compressed_size=len(packed),
+            uncompressed_size=len(records),
+        )
+        self._chunks.append(_WrittenChunk(written, counts))
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """A record of texts by their names.
+
+        Raises:
+            OSError: it cannot be written; the file is as before.
+        """
+        record = _bytes_of(Metadata(name=name, metadata=values))
+        index = MetadataIndex(offset=self._size, length=len(record), name=name)
+        self._append([record])
+        self._metadata.append(index)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
+        """A file within the file; ``time`` in ns since the epoch.
+
+        Raises:
+            OSError: it cannot be written; the file is as before.
+        """
+        attachment = Attachment(
+            create_time=time, log_time=time, name=name, media_type=media_type, data=data
+        )
+        record = _bytes_of(attachment)
+        index = AttachmentIndex(
+            offset=self._size,
+            length=len(record),
+            log_time=time,
+            create_time=time,
+            data_size=len(data),
+            name=name,
+            media_type=media_type,
+        )
+        self._append([record])
+        self._attachments.append(index)
+
+    def finish(self) -> None:
+        """Write the chunk in progress and the index, and close the file.
+
+        Where there is no room for the index, the last chunks make room for it.
+
+        Raises:
+            OSError: not even that helps; the file is closed, and can be read without an index.
+        """
+        with contextlib.closing(self._file):
+            with contextlib.suppress(OSError):
+                self.end_chunk()
+            while True:
+                try:
+                    self._append(self._summary())
+                except OSError:
+                    if not self._chunks:
+                        raise
+                    self._drop_last_chunk()
+                else:
+                    return
+
+    def _begin_chunk(self) -> None:
+        self._parts: list[bytes] = []
+        self._pending = 0  # bytes
+        self._index: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+        self._declared_here: set[str] = set()
+
+    def _put(self, data: bytes) -> None:
+        self._parts.append(data)
+        self._pending += len(data)
+
+    def _declare(self, topic: str) -> None:
+        """Put the records of a topic's type and channel before its first message."""
+        channel = self._channels[topic]
+        schema = next(each for each in self._schemas.values() if each.id == channel.schema_id)
+        self._put(_bytes_of(schema))
+        self._put(_bytes_of(channel))
+        self._declared_here.add(topic)
+
+    def _append(self, parts: Iterable[bytes]) -> None:
+        """Write at the end, all or nothing."""
+        size = self._size
+        try:
+            for part in parts:
+                rest = memoryview(part)
+                while rest:
+                    count = self._file.write(rest) or 0
+                    rest = rest[count:]
+                size += len(part)
+        except OSError:
+            self._cut(self._size)
+            raise
+        self._size = size
+
+    def _cut(self, size: int) -> None:
+        self._size = size
+        with contextlib.suppress(OSError):
+            self._file.truncate(size)
+        with contextlib.suppress(OSError):
+            self._file.seek(size)
+
+    def _drop(self, counts: Counter[str]) -> None:
+        """Forget messages that are not in the file, while no chunk is in progress."""
+        self.counts -= counts
+        self.dropped += counts
+        kept = [chunk.index for chunk in self._chunks]
+        self.start = min((index.message_start_time for index in kept), default=None)
+        self.end = max((index.message_end_time for index in kept), default=None)
+
+    def _drop_last_chunk(self) -> None:
+        """Take back the last chunk, and what was written after it."""
+        chunk = self._chunks.pop()
+        self._cut(chunk.index.chunk_start_offset)
+        self._attachments = [each for each in self._attachments if each.offset < self._size]
+        self._metadata = [each for each in self._metadata if each.offset < self._size]
+        self._drop(chunk.counts)
+
+    def _summary(self) -> list[bytes]:
+        """What comes after the messages."""
+        data_end = _bytes_of(DataEnd(0))
+        start = self._size + len(data_end)
+        groups: list[tuple[Opcode, list[McapRecord]]] = [
+            (Opcode.SCHEMA, [*self._schemas.values()]),
+            (Opcode.CHANNEL, [*self._channels.values()]),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, [chunk.index for chunk in self._chunks]),
+            (Opcode.ATTACHMENT_INDEX, [*self._attachments]),
+            (Opcode.METADATA_INDEX, [*self._metadata]),
+        ]
+        summary = RecordBuilder()
+        offsets = []
+        for opcode, records in groups:
+            begin = summary.count
+            for record in records:
+                record.write(summary)
+            if records:
+                offsets.append(SummaryOffset(opcode, start + begin, summary.count - begin))
+        offsets_start = start + summary.count
+        for offset in offsets:
+            offset.write(summary)
+        content = summary.end()
+        # The checksum covers the summary and the footer up to the checksum itself.
+        footer = _FOOTER.pack(Opcode.FOOTER, 20, start, offsets_start)
+        crc = zlib.crc32(footer, zlib.crc32(content))
+        return [data_end, content, _bytes_of(Footer(start, offsets_start, crc)), MAGIC]
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts={
+                self._channels[topic].id: count for topic, count in self.counts.items()
+            },
+            chunk_count=len(self._chunks),
+            message_count=self.message_count,
+            message_end_time=self.end or 0,
+            message_start_time=self.start or 0,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes_of(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    content: bytes = builder.end()
+    return content
