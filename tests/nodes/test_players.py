@@ -48,6 +48,30 @@ def test_poses_are_played_in_order_at_their_pace_with_new_stamps(bench, path):
     assert (np.diff(stamps) > 0).all()
 
 
+def test_a_player_goes_on_where_a_path_that_began_earlier_would_be(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    first = bench.make(PathPlayer, path=str(path), rate=0.02)  # a second between two poses
+    bench.spin_until(lambda: len(poses) == 1)
+    now = first.get_clock().now().nanoseconds
+    begun = float(first.health.values["begun"])
+    assert 0.0 <= 1e-9 * now - begun < 30.0
+    assert first.health.values["played"] == "1"
+    player = bench.make(PathPlayer, path=str(path), rate=0.02, begun=1e-9 * now - 5.2)
+    bench.spin_until(lambda: player.health.values.get("played", "0") == "6")
+    assert player.health.values["begun"] == f"{1e-9 * now - 5.2:.9f}"
+
+
+@pytest.mark.parametrize(("loop", "ends"), [(False, True), (True, False)])
+def test_a_path_that_would_be_over_ends_unless_it_loops(bench, path, loop, ends):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), begun=1_700_000_000.0, loop=loop)
+    bench.spin_until(lambda: player.finished.done() if ends else len(poses) > 12)
+    assert player.finished.done() == ends
+    if ends:
+        bench.spin_until(lambda: poses)
+        assert [round(pose.pose.position.z * 1e3) for pose in poses] == [9]
+
+
 def test_recorded_stamps_can_be_kept(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     player = bench.make(PathPlayer, path=str(path), restamp=False, rate=10.0)

@@ -17,7 +17,10 @@ from rclpy.node import Node
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 
-__all__ = ["run_node"]
+__all__ = ["INTERRUPTED", "run_node"]
+
+INTERRUPTED = 130
+"""The exit status of a node that was told to end before its work was done."""
 
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
@@ -28,8 +31,9 @@ _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
 
-    A node with a ``finished`` future ends when that is done. Bad input is one sentence on stderr
-    and exit status 1.
+    A node with a ``finished`` future ends when that is done; told to end before, or while it is
+    made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input is one
+    sentence on stderr and exit status 1.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
@@ -42,13 +46,13 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         node = create()
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        return _interrupted(node)
     except (UsSimError, ParameterException) as error:
         return _refused(error)
     except Exception:
         if rclpy.ok():
             raise
-        return 0  # a compiler, say, that a signal breaks off fails with an error of its own
+        return _interrupted(node)  # a compiler that a signal breaks off fails with its own error
     finally:
         if node is not None:
             node.destroy_node()
@@ -113,6 +117,12 @@ class _Executor(SingleThreadedExecutor):
             raise failure
 
         return fail
+
+
+def _interrupted(node: Any) -> int:
+    """The exit status of a node that was told to end."""
+    finished = getattr(node, "finished", None)
+    return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
 
 
 def _interrupt_once(*_: object) -> None:

@@ -44,6 +44,7 @@ __all__ = [
 _SPEED = Quantity("number", 0.01, 100.0)
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
 _AGE = Quantity("time", 0.01, 3600.0)
+_BEGUN = Quantity("time", 0.0, 1e10)
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,12 @@ class PathPlayerSettings(Settings):
     lockstep: bool = setting(
         description="send the next pose when the image of the last has come", default=False
     )
+    begun: float = setting(
+        _BEGUN,
+        "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
+        "the start",
+        default=0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -208,6 +215,12 @@ class CameraDriverSettings(Settings):
     latency: float = setting(
         Quantity("time", -1.0, 10.0),
         "from the middle of the exposure to the image's arrival",
+        default=0.0,
+    )
+    begun: float = setting(
+        _BEGUN,
+        "since 1970, when a file's first image was shown: play on where it would be by now; 0: "
+        "from the start",
         default=0.0,
     )
 
