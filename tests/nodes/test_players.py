@@ -23,10 +23,14 @@ STEP = 20_000_000
 @pytest.fixture
 def path(tmp_path):
     """Ten poses, 20 ms apart."""
-    stamps = EPOCH + STEP * np.arange(10)
+    return written(tmp_path / "path.mcap", STEP)
+
+
+def written(file, step):
+    """A path of ten poses, so many ns apart."""
+    stamps = EPOCH + step * np.arange(10)
     positions = np.zeros((10, 3))
     positions[:, 2] = np.arange(10) * 1e-3
-    file = tmp_path / "path.mcap"
     orientations = np.tile([0.0, 0, 0, 1], (10, 1))
     write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
     return file
@@ -48,17 +52,19 @@ def test_poses_are_played_in_order_at_their_pace_with_new_stamps(bench, path):
     assert (np.diff(stamps) > 0).all()
 
 
-def test_a_player_goes_on_where_a_path_that_began_earlier_would_be(bench, path):
+def test_a_player_goes_on_where_a_path_that_began_earlier_would_be(bench, path, tmp_path):
     poses = bench.collect(PoseStamped, "tracker/pose")
-    first = bench.make(PathPlayer, path=str(path), rate=0.02)  # a second between two poses
-    bench.spin_until(lambda: len(poses) == 1)
+    first = bench.make(PathPlayer, path=str(path))
+    bench.spin_until(lambda: len(poses) == 10)
     now = first.get_clock().now().nanoseconds
-    begun = float(first.health.values["begun"])
-    assert 0.0 <= 1e-9 * now - begun < 30.0
-    assert first.health.values["played"] == "1"
-    player = bench.make(PathPlayer, path=str(path), rate=0.02, begun=1e-9 * now - 5.2)
-    bench.spin_until(lambda: player.health.values.get("played", "0") == "6")
-    assert player.health.values["begun"] == f"{1e-9 * now - 5.2:.9f}"
+    assert 0.0 < 1e-9 * now - float(first.health.values["begun"]) < 30.0
+    assert first.health.values["played"] == "10"
+    slow = written(tmp_path / "slow" / "slow.mcap", 100 * 10**9)
+    begun = round(1e-9 * now - 560.0, 6)
+    player = bench.make(PathPlayer, path=str(slow), begun=begun)
+    bench.spin_until(lambda: player.health.values)
+    assert player.health.values["played"] == "6"
+    assert float(player.health.values["begun"]) == pytest.approx(begun, abs=1e-5)
 
 
 @pytest.mark.parametrize(("loop", "ends"), [(False, True), (True, False)])

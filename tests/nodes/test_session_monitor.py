@@ -32,9 +32,12 @@ def test_two_runs_see_each_other(bench):
     runs = ["00000000000000000001 left 10", "00000000000000000002 right 11"]
     monitors = [bench.add(SessionMonitor([], run, context=bench.context)) for run in runs]
     monitors.append(bench.add(SessionMonitor(context=bench.context)))  # of `us-sim play`
-    bench.spin_until(lambda: all(monitor.other_runs for monitor in monitors[:2]))
-    assert monitors[0].other_runs == {runs[1]}
-    assert monitors[1].other_runs == {runs[0]}
+    bench.spin_until(lambda: set(runs) <= monitors[2].other_runs)
+    bench.spin_until(lambda: runs[1] in monitors[0].other_runs)
+    bench.spin_until(lambda: runs[0] in monitors[1].other_runs)
+    for run, monitor in zip(runs, monitors, strict=False):
+        assert run not in monitor.other_runs
+        assert "" not in monitor.other_runs
 
 
 def test_what_was_lost_is_reported_at_once_and_the_newest_last(bench):

@@ -27,7 +27,7 @@ def test_nothing_lost_is_nothing_said(files):
 def test_what_became_of_a_node_is_said(files):
     back = Loss("tissue_deformer", "was ended by SIGKILL", 12.34, back_after=2.46)
     gone = Loss("session_recorder", "was stopped (SIGSTOP)", 20.0, given_up="is not started again")
-    assert outcome([back, gone], files, recorded=550).sentence() == (
+    assert outcome([back, gone], files, made=550, recorded=550).sentence() == (
         "tissue_deformer was ended by SIGKILL at 12.3 s and was back after 2.5 s; "
         "session_recorder was stopped (SIGSTOP) at 20.0 s and is not started again; "
         "550 images were recorded of 600 poses; "
@@ -44,7 +44,7 @@ def test_many_are_counted():
 
 def test_images_that_are_not_in_the_recording_are_said(files):
     lacking = outcome(files=files[:1], recorded=64, made=440, poses=None)
-    assert lacking.sentence() == "64 images were recorded of 440 reported"
+    assert lacking.sentence() == "64 images were recorded of 440 that were made"
 
 
 def test_the_summary_has_all_of_it(files):

@@ -68,10 +68,10 @@ class Outcome:
         if len(self.losses) > TOLD:
             told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
         if self.files and (self.losses or self.recorded < self.made):
-            if self.poses is not None:
-                told.append(f"{self.recorded} images were recorded of {self.poses} poses")
-            else:
-                told.append(f"{self.recorded} images were recorded of {self.made} reported")
+            of = f" of {self.poses} poses" if self.poses is not None else ""
+            if self.recorded < self.made:
+                of = f" of {self.made} that were made"
+            told.append(f"{self.recorded} images were recorded{of}")
         if len(self.files) > 1:
             told.append(f"the recording is in {_listed([file.name for file in self.files])}")
         return "; ".join(told) if self.losses or self._lacks_images else ""
