@@ -134,7 +134,9 @@ class Supervised:
         """Let one that hangs end by itself for a moment, then end it."""
         for number in (signal.SIGTERM, signal.SIGCONT):
             await self.send(action, number, context)
-        await asyncio.sleep(HUNG_STOP_S)
+        for _ in range(round(HUNG_STOP_S / LOOK_S)):
+            if action in self.actions.values():
+                await asyncio.sleep(LOOK_S)
         await self.send(action, signal.SIGKILL, context)
 
     async def send(self, action, number, context):

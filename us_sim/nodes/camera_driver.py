@@ -136,24 +136,18 @@ class CameraDriver(GuardedNode):
                 return
             there = self._images.get_subscription_count() and self._awaited.are_there()
             checks = checks + 1 if there else 0
-        now, number = self.get_clock().now().nanoseconds, 0
-        begun = self._begun if 0 < self._begun < now else now
+        there, number = self.get_clock().now().nanoseconds, 0
+        begun = self._begun if 0 < self._begun < there else there
         shown = True
         while not self._closing.is_set():
             due = begun + round(1e9 * number * self._video.interval)
             now = self.get_clock().now().nanoseconds
             self.health.values = {"played": str(number), "begun": f"{1e-9 * begun:.9f}"}
-            if begun == self._begun and now - due > 1e9 * self._video.interval:
-                # Before this process was there.
-                if self._video.grab() is None:
-                    break
-                number += 1
-                continue
-            self._begun = 0
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
             # It was exposed when it was due, however long it takes to decode.
-            if self._video.grab() is None or not (shown := self._keep(due)):
+            # One that was due before this process was there is passed over.
+            if self._video.grab() is None or not (due < there or (shown := self._keep(due))):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break

@@ -54,12 +54,12 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
             raise
         return _interrupted(node)  # a compiler that a signal breaks off fails with its own error
     finally:
+        for number in _ENDINGS:
+            signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
         if node is not None:
             node.destroy_node()
         with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
             rclpy.try_shutdown()
-        for number in _ENDINGS:
-            signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
     return 0
 
 

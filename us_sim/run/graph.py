@@ -46,7 +46,7 @@ STOP_S = 0.8
 """How long nodes may take to end before the recorder is told to."""
 RECORDER_STOP_S = 10.0
 """How long the recorder may take to write what it still holds."""
-HUNG_STOP_S = 0.5
+HUNG_STOP_S = 1.0
 """How long a node that hangs may take to end by itself, before it is killed."""
 
 
@@ -222,7 +222,7 @@ class ProcessGroup:
     def end(self, node: str) -> None:
         """End one that hangs: it may do so by itself for a moment, also if it was stopped."""
         running = self._running[node]
-        running.wait_after_sigterm(RECORDER_STOP_S / 5 if node == RECORDER else HUNG_STOP_S)
+        running.wait_after_sigterm(HUNG_STOP_S)
         running.kill()
         running.told = True
 
