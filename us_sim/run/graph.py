@@ -179,13 +179,8 @@ class ProcessGroup:
 
     @property
     def pids(self) -> dict[str, int]:
-        """The process of each node that was started and not given up."""
+        """The processes' numbers by node, also of those that have ended."""
         return {node: running.process.pid for node, running in self._running.items()}
-
-    @property
-    def pids(self) -> dict[str, int]:
-        """The processes' numbers by node."""
-        return {node: process.pid for node, process in self._processes.items()}
 
     def is_running(self, node: str) -> bool:
         """Whether that node was started and has not ended."""
