@@ -3,7 +3,7 @@
 import pytest
 
 from us_sim.recording.writer import BagWriter
-from us_sim.run.losses import Loss, Outcome, images_in
+from us_sim.run.losses import Loss, Outcome, files_of, images_in
 
 
 def outcome(losses=(), files=(), **counts):
@@ -63,6 +63,14 @@ def test_the_summary_has_all_of_it(files):
         "back_after_s": 2.0,
         "given_up": "",
     }
+
+
+def test_the_files_of_a_recording_are_found_in_their_order(tmp_path):
+    names = ["a.mcap", "a_1.mcap", "a_2.mcap", "a_2_1.mcap", "a_10.mcap"]
+    for name in (*names, "ab.mcap", "a_b.mcap", "a_1.db3", "b_1.mcap"):
+        (tmp_path / name).touch()
+    assert [file.name for file in files_of(tmp_path / "a.mcap")] == names
+    assert files_of(tmp_path / "none.mcap") == []
 
 
 def test_images_are_counted_in_all_files_and_a_broken_one_has_none(files, tmp_path):

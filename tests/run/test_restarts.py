@@ -58,6 +58,7 @@ def test_a_player_goes_on_where_its_path_would_be():
     again = going_on(player, {"played": "120", "begun": "1700000000.250000000"})
     assert again.all_parameters == {"path": "a.mcap", "begun": 1700000000.25}
     assert going_on(player, {"state": "waiting"}) is player
+    assert going_on(player, {"begun": "soon"}) is player
 
 
 def test_others_start_as_they_did():

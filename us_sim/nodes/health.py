@@ -56,6 +56,7 @@ class Health:
             DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
         )
         node.create_timer(1.0, self.report)
+        self._first = node.create_timer(0.01, self._report_first)
 
     def published(self, topic: str, stamp: TimeMessage | None = None) -> None:
         """One message went out on ``topic``; with a stamp, its age counts as latency."""
@@ -88,6 +89,11 @@ class Health:
     def problems(self, kind: str) -> int:
         """How many of that kind there were."""
         return self._problems[kind]
+
+    def _report_first(self) -> None:
+        """As soon as the node takes part: somebody waits for it."""
+        self._first.cancel()
+        self.report()
 
     def report(self) -> None:
         """Publish what there is to say: once a second, and when it must be known at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -11,7 +12,7 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 
-__all__ = ["Loss", "Outcome", "images_in"]
+__all__ = ["Loss", "Outcome", "files_of", "images_in"]
 
 IMAGES = "/ultrasound/image"
 TOLD = 4
@@ -88,6 +89,16 @@ class Outcome:
             "images_recorded": self.recorded,
             "files": [file.name for file in self.files],
         }
+
+
+def files_of(recording: Path) -> list[Path]:
+    """A recording's file and those in which it goes on: ``session.mcap``, ``session_1.mcap``, …"""
+    pattern = re.compile(rf"{re.escape(recording.stem)}((?:_\d+)*){re.escape(recording.suffix)}")
+    found = []
+    for file in recording.parent.glob("*"):
+        if match := pattern.fullmatch(file.name):
+            found.append(([int(number) for number in match[1].split("_")[1:]], file))
+    return [file for _, file in sorted(found)]
 
 
 def images_in(files: Sequence[Path]) -> int:

@@ -64,10 +64,11 @@ def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
         more: dict[str, object] = {
             "file": str(further_file(Path(str(process.all_parameters["file"]))))
         }
-    elif "begun" in report:
-        more = {"begun": float(report["begun"])}
     else:
-        return process
+        try:
+            more = {"begun": float(report["begun"])}
+        except (KeyError, ValueError):  # it does not play, or what it said is no number
+            return process
     return replace(process, given=process.given | more)
 
 

@@ -14,7 +14,7 @@ from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.domain_lock import alone_on_domain
 from us_sim.run.graph import INTERRUPTED, RECORDER, ProcessGroup, ending
-from us_sim.run.losses import Loss, Outcome, images_in
+from us_sim.run.losses import Loss, Outcome, files_of, images_in
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import Plan
 from us_sim.run.restarts import Restarts, going_on
@@ -47,7 +47,6 @@ class Supervisor:
         self, plan: Plan, group: ProcessGroup, monitor: Monitored, settings: SupervisionSettings
     ) -> None:
         self.losses: list[Loss] = []
-        self.files: list[Path] = []
         self.finished = False  # whether what is played is at its end, or given up
         self._plan, self._group, self._monitor = plan, group, monitor
         self._watch = Watch(settings.silence)
@@ -55,8 +54,9 @@ class Supervisor:
         self._away: dict[str, tuple[Loss, float]] = {}  # started again, and when they were lost
         self._were_ready: set[str] = set()
         self._processes = {process.node: process for process in plan.processes}
+        self._is_disk_full = False
+        self._older = self._recorded()
         self._began = time.monotonic()
-        self._note_file(RECORDER)
         group.start(plan.processes)
 
     @property
@@ -79,18 +79,19 @@ class Supervisor:
             self._group.end(node)
             self._lose(node, how, said)
         self._welcome()
+        self._look_at_the_disk()
 
     def end(self) -> None:
         """End all nodes; a recorder that had to be killed is lost."""
         if RECORDER in self._group.stop():
             loss = self._loss(RECORDER, "did not end when it was told to and was killed", "")
             loss.given_up = "its last messages may be missing"
-            self._note(loss)
+            self._note(loss, loss.given_up)
 
     def outcome(self, startup: float) -> Outcome:
         """How it went, once all has ended."""
         made = self._monitor.node.count(IMAGER, IMAGES)
-        files = [file for file in self.files if file.exists()]
+        files = [file for file in self._recorded() if file not in self._older]
         poses = None if self._plan.loops else self._plan.poses
         return Outcome(startup, self.losses, files, made, images_in(files), poses)
 
@@ -111,7 +112,7 @@ class Supervisor:
         """Note it, and start the node again if that may be."""
         loss = self._loss(node, what, said)
         loss.given_up = self._restarts.refused(node)
-        self._note(loss)
+        self._note(loss, loss.given_up or "it is started again")
         self._publish()
         if loss.given_up:
             self._away.pop(node, None)
@@ -121,7 +122,6 @@ class Supervisor:
         own = report.get("pid") == str(self._group.pids[node])
         process = going_on(self._processes[node], report if own else {})
         self._group.start([process])
-        self._note_file(node, process.all_parameters)
         self._away[node] = loss, time.monotonic()
 
     def _welcome(self) -> None:
@@ -137,20 +137,30 @@ class Supervisor:
     def _loss(self, node: str, what: str, said: str) -> Loss:
         return Loss(node, what, time.monotonic() - self._began, said)
 
-    def _note(self, loss: Loss) -> None:
+    def _note(self, loss: Loss, then: str = "") -> None:
         self.losses.append(loss)
         last = f", and last said: {loss.said}" if loss.said else ""
-        then = loss.given_up or "it is started again"
-        _say(f"{loss.node} {loss.what} after {loss.at:.1f} s{last}; {then}")
+        _say(f"{loss.node} {loss.what} after {loss.at:.1f} s{last}; {then}".removesuffix("; "))
 
     def _publish(self) -> None:
         """Tell diagnostics, which a recorder records."""
         self._monitor.node.tell_lost([str(loss) for loss in self.losses])
 
-    def _note_file(self, node: str, parameters: Mapping[str, object] | None = None) -> None:
-        if node == RECORDER in self._processes:
-            parameters = parameters or self._processes[RECORDER].all_parameters
-            self.files.append(Path(str(parameters["file"])))
+    def _look_at_the_disk(self) -> None:
+        """Note it when the recorder cannot write any more; it may again when there is room."""
+        node = self._monitor.node
+        is_full = "rejected disk" in node.reports.get(RECORDER, {})
+        if is_full and not self._is_disk_full:
+            what = f"could not write any more ({node.messages[RECORDER]})"
+            self._note(self._loss(RECORDER, what, ""))
+            self._publish()
+        self._is_disk_full = is_full
+
+    def _recorded(self) -> list[Path]:
+        """The files of the recording, with any that were there before."""
+        if RECORDER not in self._processes:
+            return []
+        return files_of(Path(str(self._processes[RECORDER].all_parameters["file"])))
 
 
 def follow(plan: Plan, log: Path | None, settings: SupervisionSettings) -> Outcome:
@@ -206,7 +216,7 @@ def _await_all(supervisor: Supervisor, monitor: Monitored, began: float) -> None
 
 
 def _stay(plan: Plan, supervisor: Supervisor, monitor: Monitored) -> None:
-    """Until the path is at its end, the time is up, or nothing can be recorded any more."""
+    """Until the path is at its end, or the time is up."""
     began = time.monotonic()
     ended: float | None = None
     plays = plan.poses is not None
@@ -218,8 +228,6 @@ def _stay(plan: Plan, supervisor: Supervisor, monitor: Monitored) -> None:
             now = time.monotonic()
             if now - began < RIVALRY_S:
                 monitor.refuse_earlier_run()
-            if "rejected disk" in monitor.node.reports.get(RECORDER, {}):
-                raise UsSimError(monitor.node.messages[RECORDER])
             done = _played(plan, monitor) if plays else now - began
             bar.update(min(done, total or done), _status(plan, monitor))
             if supervisor.finished and ended is None:
@@ -233,7 +241,7 @@ def _stay(plan: Plan, supervisor: Supervisor, monitor: Monitored) -> None:
 def _played(plan: Plan, monitor: Monitored) -> float:
     """How far what is played has come, in poses or images."""
     text = monitor.node.reports.get(plan.player, {}).get("played", "")
-    return float(text) if text.isdecimal() else 0.0
+    return float(text) if text.isdecimal() and len(text) < 12 else 0.0
 
 
 def _status(plan: Plan, monitor: Monitored) -> str:
