@@ -74,6 +74,11 @@ class Listener:
         while time.monotonic() < until:
             self._executor.spin_once(timeout_sec=0.02)
 
+    @property
+    def pids(self):
+        """The process of each node that reported last."""
+        return {node: int(report["pid"]) for node, report in self.monitor.reports.items()}
+
     def rate(self, since):
         """Images a second since a time on the monotonic clock."""
         return sum(t >= since for t in self.times) / (time.monotonic() - since)
@@ -108,18 +113,16 @@ def nodes_of(parent):
     return found
 
 
-def restart(listener, parent, node, number):
+def restart(listener, node, number):
     """End a node and wait until all is as before: it reports, and images come at their rate."""
-    before = nodes_of(parent)
+    before = listener.pids
     rate = listener.rate(time.monotonic() - 2.0)
     began = time.monotonic()
     os.kill(before[node], number)
     back = full = None
     while back is None or full is None:
         listener.spin(0.1)
-        now = nodes_of(parent)
-        pid = now.get(node, before[node])
-        if back is None and pid != before[node] and (node, pid) in listener.monitor.heard:
+        if back is None and listener.pids[node] != before[node]:
             back = time.monotonic() - began
         # What was on its way when the node ended does not make a window full.
         full = listener.full_since(began + 0.1, rate)
@@ -127,7 +130,8 @@ def restart(listener, parent, node, number):
             raise SystemExit(f"{node} was not back {LIMIT_S:g} s after {number.name}")
     makes_images = node not in ("session_recorder", "skin_deformer")
     seconds = full - began if makes_images else back
-    others = tuple(n for n in before if n != node and now.get(n) != before[n])
+    now = listener.pids
+    others = tuple(n for n in before if n != node and now[n] != before[n])
     return Restart(node, number, seconds, others)
 
 
@@ -145,6 +149,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--standby", action="store_true", help="as of `us-sim run`")
     parser.add_argument("--minutes", type=float, default=1e9, help="end after so long")
     asked = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -153,7 +158,8 @@ def main():
     scene = folder / "scene.yaml"
     scene.write_text(SCENE)
     listener = Listener()
-    run = start(folder, scene, "press_and_slide.mcap")
+    more = ["--standby"] if asked.standby else []
+    run = start(folder, scene, "press_and_slide.mcap", *more)
     done = []
     try:
         while len(listener.times) < 120:
@@ -162,8 +168,8 @@ def main():
         ends = time.monotonic() + 60.0 * asked.minutes
         while len(done) < asked.count and time.monotonic() < ends:
             listener.spin(2.0 + chance.random())
-            node = chance.choice(sorted(nodes_of(run.pid)))
-            done.append(restart(listener, run.pid, node, chance.choice(SIGNALS)))
+            node = chance.choice(sorted(listener.pids))
+            done.append(restart(listener, node, chance.choice(SIGNALS)))
             print(len(done), node, done[-1].number.name, f"{done[-1].seconds:.2f} s", flush=True)
             assert not done[-1].others, done[-1]
             for file in sorted(folder.glob("*.mcap"), key=lambda f: f.stat().st_mtime)[:-2]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import time
@@ -16,6 +17,7 @@ from rclpy.node import Node
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.standby import STANDBY, stand_by
 
 __all__ = ["INTERRUPTED", "run_node"]
 
@@ -33,12 +35,16 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
 
     A node with a ``finished`` future ends when that is done; told to end before, or while it is
     made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input is one
-    sentence on stderr and exit status 1.
+    sentence on stderr and exit status 1. With `STANDBY` in the environment it waits first.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
     try:
+        if os.environ.get(STANDBY) and not stand_by(create, args):
+            return INTERRUPTED
         rclpy.init(args=args)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
         return _refused(error)
     node: Any = None
@@ -60,7 +66,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
             node.destroy_node()
         with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
             rclpy.try_shutdown()
-    return 0
+    return _interrupted(node)
 
 
 def spin(node: Node) -> None:
@@ -120,7 +126,7 @@ class _Executor(SingleThreadedExecutor):
 
 
 def _interrupted(node: Any) -> int:
-    """The exit status of a node that was told to end."""
+    """The exit status of a node that ends without an error, or was told to end."""
     finished = getattr(node, "finished", None)
     return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
 

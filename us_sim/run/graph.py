@@ -39,8 +39,9 @@ Parameters = dict[str, dict[str, str]]
 _PR_SET_PDEATHSIG = 1
 _THIS_PROGRAM = ctypes.CDLL(None)
 _COMPLAINT = "us_sim: "
+# Of `us_sim.nodes.process` and `us_sim.nodes.standby`, which need rclpy.
 INTERRUPTED = 130
-"""Of `us_sim.nodes.process`, which needs rclpy."""
+STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 RECORDER = "session_recorder"
 STOP_S = 0.8
 """How long nodes may take to end before the recorder is told to."""
@@ -143,30 +144,27 @@ class ProcessGroup:
 
     def __init__(self, log: Path | None = None) -> None:
         self._running: dict[str, _Running] = {}
+        self._standbys: dict[str, _Running] = {}
         self._log_path = log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
 
     def start(self, processes: Iterable[NodeProcess]) -> None:
         """Start each from this very package; they end with this process, whatever happens to it.
 
-        A node of the same name that has ended is replaced.
+        A node of the same name that has ended is replaced, by one that stands by if there is one.
         """
-        package = str(Path(__file__).resolve().parents[2])
-        search = [package, os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
         for process in processes:
-            started = subprocess.Popen(
-                process.command(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                env=environment,
-                start_new_session=True,
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
-            )
-            self._running[process.node] = _Running(started, self._show)
+            standby = self._standbys.pop(process.node, None)
+            if standby is None or not standby.go_on(process, self._show):
+                standby = _Running(process, self._show)
+            self._running[process.node] = standby
+
+    def stand_by(self, process: NodeProcess) -> bool:
+        """Have a second process of a node; whether it is ready."""
+        standby = self._standbys.get(process.node)
+        if standby is None or standby.process.poll() is not None:
+            standby = self._standbys[process.node] = _Running(process, None)
+        return standby.said == STANDING_BY
 
     def _show(self, line: str) -> None:
         """Put a node's line where it belongs."""
@@ -236,7 +234,9 @@ class ProcessGroup:
         if RECORDER in self._running:
             self._running[RECORDER].wait_after_sigterm(RECORDER_STOP_S)
         killed = [node for node, running in self._running.items() if running.kill()]
-        for running in self._running.values():
+        for running in self._standbys.values():
+            running.kill()
+        for running in (*self._running.values(), *self._standbys.values()):
             running.reader.join(STOP_S)
         if self._log is not None:
             with contextlib.suppress(OSError):
@@ -245,10 +245,29 @@ class ProcessGroup:
 
 
 class _Running:
-    """A node's process, and the thread that reads what it says."""
+    """A node's process, and the thread that reads what it says.
 
-    def __init__(self, process: subprocess.Popen[str], show: Callable[[str], None]) -> None:
-        self.process = process
+    Args:
+        node: what it runs.
+        show: what is done with its lines; None for one that stands by.
+    """
+
+    def __init__(self, node: NodeProcess, show: Callable[[str], None] | None) -> None:
+        package = str(Path(__file__).resolve().parents[2])
+        search = [package, os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
+        self._node = node
+        self.process = subprocess.Popen(
+            node.command(),
+            stdin=subprocess.DEVNULL if show else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment if show else environment | {STANDBY: "1"},
+            start_new_session=True,
+            preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+        )
         self.complaint = ""  # why it cannot work
         self.said = ""
         self.told = False  # that it has ended
@@ -263,7 +282,22 @@ class _Running:
                 self.said = line.strip().removeprefix(_COMPLAINT).rpartition("]: ")[2]
             if line.startswith(_COMPLAINT):
                 self.complaint = self.said
-            self._show(line)
+            if self._show is not None:
+                self._show(line)
+
+    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
+        """Run the node in earnest after standing by; whether it can."""
+        assert self.process.stdin is not None
+        if self.said != STANDING_BY or node != self._node:
+            self.kill()
+            return False
+        self._show = show
+        try:
+            self.process.stdin.write("\n")
+            self.process.stdin.close()
+        except OSError:
+            return False
+        return True
 
     def tell_to_end(self) -> None:
         """SIGTERM, which one that was stopped gets, too."""

@@ -27,6 +27,8 @@ SETTLE_S = 1.2
 """After the path's end: the last images, and each node's last report, which comes every second."""
 RIVALRY_S = 5.0
 """After all nodes are ready: to see a simulation elsewhere that began at the same moment."""
+SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
+"""Nodes that take long to start, and hold no device that a second process could not have."""
 IMAGER, IMAGES = "slice_interpolator", "ultrasound/image"
 
 
@@ -55,6 +57,7 @@ class Supervisor:
         self._were_ready: set[str] = set()
         self._processes = {process.node: process for process in plan.processes}
         self._is_disk_full = False
+        self._standby = settings.standby
         self._older = self._recorded()
         self._began = time.monotonic()
         group.start(plan.processes)
@@ -80,6 +83,8 @@ class Supervisor:
             self._lose(node, how, said)
         self._welcome()
         self._look_at_the_disk()
+        if self._standby:
+            self._prepare()
 
     def end(self) -> None:
         """End all nodes; a recorder that had to be killed is lost."""
@@ -133,6 +138,15 @@ class Supervisor:
             loss.back_after = time.monotonic() - since
             self._publish()
             _say(f"{node} is back after {loss.back_after:.1f} s")
+
+    def _prepare(self) -> None:
+        """Have the next node stand by, one at a time, while all others run."""
+        if self.waiting:
+            return
+        for node in SLOW:
+            running = node in self._processes and self._group.is_running(node)
+            if running and not self._group.stand_by(self._processes[node]):
+                return
 
     def _loss(self, node: str, what: str, said: str) -> Loss:
         return Loss(node, what, time.monotonic() - self._began, said)

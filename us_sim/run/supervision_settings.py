@@ -27,3 +27,8 @@ class SupervisionSettings(Settings):
         "without a report after which a node hangs; six times as long while it works",
         default=10.0,
     )
+    standby: bool = setting(
+        description="keep a second process of each node that takes long to start, which takes over "
+        "at once; needs twice the memory",
+        default=False,
+    )
