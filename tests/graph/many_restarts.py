@@ -31,6 +31,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP)
 WINDOW_S = 0.5
 FULL = 0.9
 LIMIT_S = 60.0
+PATIENCE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Listener:
         for each in (node, self.monitor):
             self._executor.add_node(each)
         self.times = collections.deque(maxlen=10_000)
+        self.usual_rate = 0.0  # images a second
         node.create_subscription(
             Image, "ultrasound/image", lambda _: self.times.append(time.monotonic()), 100
         )
@@ -82,6 +84,16 @@ class Listener:
     def rate(self, since):
         """Images a second since a time on the monotonic clock."""
         return sum(t >= since for t in self.times) / (time.monotonic() - since)
+
+    def wait_for_full_rate(self):
+        """Until images come at their usual rate for two seconds, or that has become slower."""
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            self.spin(0.5)
+            rate = self.rate(time.monotonic() - 2.0)
+            if rate >= FULL * self.usual_rate:
+                break
+        self.usual_rate = max(self.rate(time.monotonic() - 2.0), 0.5 * self.usual_rate)
 
     def full_since(self, after, rate):
         """When a window began, after a time, in which images came at that rate; None if none."""
@@ -116,7 +128,7 @@ def nodes_of(parent):
 def restart(listener, node, number):
     """End a node and wait until all is as before: it reports, and images come at their rate."""
     before = listener.pids
-    rate = listener.rate(time.monotonic() - 2.0)
+    rate = listener.usual_rate
     began = time.monotonic()
     os.kill(before[node], number)
     back = full = None
@@ -168,6 +180,7 @@ def main():
         ends = time.monotonic() + 60.0 * asked.minutes
         while len(done) < asked.count and time.monotonic() < ends:
             listener.spin(2.0 + chance.random())
+            listener.wait_for_full_rate()
             node = chance.choice(sorted(listener.pids))
             done.append(restart(listener, node, chance.choice(SIGNALS)))
             print(len(done), node, done[-1].number.name, f"{done[-1].seconds:.2f} s", flush=True)

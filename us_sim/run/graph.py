@@ -47,7 +47,7 @@ STOP_S = 0.8
 """How long nodes may take to end before the recorder is told to."""
 RECORDER_STOP_S = 10.0
 """How long the recorder may take to write what it still holds."""
-HUNG_STOP_S = 1.0
+HUNG_STOP_S = 2.0
 """How long a node that hangs may take to end by itself, before it is killed."""
 
 
