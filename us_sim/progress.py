@@ -23,7 +23,7 @@ class Progress:
 
     def __init__(self, description: str, total: float | None = None, unit: str = "") -> None:
         layout = (
-            "{desc}: {postfix}"
+            "{desc}{postfix}"
             if total is None
             else (
                 "{desc}: {percentage:3.0f} %|{bar}| {n:.0f}/{total:.0f}"

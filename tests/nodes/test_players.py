@@ -23,10 +23,14 @@ STEP = 20_000_000
 @pytest.fixture
 def path(tmp_path):
     """Ten poses, 20 ms apart."""
-    stamps = EPOCH + STEP * np.arange(10)
+    return written(tmp_path / "path.mcap", STEP)
+
+
+def written(file, step):
+    """A path of ten poses, so many ns apart."""
+    stamps = EPOCH + step * np.arange(10)
     positions = np.zeros((10, 3))
     positions[:, 2] = np.arange(10) * 1e-3
-    file = tmp_path / "path.mcap"
     orientations = np.tile([0.0, 0, 0, 1], (10, 1))
     write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
     return file
@@ -46,6 +50,32 @@ def test_poses_are_played_in_order_at_their_pace_with_new_stamps(bench, path):
     assert abs(stamps[-1] - player.get_clock().now().nanoseconds) < 10e9
     assert 0.5 * 9 * STEP < stamps[-1] - stamps[0] < 10 * 9 * STEP
     assert (np.diff(stamps) > 0).all()
+
+
+def test_a_player_goes_on_where_a_path_that_began_earlier_would_be(bench, path, tmp_path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    first = bench.make(PathPlayer, path=str(path))
+    bench.spin_until(lambda: len(poses) == 10)
+    now = first.get_clock().now().nanoseconds
+    assert 0.0 < 1e-9 * now - float(first.health.values["begun"]) < 30.0
+    assert first.health.values["played"] == "10"
+    slow = written(tmp_path / "slow" / "slow.mcap", 100 * 10**9)
+    begun = round(1e-9 * now - 560.0, 6)
+    player = bench.make(PathPlayer, path=str(slow), begun=begun)
+    bench.spin_until(lambda: player.health.values)
+    assert player.health.values["played"] == "6"
+    assert float(player.health.values["begun"]) == pytest.approx(begun, abs=1e-5)
+
+
+@pytest.mark.parametrize(("loop", "ends"), [(False, True), (True, False)])
+def test_a_path_that_would_be_over_ends_unless_it_loops(bench, path, loop, ends):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), begun=1_700_000_000.0, loop=loop)
+    bench.spin_until(lambda: player.finished.done() if ends else len(poses) > 12)
+    assert player.finished.done() == ends
+    if ends:
+        bench.spin_until(lambda: poses)
+        assert [round(pose.pose.position.z * 1e3) for pose in poses] == [9]
 
 
 def test_recorded_stamps_can_be_kept(bench, path):

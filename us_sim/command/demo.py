@@ -6,7 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from us_sim.command.scene_options import add_network_option, add_scene_options, node_parameters
+from us_sim.command.scene_options import (
+    add_network_option,
+    add_scene_options,
+    add_supervision_options,
+    node_parameters,
+    supervision,
+)
 from us_sim.share import find_bag
 
 __all__ = ["add_demo"]
@@ -39,6 +45,7 @@ def add_demo(commands: Any) -> None:
         help="folder to write to; default: %(default)s",
     )
     add_scene_options(demo)
+    add_supervision_options(demo)
     add_network_option(demo)
     demo.set_defaults(command=_demo)
 
@@ -52,6 +59,7 @@ def _demo(args: argparse.Namespace) -> int:
         args.out,
         node_parameters(args.param),
         network=args.network,
+        supervision=supervision(args),
         source=args.source,
         path=args.path,
     )

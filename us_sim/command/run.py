@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from us_sim.command.scene_options import add_network_option, add_scene_options, node_parameters
+from us_sim.command.scene_options import (
+    add_network_option,
+    add_scene_options,
+    add_supervision_options,
+    node_parameters,
+    supervision,
+)
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -36,6 +42,7 @@ def add_run(commands: Any) -> None:
     run = commands.add_parser("run", help="run the nodes of a scene until Ctrl-C")
     run.add_argument("scene", help="scene file, or name of an installed one")
     add_setting_options(run, _Run)
+    add_supervision_options(run)
     run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
     add_scene_options(run)
@@ -65,4 +72,5 @@ def _run(args: argparse.Namespace) -> int:
         path=args.path,
         duration=asked.duration,
         network=args.network,
+        supervision=supervision(args),
     )

@@ -6,9 +6,17 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.errors import UsSimError
+from us_sim.run.supervision_settings import SupervisionSettings
 
-__all__ = ["add_network_option", "add_scene_options", "node_parameters"]
+__all__ = [
+    "add_network_option",
+    "add_scene_options",
+    "add_supervision_options",
+    "node_parameters",
+    "supervision",
+]
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +36,20 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 def add_network_option(parser: argparse.ArgumentParser) -> None:
     """Whether other machines are talked to."""
     parser.add_argument("--network", action="store_true", help="talk beyond this host")
+
+
+def add_supervision_options(parser: argparse.ArgumentParser) -> None:
+    """When a node hangs, and how often one is started again."""
+    add_setting_options(parser, SupervisionSettings)
+
+
+def supervision(args: argparse.Namespace) -> SupervisionSettings:
+    """What these options say.
+
+    Raises:
+        UsSimError: a value will not do.
+    """
+    return read_settings(args, SupervisionSettings)
 
 
 def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -192,13 +192,13 @@ def _areas(areas: LumenAreas) -> dict[str, Any]:
     return result
 
 
-def read_session(file: Path) -> Session:
-    """Read a session that `session_recorder` wrote.
+def read_session(file: Path, *further: Path) -> Session:
+    """Read a session that `session_recorder` wrote, and those that went on with it.
 
     Raises:
-        BagError: the file cannot be read.
+        BagError: a file cannot be read.
     """
-    bag = read_bag(file)
+    bag = read_bag(file, *further)
     poses: dict[int, Pose] = {}
     nodes: dict[int, NDArray[np.float64]] = {}
     sent: dict[str, list[tuple[int, int, int]]] = {}

@@ -57,6 +57,7 @@ class CameraDriver(GuardedNode):
         self._awaited = Awaited(self)
         self._grey = settings.encoding == "mono8"
         self._latency = round(1e9 * settings.latency)
+        self._begun = round(1e9 * settings.begun)  # ns, when a file's first image was due
         self._camera = read_camera_info(Path(info).expanduser()) if info else None
         size = (self._camera.width, self._camera.height) if self._camera else None
         self._video = VideoSource(source, size=size, rate=settings.rate)
@@ -135,15 +136,18 @@ class CameraDriver(GuardedNode):
                 return
             there = self._images.get_subscription_count() and self._awaited.are_there()
             checks = checks + 1 if there else 0
-        begun, number = self.get_clock().now().nanoseconds, 0
+        there, number = self.get_clock().now().nanoseconds, 0
+        begun = self._begun if 0 < self._begun < there else there
         shown = True
         while not self._closing.is_set():
             due = begun + round(1e9 * number * self._video.interval)
             now = self.get_clock().now().nanoseconds
+            self.health.values = {"played": str(number), "begun": f"{1e-9 * begun:.9f}"}
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
             # It was exposed when it was due, however long it takes to decode.
-            if self._video.grab() is None or not (shown := self._keep(due)):
+            # One that was due before this process was there is passed over.
+            if self._video.grab() is None or not (due < there or (shown := self._keep(due))):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter, deque
 
@@ -54,7 +55,8 @@ class Health:
         self._publisher = node.create_publisher(
             DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
         )
-        node.create_timer(1.0, self._publish)
+        node.create_timer(1.0, self.report)
+        self._first = node.create_timer(0.01, self._report_first)
 
     def published(self, topic: str, stamp: TimeMessage | None = None) -> None:
         """One message went out on ``topic``; with a stamp, its age counts as latency."""
@@ -88,7 +90,13 @@ class Health:
         """How many of that kind there were."""
         return self._problems[kind]
 
-    def _publish(self) -> None:
+    def _report_first(self) -> None:
+        """As soon as the node takes part: somebody waits for it."""
+        self._first.cancel()
+        self.report()
+
+    def report(self) -> None:
+        """Publish what there is to say: once a second, and when it must be known at once."""
         now = self._node.get_clock().now()
         elapsed = max(now.nanoseconds - self._last_time, 1) * 1e-9
         total = max(self._published.values(), default=0)
@@ -96,6 +104,7 @@ class Health:
         self._last_time, self._last_total = now.nanoseconds, total
         values = {
             "state": self.state,
+            "pid": str(os.getpid()),
             "rate_hz": f"{rate:.1f}",
             "received": str(self.received),
             "dropped": str(self.dropped),

@@ -47,7 +47,7 @@ class PathPlayer(GuardedNode):
         self._path = read_path(path, settings.topic)
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
-        self._begun = 0
+        self._begun = round(1e9 * settings.begun)  # ns
         self._half_period = 0.0
         self._checks = 0
         self.finished = Future()
@@ -77,16 +77,34 @@ class PathPlayer(GuardedNode):
         if self._checks < CHECKS:
             return
         self._starting.cancel()
-        self._begun = self.get_clock().now().nanoseconds
         self.health.state = "playing"
-        self.get_logger().info("playing")
         if self._lockstep:
             self._send()
             return
         steps = np.diff(self._path.log_times)
         period = float(np.median(steps)) * 1e-9 / self._rate if len(steps) else 0.01
         self._half_period = 0.5e9 * period
+        now = self.get_clock().now().nanoseconds
+        if not 0 < self._begun < now:
+            self._begun = now
+        self._skip(now)
+        self.get_logger().info(f"playing from pose {self._next}")
+        self._say_progress()
+        self.health.report()
         self.create_timer(max(period, 1e-4), self._tick)
+
+    def _skip(self, now: int) -> None:
+        """Go where a path that began earlier is by now, ns: round and round if it loops."""
+        ages = (self._path.log_times - self._path.log_times[0]) / self._rate
+        turn = int(ages[-1] + 2 * self._half_period)
+        if self._loop and turn > 0:
+            self._begun += max(now - self._begun, 0) // turn * turn
+        due = ages <= now - self._begun - self._half_period
+        self._next = min(int(due.sum()), self.pose_count - 1)
+
+    def _say_progress(self) -> None:
+        """Tell diagnostics what it takes to go on from here in another process."""
+        self.health.values = {"played": str(self._next), "begun": f"{1e-9 * self._begun:.9f}"}
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
@@ -116,6 +134,7 @@ class PathPlayer(GuardedNode):
 
     def _advance(self) -> None:
         self._next += 1
+        self._say_progress()
         if self._next < self.pose_count:
             return
         if self._loop:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import time
@@ -16,8 +17,12 @@ from rclpy.node import Node
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.standby import STANDBY, stand_by
 
-__all__ = ["run_node"]
+__all__ = ["INTERRUPTED", "run_node"]
+
+INTERRUPTED = 130
+"""The exit status of a node that was told to end before its work was done."""
 
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
@@ -28,13 +33,18 @@ _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
 
-    A node with a ``finished`` future ends when that is done. Bad input is one sentence on stderr
-    and exit status 1.
+    A node with a ``finished`` future ends when that is done; told to end before, or while it is
+    made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input is one
+    sentence on stderr and exit status 1. With `STANDBY` in the environment it waits first.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
     try:
+        if os.environ.get(STANDBY) and not stand_by(create, args):
+            return INTERRUPTED
         rclpy.init(args=args)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
         return _refused(error)
     node: Any = None
@@ -42,21 +52,21 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         node = create()
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        return _interrupted(node)
     except (UsSimError, ParameterException) as error:
         return _refused(error)
     except Exception:
         if rclpy.ok():
             raise
-        return 0  # a compiler, say, that a signal breaks off fails with an error of its own
+        return _interrupted(node)  # a compiler that a signal breaks off fails with its own error
     finally:
+        for number in _ENDINGS:
+            signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
         if node is not None:
             node.destroy_node()
         with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
             rclpy.try_shutdown()
-        for number in _ENDINGS:
-            signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status
-    return 0
+    return _interrupted(node)
 
 
 def spin(node: Node) -> None:
@@ -113,6 +123,12 @@ class _Executor(SingleThreadedExecutor):
             raise failure
 
         return fail
+
+
+def _interrupted(node: Any) -> int:
+    """The exit status of a node that ends without an error, or was told to end."""
+    finished = getattr(node, "finished", None)
+    return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
 
 
 def _interrupt_once(*_: object) -> None:

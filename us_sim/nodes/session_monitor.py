@@ -1,32 +1,79 @@
-"""Follows what the nodes of a session report on `diagnostics`."""
+"""Follows what the nodes of a session report on `diagnostics`, and reports what was lost."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
 from us_sim.nodes.qos import EVERY
 
 __all__ = ["SessionMonitor"]
 
+TOLD = 50
+"""Losses that a report tells one by one, the newest."""
+
 
 class SessionMonitor(GuardedNode):
-    """Keeps the last report of each node, by its name without namespace."""
+    """Keeps the reports of each node, by its name without namespace.
 
-    def __init__(self, **kwargs: Any) -> None:
+    Args:
+        nodes: that are followed.
+        run: a name for the run that this monitor is of, which no other has.
+    """
+
+    def __init__(self, nodes: Collection[str] = (), run: str = "", **kwargs: Any) -> None:
         super().__init__("session_monitor", **kwargs)
-        self.reports: dict[str, dict[str, str]] = {}
-        self.messages: dict[str, str] = {}
+        self._nodes, self._run = frozenset(nodes), run
+        self.reports: dict[str, dict[str, str]] = {}  # the last of each node
+        self.messages: dict[str, str] = {}  # likewise
+        self.heard: Counter[tuple[str, int]] = Counter()  # reports by node and process
+        self.other_runs: set[str] = set()
+        self._published: dict[tuple[str, int], dict[str, int]] = {}
+        self.health = Health(self, run)
+        self.health.state = "following"
         self.create_subscription(DiagnosticArray, "diagnostics", self._take, EVERY)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.rsplit("/", 1)[-1]
-            self.reports[name] = {item.key: item.value for item in status.values}
+            if name == self.get_name() and status.hardware_id not in ("", self._run):
+                self.other_runs.add(status.hardware_id)
+            if name not in self._nodes:
+                continue
+            report = {item.key: item.value for item in status.values}
+            self.reports[name] = report
             self.messages[name] = status.message
+            process = name, _number(report.get("pid", ""))
+            self.heard[process] += 1
+            self._published[process] = {
+                key.removeprefix("published "): _number(value)
+                for key, value in report.items()
+                if key.startswith("published ")
+            }
+
+    def tell_lost(self, losses: Sequence[str]) -> None:
+        """Report what was lost so far, each in words, at once and from now on."""
+        first = max(len(losses) - TOLD, 0)
+        told = {f"lost {i}": text for i, text in enumerate(losses[first:], first + 1)}
+        self.health.values = {"lost": str(len(losses)), **told}
+        self.health.warning = losses[-1]
+        self.health.report()
 
     def count(self, node: str, topic: str) -> int:
-        """How many messages ``node`` says it has published (or recorded) on ``topic``."""
-        return int(self.reports.get(node, {}).get(f"published {topic}", 0))
+        """How many messages ``node`` says it has published (or recorded) on ``topic``.
+
+        Those that it published before it was started again count, too.
+        """
+        return sum(
+            counts.get(topic, 0) for (name, _), counts in self._published.items() if name == node
+        )
+
+
+def _number(text: str) -> int:
+    """The number in a report of whoever may write there; 0 where it is none."""
+    return int(text) if text.isdecimal() and len(text) < 20 else 0

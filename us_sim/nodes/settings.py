@@ -47,6 +47,7 @@ _MARKERS = Quantity("frequency", 0.1, 1000.0)
 _AGE = Quantity("time", 0.01, 3600.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
+_BEGUN = Quantity("time", 0.0, 1e10)
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,12 @@ class PathPlayerSettings(Settings):
     lockstep: bool = setting(
         description="send the next pose when the image of the last has come", default=False
     )
+    begun: float = setting(
+        _BEGUN,
+        "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
+        "the start",
+        default=0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -247,6 +254,12 @@ class CameraDriverSettings(Settings):
     latency: float = setting(
         Quantity("time", -1.0, 10.0),
         "from the middle of the exposure to the image's arrival",
+        default=0.0,
+    )
+    begun: float = setting(
+        _BEGUN,
+        "since 1970, when a file's first image was shown: play on where it would be by now; 0: "
+        "from the start",
         default=0.0,
     )
 

@@ -34,7 +34,7 @@ _IN_PLACE_OF_DRIVERS = {"path_player", "camera_driver", "space_mouse_driver"}
 _REPORTING = (
     *("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"),
     *("haptic_renderer", "openigtlink_bridge", "path_player", "session_player"),
-    *("session_recorder", "camera_driver", "space_mouse_driver"),
+    *("session_recorder", "camera_driver", "space_mouse_driver", "session_monitor"),
 )
 
 TOPICS = (
@@ -235,7 +235,8 @@ TOPICS = (
     Topic(
         "diagnostics",
         "diagnostic_msgs/DiagnosticArray",
-        "once a second: state, rate, latency, what was dropped or refused",
+        "once a second: state, rate, latency, what was dropped or refused; of `session_monitor` "
+        "which nodes ended or hung",
         publishers=_REPORTING,
         subscribers=("session_monitor",),
     ),

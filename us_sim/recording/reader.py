@@ -229,12 +229,13 @@ def _count(text: str) -> int:
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
 
 
-def read_bag(path: str | Path) -> Bag:
+def read_bag(path: str | Path, *further: Path) -> Bag:
     """Opens a bag for reading.
 
     Args:
         path: an MCAP or SQLite file, either of them compressed with zstd, or a folder with such
             files, with or without their ``metadata.yaml``.
+        further: files in which the recording goes on.
 
     Raises:
         BagError: there is no bag, or it cannot be read; a file that is only cut off can.
@@ -243,6 +244,7 @@ def read_bag(path: str | Path) -> Bag:
     try:
         files, metadata = bag_files(path)
         scratch = Scratch()
-        return Bag(path, [open_storage(file, scratch) for file in files], metadata, scratch)
+        storages = [open_storage(file, scratch) for file in (*files, *further)]
+        return Bag(path, storages, metadata, scratch)
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -27,6 +27,7 @@ __all__ = [
     "NodeProcess",
     "Parameters",
     "ProcessGroup",
+    "ending",
     "keep_on_this_host",
     "parameters_file",
     "player_settings",
@@ -40,8 +41,17 @@ Parameters = dict[str, dict[str, str]]
 
 _PR_SET_PDEATHSIG = 1
 _THIS_PROGRAM = ctypes.CDLL(None)
+_COMPLAINT = "us_sim: "
+# Of `us_sim.nodes.process` and `us_sim.nodes.standby`, which need rclpy.
+INTERRUPTED = 130
+STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
+RECORDER = "session_recorder"
 STOP_S = 0.8
-"""How long nodes may take to end before the recorder is told to; then as long again at most."""
+"""How long nodes may take to end before the recorder is told to."""
+RECORDER_STOP_S = 10.0
+"""How long the recorder may take to write what it still holds."""
+HUNG_STOP_S = 2.0
+"""How long a node that hangs may take to end by itself, before it is killed."""
 
 
 @dataclass(frozen=True)
@@ -149,98 +159,197 @@ class ProcessGroup:
     """
 
     def __init__(self, log: Path | None = None) -> None:
-        self._processes: dict[str, subprocess.Popen[str]] = {}
-        self._readers: list[threading.Thread] = []
-        self._complaints: dict[str, str] = {}
+        self._running: dict[str, _Running] = {}
+        self._standbys: dict[str, _Running] = {}
         self._log_path = log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
 
-    def start(self, processes: Sequence[NodeProcess]) -> None:
-        """Start each from this very package; they end with this process, whatever happens to it."""
-        package = str(Path(__file__).resolve().parents[2])
-        search = [package, os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
-        for process in processes:
-            started = subprocess.Popen(
-                process.command(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                env=environment,
-                start_new_session=True,
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
-            )
-            self._processes[process.node] = started
-            reader = threading.Thread(target=self._pass_on, args=(process.node, started))
-            self._readers.append(reader)
-        for reader in self._readers:
-            reader.start()
+    def start(self, processes: Iterable[NodeProcess]) -> None:
+        """Start each from this very package; they end with this process, whatever happens to it.
 
-    def _pass_on(self, node: str, process: subprocess.Popen[str]) -> None:
-        """Put a node's lines where they belong; keep the one that says why it cannot work."""
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("us_sim: "):
-                self._complaints[node] = line.removeprefix("us_sim: ").strip()
-            if self._log is not None:
-                with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
-                    self._log.write(line)
-                    self._log.flush()
-            elif node not in self._complaints:
-                tqdm.write(line.rstrip(), file=sys.stderr)
+        A node of the same name that has ended is replaced, by one that stands by if there is one.
+        """
+        for process in processes:
+            standby = self._standbys.pop(process.node, None)
+            if standby is None or not standby.go_on(process, self._show):
+                standby = _Running(process, self._show)
+            self._running[process.node] = standby
+
+    def stand_by(self, process: NodeProcess) -> bool:
+        """Have a second process of a node; whether it is ready."""
+        standby = self._standbys.get(process.node)
+        if standby is None or standby.process.poll() is not None:
+            standby = self._standbys[process.node] = _Running(process, None)
+        return standby.said == STANDING_BY
+
+    def _show(self, line: str) -> None:
+        """Put a node's line where it belongs."""
+        if self._log is not None:
+            with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
+                self._log.write(line)
+                self._log.flush()
+        elif not line.startswith(_COMPLAINT):  # which is said when the node has ended
+            tqdm.write(line.rstrip(), file=sys.stderr)
 
     @property
     def pids(self) -> dict[str, int]:
-        """The processes' numbers by node."""
-        return {node: process.pid for node, process in self._processes.items()}
+        """The processes' numbers by node, also of those that have ended."""
+        return {node: running.process.pid for node, running in self._running.items()}
 
     def is_running(self, node: str) -> bool:
         """Whether that node was started and has not ended."""
-        process = self._processes.get(node)
-        return process is not None and process.poll() is None
+        running = self._running.get(node)
+        return running is not None and running.process.poll() is None
+
+    def take_ended(self) -> dict[str, int]:
+        """The exit status of each node that has ended; it is told once."""
+        ended = {}
+        for node, running in self._running.items():
+            status = running.process.poll()
+            if status is not None and not running.told:
+                running.told = True
+                running.reader.join(STOP_S)
+                ended[node] = status
+        return ended
+
+    def last_words(self, node: str) -> str:
+        """The last line of a node's output, without what its logger puts before it."""
+        return self._running[node].said
 
     def check(self) -> None:
         """Raise UsSimError, in the node's own words, when one has ended with an error."""
-        for (node, process), reader in zip(self._processes.items(), self._readers, strict=True):
-            status = process.poll()
+        for node, status in self.take_ended().items():
             if status:
-                reader.join(STOP_S)
-                see = f"; see {self._log_path}" if self._log_path else ""
-                complaint = f"{node} ended with status {status}{see}"
-                raise UsSimError(self._complaints.get(node, complaint))
+                raise self.failure(node, status)
 
-    def stop(self) -> None:
-        """End every process: SIGTERM first, the recorder after the others, SIGKILL at the last.
+    def failure(self, node: str, status: int) -> UsSimError:
+        """Why a node cannot work, in its own words where it has said so."""
+        see = f"; see {self._log_path}" if self._log_path else ""
+        complaint = self._running[node].complaint
+        return UsSimError(complaint or f"{node} {ending(status)}{see}")
 
-        Unlike SIGINT, SIGTERM ends a process without a word while it is still importing.
+    def end(self, node: str) -> None:
+        """End one that hangs: it may do so by itself for a moment, also if it was stopped."""
+        running = self._running[node]
+        running.wait_after_sigterm(HUNG_STOP_S)
+        running.kill()
+        running.told = True
+
+    def stop(self) -> list[str]:
+        """End every process; the names of those that had to be killed.
+
+        SIGTERM first, the recorder after the others, SIGKILL at the last. Unlike SIGINT, SIGTERM
+        ends a process without a word while it is still importing.
         """
-        recorder = "session_recorder"
-        self._terminate([node for node in self._processes if node != recorder])
-        self._terminate([recorder] if recorder in self._processes else [])
-        for process in self._processes.values():
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-        for reader in self._readers:
-            if reader.is_alive():
-                reader.join(STOP_S)
+        others = [running for node, running in self._running.items() if node != RECORDER]
+        deadline = time.monotonic() + STOP_S
+        for running in others:
+            running.tell_to_end()
+        for running in others:
+            running.wait(deadline - time.monotonic())
+        if RECORDER in self._running:
+            self._running[RECORDER].wait_after_sigterm(RECORDER_STOP_S)
+        killed = [node for node, running in self._running.items() if running.kill()]
+        for running in self._standbys.values():
+            running.kill()
+        for running in (*self._running.values(), *self._standbys.values()):
+            running.reader.join(STOP_S)
         if self._log is not None:
             with contextlib.suppress(OSError):
                 self._log.close()
+        return killed
 
-    def _terminate(self, nodes: list[str]) -> None:
-        waiting = [self._processes[node] for node in nodes]
-        for process in waiting:
-            if process.poll() is None:
-                process.terminate()
-        deadline = time.monotonic() + STOP_S
-        for process in waiting:
-            try:
-                process.wait(max(deadline - time.monotonic(), 0.0))
-            except subprocess.TimeoutExpired:
-                process.kill()
+
+class _Running:
+    """A node's process, and the thread that reads what it says.
+
+    Args:
+        node: what it runs.
+        show: what is done with its lines; None for one that stands by.
+    """
+
+    def __init__(self, node: NodeProcess, show: Callable[[str], None] | None) -> None:
+        package = str(Path(__file__).resolve().parents[2])
+        search = [package, os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
+        self._node = node
+        self.process = subprocess.Popen(
+            node.command(),
+            stdin=subprocess.DEVNULL if show else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment if show else environment | {STANDBY: "1"},
+            start_new_session=True,
+            preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+        )
+        self.complaint = ""  # why it cannot work
+        self.said = ""
+        self.told = False  # that it has ended
+        self._show = show
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.strip():
+                self.said = line.strip().removeprefix(_COMPLAINT).rpartition("]: ")[2]
+            if line.startswith(_COMPLAINT):
+                self.complaint = self.said
+            if self._show is not None:
+                self._show(line)
+
+    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
+        """Run the node in earnest after standing by; whether it can."""
+        assert self.process.stdin is not None
+        if self.said != STANDING_BY or node != self._node:
+            self.kill()
+            return False
+        self._show = show
+        try:
+            self.process.stdin.write("\n")
+            self.process.stdin.close()
+        except OSError:
+            return False
+        return True
+
+    def tell_to_end(self) -> None:
+        """SIGTERM, which one that was stopped gets, too."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            self.process.send_signal(signal.SIGCONT)
+
+    def wait(self, seconds: float) -> None:
+        """Wait for its end, at most so long."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(max(seconds, 0.0))
+
+    def wait_after_sigterm(self, seconds: float) -> None:
+        """Tell it to end, and wait at most so long."""
+        self.tell_to_end()
+        self.wait(seconds)
+
+    def kill(self) -> bool:
+        """End it for certain; whether it had not ended by itself."""
+        if self.process.poll() is not None:
+            return False
+        self.process.kill()
+        self.wait(STOP_S)  # one that waits for a disk ends when that answers
+        return True
+
+
+def ending(status: int) -> str:
+    """What an exit status says, for a person: negative ones are signals."""
+    if status == INTERRUPTED:
+        return "was told to end by a signal"
+    if status >= 0:
+        return f"ended with status {status}"
+    try:
+        return f"was ended by {signal.Signals(-status).name}"
+    except ValueError:
+        return f"was ended by signal {-status}"
 
 
 def _end_with_parent() -> None:

@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.progress import Progress
 from us_sim.run.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
-from us_sim.run.supervision import Monitored, follow, plan_of
+from us_sim.run.losses import Outcome
+from us_sim.run.monitored import Monitored
+from us_sim.run.plan import plan_of
+from us_sim.run.supervision import follow
+from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -60,14 +65,21 @@ def run(
     path: Path | None,
     duration: float | None,
     network: bool,
+    supervision: SupervisionSettings,
 ) -> int:
-    """Run a scene until its path ends, the duration is over, or Ctrl-C."""
+    """Run a scene until its path ends, the duration is over, or Ctrl-C.
+
+    Raises:
+        UsSimError: bad input, or something was lost: a node ended or hung, images were not
+            recorded.
+    """
     keep_on_this_host(network=network)
     plan = plan_of(scene, parameters, record=record, path=path, duration=duration)
     prepare_volume(scene)
-    follow(plan, log=None)
-    if record is not None:
-        print(f"recorded to {record}")
+    outcome = follow(plan, None, supervision)
+    for file in outcome.files:
+        print(f"recorded to {file}")
+    _require_nothing_lost(outcome)
     return 0
 
 
@@ -78,6 +90,7 @@ def demo(
     parameters: Parameters,
     *,
     network: bool,
+    supervision: SupervisionSettings,
     source: str | None = None,
     path: Path | None = None,
 ) -> int:
@@ -89,12 +102,14 @@ def demo(
         out: folder to write to.
         parameters: given by a person, by node.
         network: talk beyond this host.
+        supervision: when a node hangs, and how often it is started again.
         source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
             None is the one that the scene's tracker asks for.
         path: bag or recording that is played in place of the scene's own path.
 
     Raises:
-        UsSimError: bad input, ``out`` already holds a session, or a node failed.
+        UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
+            or hung, images were not recorded.
     """
     keep_on_this_host(network=network)
     scene = load_scene(name, volume=volume)
@@ -119,8 +134,19 @@ def demo(
     plan = plan_of(scene, parameters, record=recording, path=played, video=video)
     prepare_volume(scene)
     started = time.monotonic()
-    startup = follow(plan, log=out / "nodes.log")
-    return _report(scene, out, recording, startup, time.monotonic() - started, video)
+    outcome = follow(plan, out / "nodes.log", supervision)
+    try:
+        _report(scene, out, outcome, time.monotonic() - started, video)
+    except UsSimError as error:
+        lost = outcome.sentence()
+        if not lost:
+            raise
+        from us_sim.demo.session import write_summary
+
+        write_summary({"scene": scene.name, "lost": outcome.summary()}, out / "summary.json")
+        raise UsSimError(f"{lost}; {error}") from error
+    _require_nothing_lost(outcome)
+    return 0
 
 
 def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:
@@ -140,7 +166,7 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
     else:
         count = len(read_path(bag, topic or None))
         process = NodeProcess("path_player", settings | {"topic": topic})
-    group = ProcessGroup()
+    group, watch = ProcessGroup(), Watch(SupervisionSettings().silence)
     try:
         with (
             contextlib.closing(Monitored([process.node])) as monitor,
@@ -149,6 +175,8 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
             group.start([process])
             while group.is_running(process.node):
                 monitor.spin()
+                for how in watch.look(group.pids, monitor.node.heard).values():
+                    raise UsSimError(f"{process.node} {how}, and what it plays is not at its end")
                 report = monitor.node.reports.get(process.node, {})
                 done = sum(int(v) for k, v in report.items() if k.startswith("published "))
                 state = report.get("state", "starting")
@@ -211,23 +239,26 @@ def _require_a_cache() -> None:
         ) from error
 
 
+def _require_nothing_lost(outcome: Outcome) -> None:
+    """Raise UsSimError, so that the status says it, when something was."""
+    lost = outcome.sentence()
+    if lost:
+        raise UsSimError(lost)
+
+
 def _report(
-    scene: Scene,
-    out: Path,
-    recording: Path,
-    startup: float,
-    wall: float,
-    video: PathVideo | None,
-) -> int:
+    scene: Scene, out: Path, outcome: Outcome, wall: float, video: PathVideo | None
+) -> None:
     """Summary and contact sheet of what was recorded, and one paragraph for the person."""
     from us_sim.demo.contact_sheet import contact_sheet
     from us_sim.demo.session import read_session, write_summary
 
     with Progress("measuring the recording", 100, "%") as bar:
-        session = read_session(recording)
+        session = read_session(*outcome.files)
         areas = session.lumen_areas(scene, 120, lambda done: bar.update(100 * done))
     summary = session.summary(areas)
-    summary |= {"scene": scene.name, "startup_s": round(startup, 2), "wall_s": round(wall, 2)}
+    summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
+    summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
     tracked = None
     if video is not None:
         from us_sim.demo.tracked_path import tracked_path
@@ -250,6 +281,6 @@ def _report(
             f"{vessel}: {summary['areas'][f'{vessel}_change_at_full_press']:+.0%} at full press, "
             f"{summary['areas'][f'{vessel}_change_after_release']:+.1%} after release"
         )
-    for file in ("session.mcap", "contact_sheet.png", "summary.json", "nodes.log"):
-        print(out / file)
-    return 0
+    recorded = [file.name for file in outcome.files]
+    for name in (*recorded, "contact_sheet.png", "summary.json", "nodes.log"):
+        print(out / name)

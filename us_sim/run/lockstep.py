@@ -21,7 +21,7 @@ from us_sim.run.graph import (
 )
 from us_sim.run.in_process import node_in_process
 from us_sim.run.live import prepare_volume
-from us_sim.run.supervision import refuse_unknown
+from us_sim.run.monitored import refuse_unknown
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 

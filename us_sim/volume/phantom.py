@@ -19,8 +19,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.phantom_cache import kept_volume
 from us_sim.volume.settings import SEED, VOXEL_SIZE
-from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
-from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
 from us_sim.volume.volume import Volume
 
 __all__ = ["cached_phantom", "upper_arm"]
@@ -51,6 +49,10 @@ def upper_arm(
     Raises:
         VolumeError: the seed or the voxel size is out of range.
     """
+    # A phantom that is kept needs none of it, and a node should start quickly.
+    from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
+    from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+
     for name, quantity, value in (("seed", SEED, seed), ("voxel size", VOXEL_SIZE, voxel_size)):
         try:
             quantity.parse(value)

@@ -1,0 +1,168 @@
+"""Nodes ended from outside come back, nobody else is started again, and what was lost is said."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from many_restarts import nodes_of
+
+from us_sim.errors import BagError
+from us_sim.recording.reader import read_bag
+from us_sim.run.graph import NodeProcess, ProcessGroup
+
+IMAGES = "/ultrasound/image"
+ENDED = {
+    "slice_interpolator": (signal.SIGKILL, "was ended by SIGKILL"),
+    "tissue_deformer": (signal.SIGTERM, "ended with status 0"),
+    "session_recorder": (signal.SIGSTOP, "was stopped (SIGSTOP)"),
+}
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+
+
+def started(*words, cwd):
+    """`us-sim WORDS` in a process of its own."""
+    command = [sys.executable, "-m", "us_sim", *map(str, words)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=cwd)
+
+
+def wait_until(condition, process):
+    """Wait while the process runs."""
+    deadline = time.monotonic() + 100
+    while not condition():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)  # what runs needs this core
+
+
+def images_in(recording):
+    """Their number so far."""
+    try:
+        topics = read_bag(recording).topics
+    except BagError:
+        return 0
+    return sum(topic.message_count for topic in topics if topic.name == IMAGES)
+
+
+def test_nodes_that_end_are_back_and_the_rest_goes_on(played_scene, tmp_path):
+    out = tmp_path / "out"
+    options = ["--out", out, "--restarts", "1", "--param", "path_player.loop=true"]
+    demo = started("demo", played_scene, *options, cwd=tmp_path)
+    try:
+        wait_until(lambda: images_in(out / "session.mcap") > 20, demo)
+        before = nodes_of(demo.pid)
+        for node, (number, _) in ENDED.items():
+            os.kill(before[node], number)
+        further = out / "session_1.mcap"
+        wait_until(lambda: images_in(further) > 20, demo)
+        after = nodes_of(demo.pid)
+        assert before.keys() == after.keys()
+        assert {node for node in after if after[node] != before[node]} == set(ENDED)
+        gone = after["path_player"]
+        os.kill(gone, signal.SIGKILL)
+        wait_until(lambda: nodes_of(demo.pid).get("path_player", gone) != gone, demo)
+        # The second time it is given up, so no pose is to come any more, and the demo ends.
+        os.kill(nodes_of(demo.pid)["path_player"], signal.SIGKILL)
+        said = demo.communicate(timeout=60)[1]
+    finally:
+        demo.kill()
+    assert demo.returncode == 1
+    assert "Traceback" not in said
+    told = said.splitlines()[-1]
+    summary = json.loads((out / "summary.json").read_text())
+    lost = {loss["node"]: loss for loss in summary["lost"]["nodes"]}
+    for node, (_, what) in ENDED.items():
+        assert f"{node} {what} after " in said
+        assert lost[node]["what"] == what
+        assert 0 < lost[node]["back_after_s"] < 60
+        assert f"{node} {what} at " in told or "more times" in told
+    assert lost["path_player"]["given_up"] == "is not started again after 1 restart"
+    assert summary["lost"]["files"] == ["session.mcap", "session_1.mcap"]
+    assert summary["images_out"] == summary["lost"]["images_recorded"]
+    assert summary["images_out"] == images_in(out / "session.mcap") + images_in(further)
+    assert "the recording is in session.mcap and session_1.mcap" in told
+    # The recording says it by itself, too.
+    assert "slice_interpolator was ended by SIGKILL" in str(summary["nodes"]["session_monitor"])
+
+
+def test_of_two_simulations_at_once_one_is_refused(played_scene, tmp_path):
+    runs = [started("run", played_scene, cwd=tmp_path) for _ in range(2)]
+    try:
+        deadline = time.monotonic() + 60
+        while all(run.poll() is None for run in runs):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        loser, winner = sorted(runs, key=lambda run: run.poll() is None)
+        assert loser.returncode == 1
+        said = loser.stderr.read()
+        assert f"another simulation (process {winner.pid}) runs already on ROS domain" in said
+        assert said.count("\n") == 1
+        wait_until(lambda: len(nodes_of(winner.pid)) == 4, winner)
+        winner.send_signal(signal.SIGINT)
+        winner.communicate(timeout=30)
+        assert winner.returncode == 130
+    finally:
+        for run in runs:
+            run.kill()
+
+
+class Deaf(NodeProcess):
+    """A process that does not end when it is told to."""
+
+    def command(self) -> list[str]:
+        code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        return [sys.executable, "-c", code + "print('deaf', flush=True); time.sleep(100)"]
+
+
+def test_a_recorder_that_does_not_end_is_killed_and_that_is_told(monkeypatch):
+    monkeypatch.setattr("us_sim.run.graph.RECORDER_STOP_S", 0.2)
+    group = ProcessGroup()
+    group.start([Deaf("session_recorder")])
+    deadline = time.monotonic() + 30
+    while group.last_words("session_recorder") != "deaf":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert group.stop() == ["session_recorder"]
+    assert not group.is_running("session_recorder")
+    assert not Path(f"/proc/{group.pids['session_recorder']}").exists()
+
+
+def test_one_that_was_stopped_ends_by_itself_when_it_is_told_to():
+    group = ProcessGroup()
+    group.start([NodeProcess("session_recorder", {"file": "/nowhere/session.mcap"})])
+    os.kill(group.pids["session_recorder"], signal.SIGSTOP)
+    assert group.stop() == []
+
+
+def test_one_that_stands_by_takes_over_unless_it_was_made_for_something_else(
+    played_scene, tmp_path
+):
+    skin = NodeProcess("skin_deformer", {"scene": str(played_scene)})
+    log = tmp_path / "nodes.log"
+    group = ProcessGroup(log)
+    try:
+        deadline = time.monotonic() + 100
+        while not group.stand_by(skin):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert not group.pids
+        assert log.read_text() == ""  # nobody needs to know
+        group.start([skin])
+        taken_over = group.pids["skin_deformer"]
+        while group.last_words("skin_deformer") != "ready":
+            assert time.monotonic() < deadline
+            assert group.is_running("skin_deformer")
+            time.sleep(0.05)
+        assert b"US_SIM_STANDBY=1" in Path(f"/proc/{taken_over}/environ").read_bytes()
+        group.end("skin_deformer")
+        group.stand_by(skin)
+        group.start([NodeProcess("skin_deformer", {"scene": str(played_scene), "threads": 2})])
+        fresh = group.pids["skin_deformer"]
+        assert b"US_SIM_STANDBY" not in Path(f"/proc/{fresh}/environ").read_bytes()
+    finally:
+        group.stop()

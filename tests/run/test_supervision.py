@@ -1,0 +1,177 @@
+"""What the supervisor does with nodes that end, without any process."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from us_sim.errors import UsSimError
+from us_sim.run.graph import INTERRUPTED, NodeProcess
+from us_sim.run.plan import Plan
+from us_sim.run.supervision import Supervisor
+from us_sim.run.supervision_settings import SupervisionSettings
+
+
+class Group:
+    """Processes on paper: the test says which end, and how."""
+
+    def __init__(self):
+        self.pids = {}
+        self.started = []
+        self.ended = {}
+        self.hung = []
+        self.killed = []
+
+    def start(self, processes):
+        for process in processes:
+            self.started.append(process)
+            self.pids[process.node] = len(self.started)
+
+    def take_ended(self):
+        ended, self.ended = self.ended, {}
+        return ended
+
+    def is_running(self, node):
+        return node in self.pids
+
+    def last_words(self, node):
+        return f"{node} was here"
+
+    def failure(self, node, status):
+        return UsSimError(f"{node} cannot work ({status})")
+
+    def end(self, node):
+        self.hung.append(node)
+
+    def stop(self):
+        return self.killed
+
+
+class Monitor:
+    """What nodes report, on paper: each at once."""
+
+    def __init__(self, group):
+        self.group = group
+        self.told = []
+        self.silent = set()
+        self.node = SimpleNamespace(
+            reports={}, messages={}, heard={}, tell_lost=self.told.append, count=lambda *_: 7
+        )
+
+    def spin(self):
+        for node, pid in self.group.pids.items():
+            if node not in self.silent:
+                self.node.heard[node, pid] = self.node.heard.get((node, pid), 0) + 1
+                self.node.reports.setdefault(node, {})["pid"] = str(pid)
+
+    def waiting(self, pids):
+        return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]
+
+
+@pytest.fixture
+def session(tmp_path):
+    """A supervisor of three nodes, its group and its monitor."""
+    group = Group()
+    monitor = Monitor(group)
+    processes = [
+        NodeProcess("session_recorder", {"file": str(tmp_path / "session.mcap")}),
+        NodeProcess("slice_interpolator"),
+        NodeProcess("path_player"),
+    ]
+    plan = Plan(None, processes, poses=600, duration=None)
+    return Supervisor(plan, group, monitor, SupervisionSettings(restarts=2)), group, monitor
+
+
+def test_a_player_at_its_end_is_no_loss(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    group.ended = {"path_player": 0}
+    supervisor.look()
+    assert supervisor.finished
+    assert not supervisor.losses
+    assert supervisor.outcome(1.0).sentence() == ""
+
+
+@pytest.mark.parametrize("status", [0, 1, 3, -15, -9, INTERRUPTED])
+def test_any_other_end_is(session, status):
+    supervisor, group, monitor = session
+    supervisor.look()
+    group.ended = {"slice_interpolator": status}
+    supervisor.look()
+    (loss,) = supervisor.losses
+    assert (loss.node, loss.said) == ("slice_interpolator", "slice_interpolator was here")
+    assert [process.node for process in group.started[3:]] == ["slice_interpolator"]
+    supervisor.look()
+    assert loss.back_after is not None
+    assert not supervisor.finished
+    assert monitor.told[-1] == [str(loss)]
+
+
+def test_one_that_was_never_ready_ends_all_unless_a_signal_ended_it(session):
+    supervisor, group, monitor = session
+    monitor.silent = {"slice_interpolator"}
+    supervisor.look()
+    for status in (-15, 0, INTERRUPTED):
+        if len(supervisor.losses) < 2:
+            group.ended = {"slice_interpolator": status}
+            supervisor.look()
+    assert supervisor.waiting == ["slice_interpolator"]
+    group.ended = {"slice_interpolator": 1}
+    with pytest.raises(UsSimError, match="slice_interpolator cannot work"):
+        supervisor.look()
+
+
+def test_the_rest_goes_on_without_one_that_is_given_up(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    for _ in range(3):
+        group.ended = {"slice_interpolator": -11}
+        supervisor.look()
+    assert len(group.started) == 3 + 2
+    assert supervisor.losses[-1].given_up == "is not started again after 2 restarts"
+    assert "was ended by SIGSEGV" in supervisor.outcome(1.0).sentence()
+    assert not supervisor.finished
+
+
+def test_without_its_player_the_run_is_over(session):
+    supervisor, group, monitor = session
+    supervisor.look()
+    monitor.node.reports["path_player"] |= {"begun": "1700000000.5", "played": "120"}
+    for _ in range(3):
+        assert not supervisor.finished
+        group.ended = {"path_player": INTERRUPTED}
+        supervisor.look()
+    assert supervisor.finished
+    assert group.started[3].given == {"begun": 1700000000.5}
+
+
+def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_path):
+    supervisor, group, _ = session
+    supervisor.look()
+    (tmp_path / "session.mcap").touch()
+    group.ended = {"session_recorder": -9}
+    supervisor.look()
+    assert group.started[3].all_parameters["file"] == str(tmp_path / "session_1.mcap")
+    (tmp_path / "session_1.mcap").touch()
+    files = supervisor.outcome(1.0).files
+    assert [file.name for file in files] == ["session.mcap", "session_1.mcap"]
+
+
+def test_a_full_disk_is_told_once(session):
+    supervisor, _, monitor = session
+    monitor.node.messages["session_recorder"] = "no space left"
+    monitor.node.reports["session_recorder"] = {"rejected disk": "1"}
+    supervisor.look()
+    supervisor.look()
+    (loss,) = supervisor.losses
+    assert loss.what == "could not write any more (no space left)"
+
+
+def test_a_recorder_that_had_to_be_killed_is_a_loss(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    group.killed = ["path_player"]
+    supervisor.end()
+    assert not supervisor.losses
+    group.killed = ["session_recorder"]
+    supervisor.end()
+    assert "did not end when it was told to and was killed" in supervisor.outcome(1.0).sentence()

@@ -1,0 +1,119 @@
+"""Silence told apart from work, waiting, sleep and a stop, on a clock set by hand."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from us_sim.run.process_state import ProcessState, process_state
+from us_sim.run.watch import Watch
+
+NODE, PID = "tissue_deformer", 7
+
+
+class Machine:
+    """A clock and a process that the test moves."""
+
+    def __init__(self):
+        self.now = 0.0
+        self.state = ProcessState(is_stopped=False, is_waiting=False, cpu=0.0)
+        self.reports = 0
+        self.watch = Watch(10.0, clock=lambda: self.now, state=lambda _: self.state)
+
+    def look(self):
+        return self.watch.look({NODE: PID}, {(NODE, PID): self.reports}).get(NODE, "")
+
+    def pass_time(self, seconds, *, step=0.1, works=0.0, reporting=False, **state):
+        """Until something is told, looked at again and again; when that was, and what."""
+        told = ""
+        for _ in range(round(seconds / step)):
+            self.now += step
+            cpu = self.state.cpu + works * step
+            self.state = ProcessState(
+                state.get("is_stopped", False), state.get("is_waiting", False), cpu
+            )
+            self.reports += reporting
+            if told := self.look():
+                break
+        return self.now, told
+
+
+@pytest.fixture
+def machine():
+    machine = Machine()
+    machine.look()
+    machine.reports = 1
+    machine.look()
+    return machine
+
+
+def test_a_node_that_reports_never_hangs(machine):
+    assert machine.pass_time(1000.0, step=0.5, reporting=True) == (1000.0, "")
+
+
+def test_one_that_does_nothing_hangs_after_the_silence(machine):
+    when, told = machine.pass_time(100.0)
+    assert when == pytest.approx(10.0, abs=0.15)
+    assert told == "has not reported for 10 s"
+
+
+@pytest.mark.parametrize("busy", [{"works": 1.0}, {"works": 0.6}, {"is_waiting": True}])
+def test_one_that_works_or_waits_for_a_processor_has_six_times_as_long(machine, busy):
+    when, told = machine.pass_time(100.0, **busy)
+    assert when == pytest.approx(60.0, abs=0.15)
+    assert told == "has not reported for 60 s"
+
+
+def test_one_that_is_stopped_is_told_at_once(machine):
+    when, told = machine.pass_time(100.0, is_stopped=True)
+    assert when == pytest.approx(0.5, abs=0.15)
+    assert told == "was stopped (SIGSTOP)"
+
+
+def test_time_in_which_nobody_looked_is_no_silence(machine):
+    for _ in range(15):
+        machine.now += 3600.0  # a laptop that was closed
+        assert machine.look() == ""
+    machine.now += 3600.0
+    for _ in range(20):
+        machine.now += 0.5
+        told = machine.look()
+        if told:
+            break
+    assert told
+
+
+def test_the_first_report_has_five_minutes(machine):
+    machine.reports = 0
+    fresh = Machine()
+    fresh.look()
+    assert fresh.pass_time(299.0, step=0.5) == (299.0, "")
+    assert fresh.pass_time(2.0, step=0.5)[1] == "has not reported for 300 s"
+
+
+def test_another_process_of_the_node_starts_anew(machine):
+    machine.pass_time(9.0)
+    assert machine.watch.look({NODE: PID + 1}, {(NODE, PID): 1}) == {}
+    assert machine.watch.look({NODE: PID + 1}, {(NODE, PID): 2}) == {}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+def test_the_state_of_a_real_process():
+    code = "while True: pass"
+    with subprocess.Popen([sys.executable, "-c", code]) as process:
+        try:
+            deadline = time.monotonic() + 30
+            while process_state(process.pid).cpu < 0.05:
+                assert time.monotonic() < deadline
+            assert not process_state(process.pid).is_stopped
+            process.send_signal(signal.SIGSTOP)
+            os.waitpid(process.pid, os.WUNTRACED)
+            state = process_state(process.pid)
+            assert state.is_stopped
+            assert not state.is_waiting
+        finally:
+            process.kill()
+    assert process_state(process.pid) is None

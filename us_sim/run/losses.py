@@ -1,0 +1,117 @@
+"""What a run lost: nodes that ended or hung, and images that are not in the recording."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import BagError
+from us_sim.recording.reader import read_bag
+
+__all__ = ["Loss", "Outcome", "files_of", "images_in"]
+
+IMAGES = "/ultrasound/image"
+TOLD = 4
+"""Losses that are told one by one in a sentence."""
+
+
+@dataclass
+class Loss:
+    """A node that ended or hung, and what became of it."""
+
+    node: str
+    what: str  # it did: "was ended by SIGKILL"
+    at: float  # s since the nodes were started
+    said: str = ""  # last, by the node
+    back_after: float | None = None  # s, until it reported again
+    given_up: str = ""  # why it was not started again
+    time: str = field(default_factory=lambda: datetime.now().astimezone().isoformat())
+
+    def __str__(self) -> str:
+        """For a person."""
+        if self.back_after is not None:
+            then = f" and was back after {self.back_after:.1f} s"
+        else:
+            then = f" and {self.given_up}" if self.given_up else ""
+        return f"{self.node} {self.what} at {self.at:.1f} s{then}"
+
+    def summary(self) -> dict[str, Any]:
+        """As one JSON-like mapping."""
+        return {
+            "node": self.node,
+            "what": self.what,
+            "time": self.time,
+            "at_s": round(self.at, 2),
+            "last_words": self.said,
+            "back_after_s": None if self.back_after is None else round(self.back_after, 2),
+            "given_up": self.given_up,
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run went."""
+
+    startup: float  # s until all nodes were ready
+    losses: Sequence[Loss]
+    files: Sequence[Path]  # recorded, in their order
+    made: int  # images, that the node which makes them has reported
+    recorded: int  # of them
+    poses: int | None  # that there were to play, or images of a video
+
+    def sentence(self) -> str:
+        """What was lost, for a person; empty when nothing was."""
+        told = [str(loss) for loss in self.losses[:TOLD]]
+        if len(self.losses) > TOLD:
+            told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
+        if self.files and (self.losses or self.recorded < self.made):
+            of = f" of {self.poses} poses" if self.poses is not None else ""
+            if self.recorded < self.made:
+                of = f" of {self.made} that were made"
+            told.append(f"{self.recorded} images were recorded{of}")
+        if len(self.files) > 1:
+            told.append(f"the recording is in {_listed([file.name for file in self.files])}")
+        return "; ".join(told) if self.losses or self._lacks_images else ""
+
+    @property
+    def _lacks_images(self) -> bool:
+        return bool(self.files) and self.recorded < self.made
+
+    def summary(self) -> dict[str, Any]:
+        """As one JSON-like mapping."""
+        return {
+            "nodes": [loss.summary() for loss in self.losses],
+            "images_made": self.made,
+            "images_recorded": self.recorded,
+            "files": [file.name for file in self.files],
+        }
+
+
+def files_of(recording: Path) -> list[Path]:
+    """A recording's file and those in which it goes on: ``session.mcap``, ``session_1.mcap``, …"""
+    pattern = re.compile(rf"{re.escape(recording.stem)}((?:_\d+)*){re.escape(recording.suffix)}")
+    found = []
+    for file in recording.parent.glob("*"):
+        if match := pattern.fullmatch(file.name):
+            found.append(([int(number) for number in match[1].split("_")[1:]], file))
+    return [file for _, file in sorted(found)]
+
+
+def images_in(files: Sequence[Path]) -> int:
+    """The images in recordings; a file that cannot be read has none."""
+    count = 0
+    for file in files:
+        try:
+            topics = read_bag(file).topics
+        except BagError:
+            continue
+        count += sum(topic.message_count for topic in topics if topic.name == IMAGES)
+    return count
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -1,0 +1,122 @@
+"""The monitor in the process that runs a simulation: who is there, and what they report."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from us_sim.errors import UsSimError
+from us_sim.run.domain_lock import domain
+from us_sim.run.graph import NodeProcess
+
+if TYPE_CHECKING:
+    from us_sim.nodes.session_monitor import SessionMonitor
+
+__all__ = ["Monitored", "refuse_unknown"]
+
+LOOK_AROUND_S = 0.4
+"""To discover whether another simulation is on this ROS domain."""
+ANSWER_S = 5.0
+"""For a node to say which parameters it has."""
+
+
+class Monitored:
+    """A monitor node in this process, with its own context and executor.
+
+    Args:
+        nodes: that are followed.
+        supervised: they are a simulation, of which there is one on a domain.
+        namespace: theirs.
+    """
+
+    def __init__(self, nodes: list[str], *, supervised: bool = False, namespace: str = "") -> None:
+        import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+        import rclpy
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        from us_sim.nodes.session_monitor import SessionMonitor
+
+        self.names = nodes
+        self._context = Context()
+        try:
+            rclpy.init(
+                args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO
+            )
+        except Exception as error:  # what rcl raises differs between its versions
+            raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+        # The first part decides which of two simulations goes on: that which began first.
+        self.run = (
+            f"{time.time_ns():020} {socket.gethostname()} {os.getpid()}" if supervised else ""
+        )
+        self.node: SessionMonitor = SessionMonitor(
+            nodes, self.run, context=self._context, namespace=namespace
+        )
+        self._executor: Any = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def spin(self, seconds: float = 0.1) -> None:
+        """Take what has come next, or wait for it, at most so long."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def refuse_company(self) -> None:
+        """Raise UsSimError when a node of one of these names is on the domain already."""
+        until = time.monotonic() + LOOK_AROUND_S
+        while time.monotonic() < until:
+            self.spin()
+        taken = sorted(set(self.names) & set(self.node.get_node_names()))
+        if taken:
+            raise UsSimError(
+                f"{taken[0]} runs already on ROS domain {domain()}: "
+                f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"
+            )
+
+    def refuse_earlier_run(self) -> None:
+        """Raise UsSimError when another simulation on the network began just before this one."""
+        first = min(self.node.other_runs, default=self.run)
+        if first < self.run:
+            host = first.split(" ")[1:2]
+            raise UsSimError(
+                f"another simulation{' on ' + host[0] if host else ''} began on ROS domain "
+                f"{domain()} just before this one: end it, or set ROS_DOMAIN_ID to another number "
+                f"for this one"
+            )
+
+    def waiting(self, pids: Mapping[str, int]) -> list[str]:
+        """The nodes whose processes have not reported yet."""
+        return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]
+
+    def refuse_unknown(self, processes: Sequence[NodeProcess]) -> None:
+        """Raise UsSimError when a parameter was given that its node does not have."""
+        from rclpy.parameter_client import AsyncParameterClient
+
+        for process in processes:
+            if not process.given:
+                continue
+            client = AsyncParameterClient(self.node, process.node)
+            client.wait_for_services(timeout_sec=ANSWER_S)
+            answer = client.list_parameters()
+            self._executor.spin_until_future_complete(answer, timeout_sec=ANSWER_S)
+            if answer.done():
+                refuse_unknown(process, answer.result().result.names)
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+
+def refuse_unknown(process: NodeProcess, known: Collection[str]) -> None:
+    """Raise UsSimError when a parameter was given by a name that is not among the ``known``."""
+    for name in process.given:
+        if name not in known and not name.startswith("qos_overrides."):
+            own = sorted(n for n in known if not n.startswith("qos_overrides."))
+            raise UsSimError(
+                f"--param {process.node}.{name}: {process.node} has no such parameter; it has "
+                f"{', '.join(own)}"
+            )

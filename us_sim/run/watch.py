@@ -1,0 +1,112 @@
+"""Which nodes have stopped reporting, told apart from those that work or wait for a processor.
+
+>>> from us_sim.run.watch import Watch
+>>> times = iter(range(100))
+>>> watch = Watch(10.0, clock=lambda: 0.5 * next(times), state=lambda pid: None)
+>>> watch.look({"slice_interpolator": 7}, {("slice_interpolator", 7): 1})
+{}
+>>> [told for _ in range(21) if (told := watch.look({"slice_interpolator": 7}, {}))]
+[{'slice_interpolator': 'has not reported for 10 s'}]
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from us_sim.run.process_state import ProcessState, process_state
+
+__all__ = ["Watch"]
+
+STEP_S = 0.5
+"""A longer time between two looks counts as this much: the machine slept, or had no time for us,
+and so perhaps none for the nodes."""
+STOPPED_S = 0.5
+"""For which a process may be stopped."""
+BUSY_SHARE = 0.5
+"""Of the silence, in which a node that is busy has worked or waited for a processor."""
+BUSY_PATIENCE = 6.0
+"""How many times as long a busy node may be silent: it may be compiling."""
+START_LIMIT_S = 300.0
+"""For the first report: the first run compiles."""
+
+
+@dataclass
+class _Silence:
+    """Of one process, s on the clock of the watch."""
+
+    reports: int = 0
+    silent: float = 0.0
+    busy: float = 0.0  # of it
+    stopped: float = 0.0  # at the end of it
+    cpu: float = 0.0
+
+
+class Watch:
+    """Looks at processes again and again, and says which of them hang.
+
+    Args:
+        silence: s without a report after which a node hangs that does not even work.
+        clock: s, never set back.
+        state: what the system says of a process.
+    """
+
+    def __init__(
+        self,
+        silence: float,
+        clock: Callable[[], float] = time.monotonic,
+        state: Callable[[int], ProcessState | None] = process_state,
+    ) -> None:
+        self._limit = silence
+        self._clock, self._state = clock, state
+        self._last: float | None = None
+        self._silences: dict[tuple[str, int], _Silence] = {}
+
+    def look(
+        self, pids: Mapping[str, int], reports: Mapping[tuple[str, int], int]
+    ) -> dict[str, str]:
+        """The nodes that hang, and how that shows, for a person; each is told once.
+
+        Args:
+            pids: the processes that run, by node.
+            reports: how many have come, by node and process.
+        """
+        now = self._clock()
+        step = 0.0 if self._last is None else min(now - self._last, STEP_S)
+        self._last = now
+        hung = {}
+        for node, pid in pids.items():
+            silence = self._silences.setdefault((node, pid), _Silence())
+            self._add(silence, pid, step, reports.get((node, pid), 0))
+            told = self._told(silence)
+            if told:
+                silence.silent = silence.busy = silence.stopped = 0.0
+                hung[node] = told
+        return hung
+
+    def _add(self, silence: _Silence, pid: int, step: float, reports: int) -> None:
+        """One more step of silence, if it is one."""
+        state = self._state(pid)
+        worked = 0.0
+        if state is not None:
+            worked = step if state.is_waiting else min(state.cpu - silence.cpu, step)
+            silence.cpu = state.cpu
+        silence.stopped = silence.stopped + step if state is not None and state.is_stopped else 0.0
+        if reports > silence.reports:
+            silence.reports, silence.silent, silence.busy = reports, 0.0, 0.0
+            return
+        silence.silent += step
+        silence.busy += max(worked, 0.0)
+
+    def _told(self, silence: _Silence) -> str:
+        if silence.stopped >= STOPPED_S:
+            return "was stopped (SIGSTOP)"
+        limit = self._limit
+        if silence.busy > BUSY_SHARE * silence.silent:
+            limit *= BUSY_PATIENCE
+        if not silence.reports:
+            limit = max(limit, START_LIMIT_S)
+        if silence.silent < limit:
+            return ""
+        return f"has not reported for {silence.silent:.0f} s"
