@@ -150,7 +150,8 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_pat
     (tmp_path / "session.mcap").touch()
     group.ended = {"session_recorder": -9}
     supervisor.look()
-    assert group.started[3].all_parameters["file"] == str(tmp_path / "session_1.mcap")
+    again = group.started[3].all_parameters
+    assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
     (tmp_path / "session_1.mcap").touch()
     files = supervisor.outcome(1.0).files
     assert [file.name for file in files] == ["session.mcap", "session_1.mcap"]
