@@ -52,6 +52,7 @@ class Health:
         self.received = 0
         self.dropped = 0
         self.values: dict[str, str] = {}
+        self.scheduling = ""  # how its process goes before others, if that was asked for
         self._publisher = node.create_publisher(
             DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
         )
@@ -108,6 +109,7 @@ class Health:
             "rate_hz": f"{rate:.1f}",
             "received": str(self.received),
             "dropped": str(self.dropped),
+            **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
             **{f"failed {where}": str(n) for where, n in self._failures().items()},

@@ -18,6 +18,7 @@ from rclpy.node import Node
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.realtime import go_first
 from us_sim.nodes.standby import STANDBY, stand_by
 
 __all__ = ["INTERRUPTED", "run_node"]
@@ -52,6 +53,8 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     try:
         node = create()
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
+        if getattr(node, "goes_first", False):
+            node.health.scheduling = go_first()
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return _interrupted(node)

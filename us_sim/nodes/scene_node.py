@@ -32,6 +32,8 @@ class SceneNode(GuardedNode):
         self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
         self.lockstep = settings.lockstep
         self.threads = settings.threads
+        #: Whether its process should go before ordinary ones.
+        self.goes_first = settings.realtime and not settings.lockstep
         self.health: Health = Health(self, self.scene.name)
 
     def stream(self, message_type: Any, topic: str) -> Publisher:

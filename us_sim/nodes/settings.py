@@ -62,6 +62,10 @@ class SceneNodeSettings(Settings):
         description="work on every message, in order, instead of the newest", default=False
     )
     threads: int = setting(Quantity("number", 1, 256), "for the numerical work", default=1)
+    realtime: bool = setting(
+        description="go before ordinary programs, where the system allows that; not in lockstep",
+        default=True,
+    )
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,9 @@ def write_report(folder: ReportFolder, points: Sequence[Point]) -> None:
         "![Hop by hop](latency_hops.png)",
         _rows(points),
         f"An age is counted from the pose's own stamp to the arrival in a process that subscribes "
-        f"to every topic above, as a viewer would; mm is how far a hand moves meanwhile at "
-        f"{1e3 * HAND:.0f} mm/s. A pose without an image was skipped since a newer one had come, "
+        f"to every topic above, and goes before ordinary programs where it may, as the nodes do; "
+        f"mm is how far a hand moves meanwhile at {1e3 * HAND:.0f} mm/s. A pose without an image "
+        f"was skipped since a newer one had come, "
         f"or lost. In lockstep each pose waits for the image of the one before, and images a "
         f"second are what the machine can do.",
         "## Where the processor's time goes",
