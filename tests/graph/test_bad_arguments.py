@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from rclpy.signals import uninstall_signal_handlers
 
 
 @pytest.fixture
@@ -15,6 +16,7 @@ def _own_signals() -> Iterator[None]:
     numbers = (signal.SIGINT, signal.SIGTERM)
     kept = [signal.getsignal(number) for number in numbers]
     yield
+    uninstall_signal_handlers()
     for number, handler in zip(numbers, kept, strict=True):
         signal.signal(number, handler)
 
