@@ -74,7 +74,7 @@ def plot_over_time(point: Point, file: Path) -> None:
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     came = np.array([arrival for _, arrival in point.images], dtype=float)
     time = 1e-9 * (came - came[0]) if len(came) else came
-    above.plot(time, point.ages("ultrasound/image"), ",", color="#08519c")
+    above.plot(time, point.ages("ultrasound/image"), ".", color="#08519c", ms=2)
     above.set_ylabel("ms from a pose to its image")
     above.set_ylim(bottom=0)
     for node, use in point.usage.items():
