@@ -49,12 +49,22 @@ _LENGTH = struct.Struct("<Q")
 _COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
 
 
-@dataclass(frozen=True)
-class _WrittenChunk:
-    """A chunk in the file."""
+_COUNT = struct.Struct("<HI")  # channel, messages
+_PLACE = struct.Struct("<9xQQQ")  # of a chunk's index record: start, end, where the chunk begins
 
-    index: ChunkIndex
-    counts: Counter[str]  # messages by topic
+
+@dataclass(frozen=True, slots=True)
+class _WrittenChunk:
+    """A chunk in the file; there are thirty a second, so little is kept of each."""
+
+    index: bytes  # the record
+    counts: bytes  # `_COUNT` of each channel
+
+    @property
+    def place(self) -> tuple[int, int, int]:
+        """Lowest and highest log time, ns, and where in the file it begins."""
+        first, last, begin = _PLACE.unpack_from(self.index)
+        return first, last, begin
 
 
 class McapOutput:
@@ -192,7 +202,8 @@ class McapOutput:
             compressed_size=len(packed),
             uncompressed_size=len(records),
         )
-        self._chunks.append(_WrittenChunk(written, counts))
+        packed_counts = [_COUNT.pack(self._channels[t].id, n) for t, n in counts.items()]
+        self._chunks.append(_WrittenChunk(_bytes_of(written), b"".join(packed_counts)))
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """A record of texts by their names.
@@ -292,42 +303,40 @@ class McapOutput:
         """Forget messages that are not in the file, while no chunk is in progress."""
         self.counts -= counts
         self.dropped += counts
-        kept = [chunk.index for chunk in self._chunks]
-        self.start = min((index.message_start_time for index in kept), default=None)
-        self.end = max((index.message_end_time for index in kept), default=None)
+        places = [chunk.place for chunk in self._chunks]
+        self.start = min((first for first, _, _ in places), default=None)
+        self.end = max((last for _, last, _ in places), default=None)
 
     def _drop_last_chunk(self) -> None:
         """Take back the last chunk, and what was written after it."""
         chunk = self._chunks.pop()
-        self._cut(chunk.index.chunk_start_offset)
+        self._cut(chunk.place[2])
         self._attachments = [each for each in self._attachments if each.offset < self._size]
         self._metadata = [each for each in self._metadata if each.offset < self._size]
-        self._drop(chunk.counts)
+        topics = {channel.id: topic for topic, channel in self._channels.items()}
+        self._drop(Counter({topics[id]: n for id, n in _COUNT.iter_unpack(chunk.counts)}))
 
     def _summary(self) -> list[bytes]:
         """What comes after the messages."""
         data_end = _bytes_of(DataEnd(0))
         start = self._size + len(data_end)
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, [*self._schemas.values()]),
-            (Opcode.CHANNEL, [*self._channels.values()]),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, [chunk.index for chunk in self._chunks]),
-            (Opcode.ATTACHMENT_INDEX, [*self._attachments]),
-            (Opcode.METADATA_INDEX, [*self._metadata]),
+        groups: list[tuple[Opcode, Iterable[bytes]]] = [
+            (Opcode.SCHEMA, map(_bytes_of, self._schemas.values())),
+            (Opcode.CHANNEL, map(_bytes_of, self._channels.values())),
+            (Opcode.STATISTICS, [_bytes_of(self._statistics())]),
+            (Opcode.CHUNK_INDEX, (chunk.index for chunk in self._chunks)),
+            (Opcode.ATTACHMENT_INDEX, map(_bytes_of, self._attachments)),
+            (Opcode.METADATA_INDEX, map(_bytes_of, self._metadata)),
         ]
-        summary = RecordBuilder()
-        offsets = []
+        parts, offsets, position = [], [], start
         for opcode, records in groups:
-            begin = summary.count
-            for record in records:
-                record.write(summary)
-            if records:
-                offsets.append(SummaryOffset(opcode, start + begin, summary.count - begin))
-        offsets_start = start + summary.count
-        for offset in offsets:
-            offset.write(summary)
-        content = summary.end()
+            part = b"".join(records)
+            if part:
+                offsets.append(_bytes_of(SummaryOffset(opcode, position, len(part))))
+            parts.append(part)
+            position += len(part)
+        offsets_start = position
+        content = b"".join(parts + offsets)
         # The checksum covers the summary and the footer up to the checksum itself.
         footer = _FOOTER.pack(Opcode.FOOTER, 20, start, offsets_start)
         crc = zlib.crc32(footer, zlib.crc32(content))
