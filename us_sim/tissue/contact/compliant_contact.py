@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import pivot, solve_active
 from us_sim.tissue.contact.penetration import only_forward, pushing_gap
@@ -187,14 +188,10 @@ def gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, 
         a = rest[i, 0] + displacement[m, 0] - origin[0]
         b = rest[i, 1] + displacement[m, 1] - origin[1]
         c = rest[i, 2] + displacement[m, 2] - origin[2]
-        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
-        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
-        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
+        x, y, z = turned_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
         gap[m] = g
-        normal[m, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
-        normal[m, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz
-        normal[m, 2] = r[2, 0] * nx + r[2, 1] * ny + r[2, 2] * nz
+        normal[m, 0], normal[m, 1], normal[m, 2] = turned(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
 __all__ = ["FlaredProbe"]
@@ -199,13 +200,9 @@ def _distances(shape, r, origin, points, near, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
-        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
-        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
+        x, y, z = turned_back(r, a, b, c)
         gap[i], nx, ny, nz = _distance(shape, x, y, z)
-        normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
-        normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz
-        normal[i, 2] = r[2, 0] * nx + r[2, 1] * ny + r[2, 2] * nz
+        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

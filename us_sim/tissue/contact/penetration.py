@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import curved_box_distance
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
 __all__ = [
@@ -186,11 +187,7 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
-        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
-        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
+        x, y, z = turned_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         gap[i] = g
-        normal[i, 0] = r[0, 0] * nx + r[0, 1] * ny + r[0, 2] * nz
-        normal[i, 1] = r[1, 0] * nx + r[1, 1] * ny + r[1, 2] * nz
-        normal[i, 2] = r[2, 0] * nx + r[2, 1] * ny + r[2, 2] * nz
+        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 from us_sim.tissue.contact.penetration import pushing_gap
 from us_sim.tissue.elasticity.springs import spring_forces
@@ -114,15 +115,11 @@ def _stop_at_probe(particles, probe, step, contact, duration):
         a = positions[i, 0] - origin[0]
         b = positions[i, 1] - origin[1]
         c = positions[i, 2] - origin[2]
-        x = r[0, 0] * a + r[1, 0] * b + r[2, 0] * c
-        y = r[0, 1] * a + r[1, 1] * b + r[2, 1] * c
-        z = r[0, 2] * a + r[1, 2] * b + r[2, 2] * c
+        x, y, z = turned_back(r, a, b, c)
         gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
-        nx = r[0, 0] * u + r[0, 1] * v + r[0, 2] * w
-        ny = r[1, 0] * u + r[1, 1] * v + r[1, 2] * w
-        nz = r[2, 0] * u + r[2, 1] * v + r[2, 2] * w
+        nx, ny, nz = turned(r, u, v, w)
         positions[i, 0] -= gap * nx
         positions[i, 1] -= gap * ny
         positions[i, 2] -= gap * nz
