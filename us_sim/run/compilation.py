@@ -44,7 +44,7 @@ def parts() -> Iterator[Part]:
         yield f"{solver} on any mesh", partial(_use_solver, solver, box=False)
     for solver in ("fem", "fem_nonlinear"):
         yield f"{solver} with friction", partial(_use_friction, solver)
-    yield "materials", _average_materials
+    yield "materials", _count_labels
     yield "skin", _use_skin
     for method in SLICERS:
         yield method, partial(_make_image, method)
@@ -76,12 +76,10 @@ def _use_friction(name: str) -> None:
         solver.deform(Pose(np.array([across, 0.0, 0.005])))
 
 
-def _average_materials() -> None:
-    from us_sim.tissue.elasticity.material import Material
-    from us_sim.tissue.elasticity.materials import average_over_labels
+def _count_labels() -> None:
+    from us_sim.tissue.elasticity.materials import label_fractions
 
-    labels = np.zeros((4, 4, 4), dtype=np.uint8)
-    average_over_labels(_block(box=True).mesh, labels, np.eye(4), {0: Material(10e3, 0.45, 1000.0)})
+    label_fractions(_block(box=True).mesh, np.zeros((4, 4, 4), dtype=np.uint8), np.eye(4))
 
 
 def _use_skin() -> None:

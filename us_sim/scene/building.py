@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe.probe import Probe
     from us_sim.tissue.elasticity.material import Material
-    from us_sim.tissue.elasticity.materials import TissueMaterials
+    from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
     from us_sim.volume.volume import Volume
@@ -158,14 +158,15 @@ def tissue_model_of(
     if note is not None:
         for remark in remarks:
             note(f"tissue mesh: {remark}")
-    fixed = _fixed_nodes(scene, section, mesh, volume)
+    fractions = _label_fractions(mesh, volume)
+    fixed = _fixed_nodes(scene, section, mesh, volume, fractions)
     from us_sim.tissue.mesh.node_selection import face_nodes, facing_nodes
 
     touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top")
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
-        materials=materials_of(scene, section.materials, mesh, volume),
+        materials=_materials(scene, section.materials, mesh, volume, fractions),
         fixed=fixed,
         collider=collider_of(scene),
         contact_nodes=contact,
@@ -180,10 +181,29 @@ def materials_of(
     Raises:
         SceneError: a label of the volume has no material, or a material no label.
     """
+    return _materials(scene, materials, mesh, volume, _label_fractions(mesh, volume))
+
+
+def _label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
+    """None where the volume has no labels."""
+    from us_sim.tissue.elasticity.materials import label_fractions
+
+    if volume.labels is None:
+        return None
+    return label_fractions(mesh, volume.labels, volume.patient_to_index)
+
+
+def _materials(
+    scene: Scene,
+    materials: Mapping[str, Material],
+    mesh: TetrahedralMesh,
+    volume: Volume,
+    fractions: LabelFractions | None,
+) -> TissueMaterials:
     from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
 
     materials = dict(materials)
-    if volume.labels is None:
+    if fractions is None:
         if list(materials) != ["tissue"]:
             raise SceneError(
                 f"{scene.origin}: tissue.materials: this volume has no labels, so it takes one "
@@ -200,7 +220,7 @@ def materials_of(
             f"{scene.origin}: tissue.materials.{next(iter(materials))}: the volume has no such "
             f"label; it has {', '.join(volume.label_names.values())}"
         )
-    return average_over_labels(mesh, volume.labels, volume.patient_to_index, by_label)
+    return average_over_labels(fractions, by_label)
 
 
 def membrane_of(scene: Scene) -> SkinMembrane:
@@ -247,7 +267,11 @@ def _mesh(section: TissueSettings) -> tuple[TetrahedralMesh, tuple[str, ...]]:
 
 
 def _fixed_nodes(
-    scene: Scene, section: TissueSettings, mesh: TetrahedralMesh, volume: Volume
+    scene: Scene,
+    section: TissueSettings,
+    mesh: TetrahedralMesh,
+    volume: Volume,
+    fractions: LabelFractions | None,
 ) -> NDArray[np.bool_]:
     """Nodes on the named faces, and nodes inside the named labels (the skeleton is rigid)."""
     from us_sim.tissue.mesh.node_selection import FACES, face_nodes, nodes_in_label
@@ -257,10 +281,8 @@ def _fixed_nodes(
     for name in section.fixed:
         if name in FACES:
             fixed[face_nodes(mesh, name, section.mesh.margin)] = True
-        elif name in numbers and volume.labels is not None:
-            fixed[nodes_in_label(mesh, volume.labels, volume.patient_to_index, numbers[name])] = (
-                True
-            )
+        elif name in numbers and fractions is not None:
+            fixed[nodes_in_label(mesh, fractions, numbers[name])] = True
         else:
             raise SceneError(
                 f"{scene.origin}: tissue.fixed: `{name}` is neither a face ({', '.join(FACES)}) "

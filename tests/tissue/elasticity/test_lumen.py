@@ -18,6 +18,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import (
     TissueMaterials,
     average_over_labels,
+    label_fractions,
     uniform_material,
 )
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
@@ -210,12 +211,13 @@ def test_fractions_are_those_of_the_labels_and_pressures_those_of_the_lumens():
     mesh = box_mesh(*([0.0, 0.02],) * 3)
     index = np.diag([1000.0, 1000.0, 1000.0, 1.0])
     index[:3, 3] = -0.5
-    averaged = average_over_labels(mesh, labels, index, {1: MUSCLE, 2: VEIN})
+    fractions = label_fractions(mesh, labels, index)
+    averaged = average_over_labels(fractions, {1: MUSCLE, 2: VEIN})
     assert averaged.lumen_fraction @ mesh.volumes / mesh.volumes.sum() == pytest.approx(
         0.75, abs=0.01
     )
     np.testing.assert_allclose(averaged.lumen_pressure, 1000.0)
-    solid = average_over_labels(mesh, labels, index, {1: MUSCLE, 2: MUSCLE})
+    solid = average_over_labels(fractions, {1: MUSCLE, 2: MUSCLE})
     assert not solid.lumen_fraction.any()
     assert not solid.lumen_pressure.any()
     assert uniform_material(mesh, VEIN).lumen_pressure.tolist() == [1000.0] * 5

@@ -77,7 +77,9 @@ def test_constants_are_averaged_by_volume():
     labels = voxels()
     labels[:100] = 2  # x < 0
     mesh = box_mesh([-0.01, 0.01, 0.03], [0.0, 0.01], [0.0, 0.01])
-    averaged = average_over_labels(mesh, labels, INDEX, {1: FAT, 2: MUSCLE, 9: FAT})
+    averaged = average_over_labels(
+        label_fractions(mesh, labels, INDEX), {1: FAT, 2: MUSCLE, 9: FAT}
+    )
     assert averaged.young_modulus[5:] == pytest.approx(np.full(5, 3e3))
     # The cell astride x = 0 is half of each, its tetrahedra more or less.
     fraction = mesh.volumes[:5] / mesh.volumes[:5].sum()
@@ -96,8 +98,9 @@ def test_the_same_input_gives_the_same_bytes():
 def test_a_label_without_material_is_named():
     labels = voxels()
     labels[:50] = 8
+    fractions = label_fractions(block_mesh((5, 3, 3)), labels, INDEX)
     with pytest.raises(MaterialError, match="label 8 fills"):
-        average_over_labels(block_mesh((5, 3, 3)), labels, INDEX, {1: FAT})
+        average_over_labels(fractions, {1: FAT})
 
 
 def test_a_mesh_outside_the_volume_is_refused():

@@ -6,7 +6,7 @@ from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import MeshError
 from us_sim.geometry.collider import Sphere
-from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
 from us_sim.tissue.mesh.file import read_mesh
 from us_sim.tissue.mesh.node_selection import FACES, face_nodes, facing_nodes, nodes_in_label
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -82,10 +82,11 @@ def test_nodes_within_bone_are_found():
     index[:3, 3] = [99.5, 49.5, -0.5]
     labels = np.ones((200, 100, 100), dtype=np.uint8)
     labels[75:125, :, 55:85] = 6  # x from -25 to 25 mm, z from 55 to 85 mm
-    found = mesh.nodes[nodes_in_label(mesh, labels, index, 6)]
+    fractions = label_fractions(mesh, labels, index)
+    found = mesh.nodes[nodes_in_label(mesh, fractions, 6)]
     np.testing.assert_allclose(np.unique(found[:, 0]), [-0.02, -0.01, 0, 0.01, 0.02], atol=1e-12)
     np.testing.assert_allclose(np.unique(found[:, 2]), [0.06, 0.07, 0.08], atol=1e-12)
-    assert len(nodes_in_label(mesh, labels, index, 9)) == 0
+    assert len(nodes_in_label(mesh, fractions, 9)) == 0
 
 
 def test_lumped_mass_is_the_tissues_mass():

@@ -2,13 +2,14 @@
 
 >>> import numpy as np
 >>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import average_over_labels
+>>> from us_sim.tissue.elasticity.materials import average_over_labels, label_fractions
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
 >>> labels = np.ones((10, 10, 10), dtype=np.uint8)
 >>> index_from_patient = np.diag([1000.0, 1000.0, 1000.0, 1.0])
 >>> muscle = Material(young_modulus=12e3, poisson_ratio=0.45, density=1060.0)
->>> average_over_labels(mesh, labels, index_from_patient, {1: muscle}).young_modulus
+>>> fractions = label_fractions(mesh, labels, index_from_patient)
+>>> average_over_labels(fractions, {1: muscle}).young_modulus
 array([12000., 12000., 12000., 12000., 12000.])
 """
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = [
+    "LabelFractions",
     "TissueMaterials",
     "average_over_labels",
     "label_fractions",
@@ -102,11 +105,22 @@ def uniform_material(mesh: TetrahedralMesh, material: Material) -> TissueMateria
     )
 
 
+class LabelFractions(NamedTuple):
+    """How much of each tetrahedron each label fills."""
+
+    labels: NDArray[np.uint8]  # (L,) those that occur, ascending
+    fractions: NDArray[np.float64]  # (M, L) of the volume; rows sum to 1
+
+    def of(self, label: int) -> NDArray[np.float64]:
+        """(M,) those of one label, zero where it does not occur."""
+        return self.fractions[:, self.labels == label].sum(axis=1)
+
+
 def label_fractions(
     mesh: TetrahedralMesh,
     labels: NDArray[np.uint8],
     index_from_patient: NDArray[np.float64],
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+) -> LabelFractions:
     """The volume fraction of each label in each tetrahedron.
 
     The same 1024 low-discrepancy points (Kronecker sequence of the generalised golden ratio, mapped
@@ -118,9 +132,6 @@ def label_fractions(
         mesh: in frame ``patient``.
         labels: (i, j, k).
         index_from_patient: (4, 4) affine, patient metres to voxel indices (centres at integers).
-
-    Returns:
-        (L,) the labels that occur, ascending, and (M, L) their volume fractions; rows sum to 1.
 
     Raises:
         MaterialError: the labels are not a 3-D uint8 array, the map is not affine, or the mesh and
@@ -145,29 +156,25 @@ def label_fractions(
     labels.flags.writeable = False  # as a volume's are, or numba would compile the kernel twice
     counts = _count_labels(indices, mesh.tetrahedra, labels, _simplex_points(_SAMPLES))
     present = np.flatnonzero(counts.any(axis=0))
-    return present.astype(np.uint8), counts[:, present] / _SAMPLES
+    return LabelFractions(present.astype(np.uint8), counts[:, present] / _SAMPLES)
 
 
 def average_over_labels(
-    mesh: TetrahedralMesh,
-    labels: NDArray[np.uint8],
-    index_from_patient: NDArray[np.float64],
-    materials: Mapping[int, Material],
+    fractions: LabelFractions, materials: Mapping[int, Material]
 ) -> TissueMaterials:
     """Constants of each tetrahedron: the average of its labels' constants by volume fraction.
 
     Args:
-        mesh, labels, index_from_patient: as in `label_fractions`.
-        materials: of each label that occurs within the mesh.
+        fractions: of the tetrahedra.
+        materials: of each label that occurs in them.
 
     Raises:
-        MaterialError: a label within the mesh has no material, or as `label_fractions`.
+        MaterialError: a label in them has no material.
     """
-    present, fractions = label_fractions(mesh, labels, index_from_patient)
-    missing = [int(label) for label in present if int(label) not in materials]
+    missing = [int(label) for label in fractions.labels if int(label) not in materials]
     if missing:
         raise MaterialError(
-            f"label {missing[0]} fills {fractions[:, present == missing[0]].sum():.2f} tetrahedra "
+            f"label {missing[0]} fills {fractions.of(missing[0]).sum():.2f} tetrahedra "
             f"but has no material: add one for it"
         )
     constants = np.array(
@@ -179,10 +186,10 @@ def average_over_labels(
                 float(m.lumen_pressure is not None),
                 m.lumen_pressure or 0.0,
             )
-            for m in (materials[int(label)] for label in present)
+            for m in (materials[int(label)] for label in fractions.labels)
         ]
     )
-    young_modulus, poisson_ratio, density, lumen, pressure = (fractions @ constants).T
+    young_modulus, poisson_ratio, density, lumen, pressure = (fractions.fractions @ constants).T
     np.divide(pressure, lumen, out=pressure, where=lumen > 0)  # of the lumen alone
     return TissueMaterials(young_modulus, poisson_ratio, density, lumen, pressure)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.tissue.elasticity.materials import label_fractions
+from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["FACES", "face_nodes", "facing_nodes", "nodes_in_label"]
@@ -85,22 +85,10 @@ def facing_nodes(mesh: TetrahedralMesh) -> NDArray[np.int32]:
 
 
 def nodes_in_label(
-    mesh: TetrahedralMesh,
-    labels: NDArray[np.uint8],
-    index_from_patient: NDArray[np.float64],
-    label: int,
+    mesh: TetrahedralMesh, fractions: LabelFractions, label: int
 ) -> NDArray[np.int32]:
-    """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending.
-
-    Args:
-        mesh, labels, index_from_patient: as in `tissue.elasticity.materials.label_fractions`.
-        label: its number in ``labels``.
-
-    Raises:
-        MaterialError: as `us_sim.tissue.elasticity.materials.label_fractions`.
-    """
-    present, fractions = label_fractions(mesh, labels, index_from_patient)
-    filled = fractions[:, present == label].sum(axis=1)
+    """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending."""
+    filled = fractions.of(label)
     around = mesh.tetrahedra.ravel()
     volume = np.bincount(around, np.repeat(mesh.volumes, 4), len(mesh.nodes))
     inside = np.bincount(around, np.repeat(mesh.volumes * filled, 4), len(mesh.nodes))
