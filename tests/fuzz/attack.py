@@ -207,6 +207,7 @@ class Attack:
         self._sent: deque[tuple[str, bytes]] = deque(maxlen=ROUND)
         self._reported: dict[str, float] = {}
         self._images: set[int] = set()
+        self._good: set[int] = set()  # stamps of the good poses since the last round, ns
         self._bad_nodes = 0
         self._node.create_subscription(DiagnosticArray, "diagnostics", self._report, 100)
         self._node.create_subscription(Image, "ultrasound/image", self._image, 10)
@@ -262,7 +263,6 @@ class Attack:
     def _fault(self) -> str:
         try:
             self._require_all()
-            self._bad_nodes = 0
             self._require_images()
         except RuntimeError as error:
             return str(error)
@@ -280,9 +280,12 @@ class Attack:
     def _require_images(self) -> None:
         """Good poses become images again, all nodes report, and the tissue is finite."""
         began, sent = time.monotonic(), []
+        self._good.clear()  # what is spoiled has stamps from before
+        self._bad_nodes = 0
         while time.monotonic() - began < PATIENCE:
             if self._played:
                 sent.append(self._send_pose(len(sent)))
+                self._good.add(sent[-1])
             self._spin(0.05)
             self._require_all()
             silent = [n for n in self._group.pids if time.monotonic() - self._reported[n] > 5.0]
@@ -328,7 +331,7 @@ class Attack:
     def _tissue(self, message: PointCloud2) -> None:
         stamp = 1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec
         values = np.frombuffer(message.data[: len(message.data) // 4 * 4], "<f4")
-        self._bad_nodes += stamp in self._images and not np.isfinite(values).all()
+        self._bad_nodes += stamp in self._good and not np.isfinite(values).all()
 
 
 def main(arguments: list[str]) -> int:
