@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["go_first"]
+__all__ = ["go_first", "scheduling_of"]
 
 _PRIORITY = 1
 """The lowest of those that go first: drivers of devices may go before."""
@@ -31,3 +31,16 @@ def go_first() -> str:
     except OSError:
         return "ordinary"
     return "realtime"
+
+
+def scheduling_of(pid: int) -> str:
+    """How the main thread of a process runs, in the words of `go_first`."""
+    if not hasattr(os, "sched_getscheduler"):
+        return "ordinary"
+    try:
+        policy = os.sched_getscheduler(pid)
+    except OSError:  # it has ended
+        return "ordinary"
+    return (
+        "realtime" if policy & ~getattr(os, "SCHED_RESET_ON_FORK", 0) == os.SCHED_RR else "ordinary"
+    )

@@ -86,6 +86,8 @@ def test_limits_are_judged_by_the_case_they_are_for():
     assert [t.met for t in targets([])] == [None] * 7
     unlike = Point(replace(LIVE, viewer=True), heard(image=90.0))
     assert targets([unlike, good])[2].met
+    held_up = Point(replace(DEMO, busy=True, realtime=False), heard(image=90.0))
+    assert targets([held_up])[-1].met is None
 
 
 @pytest.mark.parametrize("case", [Case(), Case("msds", FINE, (256, 300))], ids=str)
@@ -129,10 +131,12 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
 
 def test_a_running_graph_is_heard_and_recorded():
     told = []
-    point = run_case(Case(seconds=1.0), lambda seconds, words: told.append((seconds, words)))
+    case = Case(seconds=1.0, realtime=False)
+    point = run_case(case, lambda seconds, words: told.append((seconds, words)))
     assert len(point.heard["tracker/pose"]) > 40
     assert len(point.images) > 20
     assert point.lost == 0
+    assert point.values["scheduling"] == "ordinary"
     ages = [
         point.latency(topic, 50) for topic in ("probe/pose", "tissue/nodes", "ultrasound/image")
     ]

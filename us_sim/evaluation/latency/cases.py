@@ -32,6 +32,7 @@ class Case:
     recorder: bool = True
     viewer: bool = False  # somebody looks at the annotated image and the structures
     busy: bool = False  # something else keeps every core busy
+    realtime: bool = True  # the nodes go before ordinary programs, where the system allows that
     seconds: float = 20.0
 
     @property
@@ -46,7 +47,8 @@ class Case:
         parts += [self.placed] if self.placed != PLACED[0] else []
         parts += ["recorder"] if self.recorder else []
         parts += ["viewer"] if self.viewer else []
-        return ", ".join([*parts, "cores busy"] if self.busy else parts)
+        parts += ["cores busy"] if self.busy else []
+        return ", ".join([*parts, "as ordinary programs"] if not self.realtime else parts)
 
 
 LIVE = Case(mesh=FINE, seconds=300.0)
@@ -60,7 +62,7 @@ def cases(quick: bool) -> list[Case]:
     """Those of a run; of a quick one a few, for some seconds each."""
     base = Case()
     if quick:
-        chosen = [base, LIVE, DEMO, replace(DEMO, busy=True), replace(base, placed=PLACED[1])]
+        chosen = [base, LIVE, DEMO, *_beside(DEMO), replace(base, placed=PLACED[1])]
         return [replace(case, seconds=8.0) for case in chosen]
     return [
         base,
@@ -73,9 +75,15 @@ def cases(quick: bool) -> list[Case]:
         *(replace(base, solver=solver) for solver in ("fem_cg", "msds", "msds_implicit")),
         DEMO,
         replace(DEMO, viewer=True),
-        replace(DEMO, busy=True),
+        *_beside(DEMO),
         *(replace(DEMO, placed=placed) for placed in PLACED[1:]),
         LIVE,
         replace(LIVE, busy=True, seconds=base.seconds),
         replace(DEMO, mesh=FINE),
     ]
+
+
+def _beside(case: Case) -> list[Case]:
+    """The case beside something else that keeps every core busy, before it or not."""
+    busy = replace(case, busy=True)
+    return [busy, replace(busy, realtime=False)]

@@ -29,6 +29,7 @@ class Point(Row):
     heard: Mapping[str, Heard] = field(default_factory=dict)  # by topic, in their order
     recorded: int | None = None  # of the images that were heard; None without a recorder
     usage: Mapping[str, UsageOverTime] = field(default_factory=dict)  # by node
+    scheduling: str = "ordinary"  # or realtime: what the nodes got
     throughput: float = float("nan")  # images a second, in lockstep
     failure: str = ""
 
@@ -50,6 +51,7 @@ class Point(Row):
             "recorder": case.recorder,
             "viewer": case.viewer,
             "cores_busy": case.busy,
+            "scheduling": self.scheduling,
             "seconds": case.seconds,
             "poses": len(self._heard("tracker/pose")),
             "images": len(self.images),

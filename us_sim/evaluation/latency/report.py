@@ -18,7 +18,7 @@ from us_sim.evaluation.target import target_table
 __all__ = ["table", "write_report"]
 
 _HEAD = (
-    *("", "images/s", "dropped", "pose ms p50", "nodes ms p50", "p99"),
+    *("", "scheduling", "images/s", "dropped", "pose ms p50", "nodes ms p50", "p99"),
     *("image ms p50", "p99", "worst", "mm p50", "p99", "cores", "MB", "not recorded"),
 )
 
@@ -57,7 +57,8 @@ def write_report(folder: ReportFolder, points: Sequence[Point]) -> None:
         f"The arm's path is played again and again at {RATE:.0f} Hz; what comes in the first "
         f"seconds does not count. Memory is what is resident at the end. Cores are kept busy by "
         f"as many endless loops as there are cores, at the same priority. Methods run as their "
-        f"settings say by default, one thread a node.",
+        f"settings say by default, one thread a node. Scheduling is what the nodes got: realtime "
+        f"where they may go before ordinary programs, see their parameter `realtime`.",
     ]
     folder.write_report(parts, failures(points))
 
@@ -68,7 +69,7 @@ def _rows(points: Sequence[Point]) -> str:
         image, values = "ultrasound/image", point.values
         rows.append(
             (
-                *(str(point.case), _number(point.rate), str(point.dropped)),
+                *(str(point.case), point.scheduling, _number(point.rate), str(point.dropped)),
                 _number(point.latency("probe/pose", 50)),
                 *(_number(point.latency("tissue/nodes", percent)) for percent in (50, 99)),
                 *(_number(point.latency(image, percent)) for percent in (50, 99, 100)),

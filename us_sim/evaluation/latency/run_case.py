@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,7 +77,10 @@ def _in_lockstep(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
 
 def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
     file = folder / "session.mcap"
-    processes = simulation_nodes(scene, played=True)
+    processes = [
+        replace(process, given={"realtime": case.realtime})
+        for process in simulation_nodes(scene, played=True)
+    ]
     player = player_settings(scene, _path(scene), recorded=case.recorder) | {"loop": True}
     processes.append(NodeProcess("path_player", player))
     if case.recorder:
@@ -85,6 +88,7 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
     with listening(viewer=case.viewer) as arrivals, _started(case, processes, folder) as running:
         _await_images(arrivals, running, tell)
         usage: dict[str, UsageOverTime] = {node: UsageOverTime() for node in running.pids}
+        scheduling = running.scheduling
         began, began_ns = time.monotonic(), time.time_ns()
         while (passed := time.monotonic() - began) < case.seconds:
             running.check()
@@ -99,7 +103,7 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
             for topic in arrivals.topics
         }
     recorded = _recorded(file, {s for s, _ in heard["ultrasound/image"]}) if case.recorder else None
-    return Point(case, heard, recorded, usage)
+    return Point(case, heard, recorded, usage, scheduling)
 
 
 def _path(scene: Scene) -> Path:
@@ -114,6 +118,13 @@ class _Running:
     pids: Mapping[str, int]  # by node, or by how the nodes are placed
     ended: Callable[[], list[str]]  # which of them have
     log: Path | None = None
+
+    @property
+    def scheduling(self) -> str:
+        """As `scheduling_of` the node that has most to do."""
+        from us_sim.nodes.realtime import scheduling_of
+
+        return scheduling_of(self.pids.get("tissue_deformer") or next(iter(self.pids.values())))
 
     def check(self) -> None:
         """Raise UsSimError when one has ended."""

@@ -50,12 +50,12 @@ def _seen(point: Point | None, value: Callable[[Point], float]) -> float:
 
 def _alike(points: Sequence[Point], wanted: Case, *, busy: bool) -> Point | None:
     """The point of the wanted case, however long it was."""
-    same = (wanted.solver, wanted.mesh, wanted.image, wanted.placed, True, False, busy)
+    same = (wanted.solver, wanted.mesh, wanted.image, wanted.placed, True, False, busy, True)
     for point in points:
         case = point.case
         if same == (
             *(case.solver, case.mesh, case.image, case.placed),
-            *(case.recorder, case.viewer, case.busy),
+            *(case.recorder, case.viewer, case.busy, case.realtime),
         ):
             return point
     return None
