@@ -16,6 +16,7 @@ from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2, PointField
+from std_srvs.srv import Trigger
 
 from us_sim.errors import PoseError
 from us_sim.nodes import guarded_node, process
@@ -130,6 +131,19 @@ def test_a_request_that_fails_has_an_answer(bench, broken):
         bench.spin_until(answer.done)
         assert list(answer.result().results) == []
         assert broken.failures["service set"] == count
+
+
+def test_an_answer_does_not_say_that_what_failed_was_done(bench, broken):
+    def fail(_, response):
+        response.success = True
+        raise RuntimeError("a bug")
+
+    broken.create_service(Trigger, "pull", fail)
+    client = bench.peer.create_client(Trigger, "pull")
+    bench.spin_until(client.service_is_ready)
+    answer = client.call_async(Trigger.Request())
+    bench.spin_until(answer.done)
+    assert (answer.result().success, answer.result().message) == (False, guarded_node.FAILED)
 
 
 def test_a_parameter_whose_check_fails_is_refused(broken):

@@ -30,7 +30,8 @@ early.join()
 late = threading.Thread(target=lambda: policies.append(policy()))
 late.start()
 late.join()
-print(said, scheduling_of(os.getpid()), policies == ([os.SCHED_RR, os.SCHED_OTHER] if said == "realtime" else [0, 0]))
+expected = [os.SCHED_RR, os.SCHED_OTHER] if said == "realtime" else [0, 0]
+print(said, scheduling_of(os.getpid()), policies == expected)
 """
 
 

@@ -127,7 +127,10 @@ def test_stop_and_record(bench, quiet, tmp_path):
     call(bench, srv.Stop, "stop")
     assert read_bag(file).complete
     say(bench, recorder, note, "nobody records")
-    assert call(bench, srv.Record, "record", uri=str(file)).return_code == 1
+    for taken in (str(file), "/", ".", "a\0b", f"{'a' * 5000}.mcap"):
+        answer = call(bench, srv.Record, "record", uri=taken)
+        assert answer.return_code == 1
+        assert "exists already" in answer.error_string or "cannot be made" in answer.error_string
     other = tmp_path / "other" / "two.mcap"
     assert call(bench, srv.Record, "record", uri=str(other)).return_code == 0
     say(bench, recorder, note, "two")

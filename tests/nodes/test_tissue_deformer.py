@@ -98,7 +98,12 @@ def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is
     assert told.wait(timeout=20)
     bench.spin_until(lambda: node.health.state.startswith("fem, preparing for "))
     assert node.health.state.endswith(" s, compiling msds, kernel 7")
+    # Set back, it goes on as it is, and what was begun is never adopted.
+    assert node.set_parameters([Parameter("solver", value="fem")])[0].successful
+    assert node.health.state == "fem"
+    told.clear()
     may_end.set()
+    assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
     bench.spin_until(lambda: node.health.state == "msds")
 
 

@@ -246,8 +246,9 @@ def test_nothing_is_overwritten(tmp_path):
         BagWriter(tmp_path / "first.mcap")
     with pytest.raises(BagError, match=r"belongs to another recording.*second/second.mcap"):
         BagWriter(tmp_path / "second.mcap")
-    with pytest.raises(BagError, match="not empty"):
-        BagWriter(tmp_path)
+    for folder in (tmp_path, "/", ""):
+        with pytest.raises(BagError, match="not empty"):
+            BagWriter(folder)
     with BagWriter(tmp_path / "second/second.mcap"):
         pass
     assert len(list(tmp_path.iterdir())) == 3
@@ -255,7 +256,8 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_places_that_cannot_be_written(tmp_path):
     (tmp_path / "file").touch()
-    for path in (tmp_path / "file/session.mcap", Path("/proc/session.mcap")):
+    nameless = (tmp_path / "a\0b.mcap", tmp_path / "a\0b", tmp_path / f"{'a' * 5000}.mcap")
+    for path in (tmp_path / "file/session.mcap", Path("/proc/session.mcap"), *nameless):
         with pytest.raises(BagError, match="cannot be made"):
             BagWriter(path)
 

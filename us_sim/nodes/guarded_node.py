@@ -27,6 +27,9 @@ SAY_S = 1.0
 """How long the same failure is not said again."""
 HEADER_SIZE = 4
 """Bytes that every serialized message begins with."""
+FAILED = "it failed; see the node's log"
+_DONE, _CODE, _REASON = ("success", "successful"), ("return_code",), ("error_string", "message")
+"""Fields by which responses usually say whether what was asked for was done, and why not."""
 LONGEST = 500
 """Characters of a sentence: an error may quote all of a message."""
 
@@ -123,15 +126,15 @@ class GuardedNode(Node):
         return super().create_guard_condition(self._entered(_name(callback), callback), *args, **kw)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
-        """As `rclpy.node.Node.create_service`, guarded: a request that fails has its answer too."""
-        entered = self._entered(f"service {srv_name}", callback, lambda _, response: response)
+        """As `rclpy.node.Node.create_service`, guarded: a request that fails is told that."""
+        entered = self._entered(f"service {srv_name}", callback, _refusing)
         return super().create_service(srv_type, srv_name, entered, **options)
 
     def add_on_set_parameters_callback(self, callback: Any) -> None:
         """As `rclpy.node.Node.add_on_set_parameters_callback`: what fails refuses the change."""
 
         def refuse(_: Any) -> SetParametersResult:
-            return SetParametersResult(successful=False, reason="it failed; see the node's log")
+            return SetParametersResult(successful=False, reason=FAILED)
 
         super().add_on_set_parameters_callback(self.guarded("parameters", callback, refuse))
 
@@ -188,6 +191,18 @@ def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes],
 def kind_of(error: UsSimError) -> str:
     """What an error is counted as: ``pose`` of a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()
+
+
+def _refusing(_: Any, response: Any) -> Any:
+    """The response, which says that what was asked for has failed where it has a field for that."""
+    for name in response.get_fields_and_field_types():
+        if name in _DONE:
+            setattr(response, name, False)
+        elif name in _CODE:
+            setattr(response, name, 1)
+        elif name in _REASON:
+            setattr(response, name, FAILED)
+    return response
 
 
 def _name(callback: Any) -> str:

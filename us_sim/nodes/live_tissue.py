@@ -96,8 +96,16 @@ class LiveTissue:
         """Make ready what was set."""
         if values == self._asked:
             return
-        plan = self._plan(values)
         self._asked = dict(values)
+        if values == self._current:
+            self._preparation.drop()
+            self._node.health.state = self.state
+            self._node.get_logger().info(
+                f"set back: {self.tissue.name} goes on as it is, and what was being prepared is "
+                f"dropped"
+            )
+            return
+        plan = self._plan(values)
         if self._node.lockstep:
             self._settle(self._made(plan))
             return

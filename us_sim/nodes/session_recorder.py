@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from collections import deque
 from collections.abc import Mapping
@@ -134,7 +135,8 @@ class SessionRecorder(GuardedNode):
     def _begin(self, file: str, *, further: bool) -> None:
         """Open a file and let messages in."""
         settings = self._settings
-        taken = Path(file).with_name("metadata.yaml").exists() and Path(file).suffix == ".mcap"
+        beside = Path(file).parent / "metadata.yaml"
+        taken = file.endswith(".mcap") and os.path.exists(beside)
         if taken and not further:
             self.get_logger().info(
                 "metadata.yaml in this folder belongs to another recording, so none is written; "

@@ -76,17 +76,10 @@ class BagWriter:
     ) -> None:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
-        path = Path(path)
-        is_folder = path.suffix != ".mcap"
-        self._stem = path.resolve().name if is_folder else path.stem
-        self.path = path / f"{self._stem}_0.mcap" if is_folder else path
-        is_further = further and self.path.exists()
-        if is_further:
-            self.path, sidecar = self._further(), False
         self.custom_data = dict(custom_data or {})
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
         self.on_split: Callable[[str, str], None] | None = None
-        self._metadata_file = self.path.with_name("metadata.yaml") if sidecar else None
+        self._metadata_file: Path | None = None
         self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._flush_interval = round(flush_interval * 1e9)
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
@@ -95,13 +88,12 @@ class BagWriter:
         self._last_flush: int | None = None
         self._closed_because = ""
         self._ended = False
-        if not is_further:
-            self._refuse_to_overwrite(is_folder=is_folder, folder=path)
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._output = self._opened(self.path)
+            self._begin(Path(path), sidecar=sidecar, further=further)
         except OSError as error:
-            raise BagError(f"{self.path} cannot be made: {error.strerror}") from None
+            raise BagError(f"{path} cannot be made: {error.strerror}") from None
+        except ValueError as error:  # a name that no file can have
+            raise BagError(f"{path} cannot be made: {error}") from None
 
     @property
     def message_count(self) -> int:
@@ -285,6 +277,19 @@ class BagWriter:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _begin(self, path: Path, *, sidecar: bool, further: bool) -> None:
+        """Make the first file."""
+        is_folder = path.suffix != ".mcap"
+        self._stem = path.resolve().name if is_folder else path.stem
+        self.path = path / f"{self._stem}_0.mcap" if is_folder else path
+        if further and self.path.exists():
+            self.path = self._further()
+        else:
+            self._metadata_file = self.path.with_name("metadata.yaml") if sidecar else None
+            self._refuse_to_overwrite(is_folder=is_folder, folder=path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._output = self._opened(self.path)
 
     def _refuse_to_overwrite(self, *, is_folder: bool, folder: Path) -> None:
         if self.path.exists():

@@ -87,6 +87,17 @@ def test_what_was_made_and_not_taken_gives_way_to_a_newer_plan(preparation, tiss
     assert outcome_of(preparation).solver == "newest"
 
 
+def test_what_is_dropped_is_never_told(preparation, tissue):
+    preparation.want(Plan("first"))
+    assert tissue.has_begun.acquire(timeout=20)
+    preparation.drop()
+    assert preparation.state == ""
+    tissue.may_end.release()
+    preparation.want(Plan("newest"))
+    tissue.may_end.release()
+    assert outcome_of(preparation).solver == "newest"
+
+
 @pytest.mark.parametrize(
     ("name", "problem"),
     [("impossible", "it cannot be"), ("broken", "ZeroDivisionError: division by zero")],

@@ -33,7 +33,8 @@ class Preparation:
     def __init__(self, tissue: SwitchableTissue) -> None:
         self._tissue = tissue
         self._lock = threading.Lock()
-        self._wanted: Plan | None = None
+        self._wanted: Plan | None = None  # that no thread has begun with
+        self._newest: Plan | None = None
         self._outcome: Prepared | Failed | None = None
         self._thread: threading.Thread | None = None
         self._began = 0.0
@@ -43,19 +44,24 @@ class Preparation:
     def state(self) -> str:
         """For how long something is being made already, and how far it is; '' when nothing is."""
         with self._lock:
-            if self._thread is None:
+            if self._thread is None or self._newest is None:
                 return ""
             return f"preparing for {time.monotonic() - self._began:.0f} s{self._progress}"
 
     def want(self, plan: Plan) -> None:
         """Begin to make what a plan needs; what is still being made for another is then dropped."""
         with self._lock:
-            self._wanted = plan
+            self._wanted = self._newest = plan
             self._outcome = None
             if self._thread is None:
                 self._began = time.monotonic()
                 self._thread = threading.Thread(target=self._work, name="solver", daemon=True)
                 self._thread.start()
+
+    def drop(self) -> None:
+        """Want nothing any more; a thread ends with what it is making."""
+        with self._lock:
+            self._wanted = self._newest = self._outcome = None
 
     def take(self) -> Prepared | Failed | None:
         """The outcome of the newest plan, once; None until there is one."""
@@ -84,5 +90,5 @@ class Preparation:
                 _logger.exception("preparing %s", plan.solver)
                 outcome = Failed(plan, f"{type(error).__name__}: {error}")
             with self._lock:
-                if self._wanted is None:
+                if self._newest is plan:
                     self._outcome = outcome
