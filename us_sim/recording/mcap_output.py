@@ -11,11 +11,13 @@ The format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 import zstandard
@@ -38,7 +40,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-__all__ = ["MAGIC", "McapOutput"]
+__all__ = ["MAGIC", "McapOutput", "Place"]
 
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
@@ -65,6 +67,14 @@ class _WrittenChunk:
         """Lowest and highest log time, ns, and where in the file it begins."""
         first, last, begin = _PLACE.unpack_from(self.index)
         return first, last, begin
+
+
+class Place(Enum):
+    """Where a file is that is being written."""
+
+    HERE = "where it was made"
+    MOVED = "somewhere else"
+    REMOVED = "nowhere"
 
 
 class McapOutput:
@@ -98,6 +108,7 @@ class McapOutput:
         self._begin_chunk()
         self._size = 0  # bytes of whole records in the file
         self._file = path.open("xb", buffering=0)
+        self._tells_place = self._is_at_path  # some network's folders give no lasting numbers
         try:
             self._append([MAGIC, _bytes_of(Header("ros2", library))])
         except OSError:
@@ -105,6 +116,25 @@ class McapOutput:
             with contextlib.suppress(OSError):
                 path.unlink()
             raise
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the file has been closed."""
+        return self._file.closed
+
+    @property
+    def place(self) -> Place:
+        """Whether somebody else has taken the file away since it was made."""
+        if not self._tells_place or self._is_at_path:
+            return Place.HERE
+        return Place.MOVED if os.fstat(self._file.fileno()).st_nlink else Place.REMOVED
+
+    @property
+    def _is_at_path(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), os.stat(self.path))
+        except OSError:
+            return False
 
     @property
     def size(self) -> int:

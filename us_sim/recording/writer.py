@@ -17,14 +17,14 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
 from us_sim.errors import BagError
+from us_sim.recording.bag_names import BagNames
 from us_sim.recording.contents import Contents
-from us_sim.recording.mcap_output import McapOutput
+from us_sim.recording.mcap_output import McapOutput, Place
 
 __all__ = ["BagWriter"]
 
@@ -40,7 +40,8 @@ class BagWriter:
     or with :meth:`flush`, and then survives the end of the process.
 
     Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
-    one when there is room again, and :attr:`lost` tells what did not fit.
+    one when there is room again, and :attr:`lost` tells what did not fit. Where somebody takes the
+    file away, that is an error as well, and writing goes on in another one at once.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -79,7 +80,6 @@ class BagWriter:
         self.custom_data = dict(custom_data or {})
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
         self.on_split: Callable[[str, str], None] | None = None
-        self._metadata_file: Path | None = None
         self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._flush_interval = round(flush_interval * 1e9)
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
@@ -87,18 +87,26 @@ class BagWriter:
         self._attachments: dict[str, tuple[str, bytes, int]] = {}
         self._last_flush: int | None = None
         self._closed_because = ""
+        self._taken_away: list[str] = []  # what happened to files, as nobody has been told yet
         self._ended = False
         try:
-            self._begin(Path(path), sidecar=sidecar, further=further)
+            self._names = BagNames(Path(path), sidecar=sidecar, further=further)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._output = self._opened(self.path)
         except OSError as error:
             raise BagError(f"{path} cannot be made: {error.strerror}") from None
         except ValueError as error:  # a name that no file can have
             raise BagError(f"{path} cannot be made: {error}") from None
 
     @property
+    def path(self) -> Path:
+        """The first file."""
+        return self._names.first
+
+    @property
     def message_count(self) -> int:
         """Number of messages written."""
-        present = 0 if self._is_finished else self._output.message_count
+        present = 0 if self._output.is_finished else self._output.message_count
         return sum(file.message_count for file in self._contents.files) + present
 
     @property
@@ -211,38 +219,40 @@ class BagWriter:
         """Ends the chunk and hands everything to the operating system.
 
         Raises:
-            BagError: the bag is closed, or the disk is full.
+            BagError: the bag is closed, the disk is full, or the file was taken away.
         """
         with self._writing():
             self._output.end_chunk()
+            if self._output.place is not Place.HERE:
+                self._go_on()
+        self._tell_taken_away(f"; the recording goes on in {self._output.path}")
 
     def split(self) -> None:
         """Ends the present file and goes on in a further one.
 
         Raises:
-            BagError: the bag is closed, or the disk is full.
+            BagError: the bag is closed, the disk is full, or the file was taken away.
         """
         with self._writing():
-            self._add_metadata(self._output)
-            closed = self._output.path
-            self._finish()
-            self._output = self._opened(self._further())
-        if self.on_split is not None:
-            self.on_split(str(closed), str(self._output.path))
+            self._go_on()
+        self._tell_taken_away(f"; the recording goes on in {self._output.path}")
 
     def resume(self) -> bool:
         """After the disk was full: whether there is room again, and a further file is begun."""
-        if self._closed_because and shutil.disk_usage(self.path.parent).free >= _ROOM:
+        if self._closed_because:
             with contextlib.suppress(OSError):
-                self._output = self._opened(self._further())
-                self._closed_because = ""
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                if shutil.disk_usage(self.path.parent).free >= _ROOM:
+                    self._output = self._opened(self._names.further())
+                    self._closed_because = ""
         return not self._closed_because
 
     def close(self) -> None:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full; what was written before stays readable.
+            BagError: the disk is full; what was written before stays readable. Or the file was
+                taken away.
         """
         self._ended = True
         if not self._closed_because:
@@ -252,9 +262,13 @@ class BagWriter:
             self._closed_because = f"{self.path} is closed: nothing can be written to it any more"
             if self.on_split is not None:
                 self.on_split(str(self._output.path), "")
-        if self._metadata_file is None:
+        self._write_metadata_file()
+        self._tell_taken_away()
+
+    def _write_metadata_file(self) -> None:
+        metadata_file, self._names.metadata = self._names.metadata, None
+        if metadata_file is None or not self._contents.files:
             return
-        metadata_file, self._metadata_file = self._metadata_file, None
         try:
             with metadata_file.open("x", encoding="utf-8") as file:
                 file.write(self._contents.metadata(None, self.custom_data).document())
@@ -278,37 +292,6 @@ class BagWriter:
     ) -> None:
         self.close()
 
-    def _begin(self, path: Path, *, sidecar: bool, further: bool) -> None:
-        """Make the first file."""
-        is_folder = path.suffix != ".mcap"
-        self._stem = path.resolve().name if is_folder else path.stem
-        self.path = path / f"{self._stem}_0.mcap" if is_folder else path
-        if further and self.path.exists():
-            self.path = self._further()
-        else:
-            self._metadata_file = self.path.with_name("metadata.yaml") if sidecar else None
-            self._refuse_to_overwrite(is_folder=is_folder, folder=path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._output = self._opened(self.path)
-
-    def _refuse_to_overwrite(self, *, is_folder: bool, folder: Path) -> None:
-        if self.path.exists():
-            raise BagError(f"{self.path} exists already: choose another name or remove it")
-        if is_folder and folder.is_dir() and any(folder.iterdir()):
-            raise BagError(f"{folder} exists already and is not empty: choose another name")
-        if self._metadata_file is not None and self._metadata_file.exists():
-            own = self.path.with_suffix("") / self.path.name
-            raise BagError(
-                f"{self._metadata_file} belongs to another recording: record into a folder of its "
-                f"own, such as {own}"
-            )
-
-    @property
-    def _is_finished(self) -> bool:
-        """Whether the present file has been closed."""
-        files = self._contents.files
-        return bool(files) and files[-1].path == self._output.path.name
-
     def _is_long(self, time: int) -> bool:
         """Whether the file is as large or long as one may be, before a message of that time."""
         file = self._output
@@ -316,14 +299,6 @@ class BagWriter:
             return True
         late = file.start is not None and time - file.start > self._max_duration
         return bool(self._max_duration and late)
-
-    def _further(self) -> Path:
-        """The next file's name."""
-        numbers = count(1)
-        while True:
-            path = self.path.with_name(f"{self._stem}_{next(numbers)}.mcap")
-            if not path.exists():
-                return path
 
     def _opened(self, path: Path) -> McapOutput:
         """A new file that knows all topics so far, with what is attached."""
@@ -354,21 +329,55 @@ class BagWriter:
         except OSError as error:
             with contextlib.suppress(OSError):
                 self._finish()
+            kept = f"its first {self._output.message_count} messages are kept and can be read"
+            if self._taken_away:
+                kept = "; ".join(self._taken_away)
+                self._taken_away.clear()
             self._closed_because = (
-                f"{self._output.path} cannot be written ({error.strerror}): the recording stops, "
-                f"and its first {self.message_count} messages are kept and can be read"
+                f"{error.filename or self._output.path} cannot be written ({error.strerror}): "
+                f"the recording stops, and {kept}"
             )
             raise BagError(self._closed_because) from None
 
+    def _go_on(self) -> None:
+        """End the present file, and begin a further one."""
+        closed = self._output
+        self._add_metadata(closed)
+        self._finish()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._output = self._opened(self._names.further())
+        if self.on_split is not None:
+            self.on_split(str(closed.path), str(self._output.path))
+
     def _finish(self) -> None:
         """Give the present file its index, close it and count what is in it."""
-        if self._is_finished:
+        file = self._output
+        if file.is_finished:
             return
+        place = file.place
         try:
-            self._output.finish()
+            file.finish()
         finally:
-            self._contents.keep(self._output)
-            self.lost += self._output.dropped
+            self.lost += file.dropped
+            if place is Place.HERE:
+                self._contents.keep(file)
+            elif place is Place.MOVED:
+                self._taken_away.append(
+                    f"{file.path} was moved away while it was recorded, with "
+                    f"{file.message_count} messages"
+                )
+            else:
+                self.lost += file.counts
+                self._taken_away.append(
+                    f"{file.path} was removed while it was recorded: {file.message_count} messages "
+                    f"are lost with it"
+                )
+
+    def _tell_taken_away(self, then: str = "") -> None:
+        """Raise BagError where a file was taken away, once."""
+        told, self._taken_away = "; ".join(self._taken_away), []
+        if told:
+            raise BagError(told + then)
 
     def _add_metadata(self, output: McapOutput) -> None:
         lines = self._contents.metadata(output, self.custom_data).lines()
