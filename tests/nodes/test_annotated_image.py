@@ -174,6 +174,14 @@ def test_poses_of_another_clock_are_live_when_they_come_and_missed_when_they_do_
     bench.spin_until(lambda: pictures and frame(pictures[-1]) == AMBER)
 
 
+def test_setting_the_clock_makes_no_pose_old(show):
+    node = show(stale_after=10.0)
+    for simulated in (True, False):  # to 1970, and back to the present
+        node.annotated.pose_came(node.stamp())
+        assert node.set_parameters([Parameter("use_sim_time", value=simulated)])[0].successful
+        assert node.annotated.state == "live"
+
+
 def test_an_image_that_lags_behind_live_poses_is_marked(bench, show):
     node = show(stale_after=0.5, lost_after=60.0)
     pictures = subscribed(bench, node)

@@ -44,7 +44,9 @@ def test_many_are_counted():
 
 def test_images_that_are_not_in_the_recording_are_said(files):
     lacking = outcome(files=files[:1], recorded=64, made=440, poses=None)
-    assert lacking.sentence() == "64 images were recorded of 440 that were made"
+    assert lacking.sentence() == (
+        "64 images were recorded of 440 that were made; the recording is in session.mcap"
+    )
 
 
 def test_the_summary_has_all_of_it(files):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 from builtin_interfaces.msg import Time as TimeMessage
 
 from us_sim.nodes.conversions import nanoseconds_of
@@ -19,8 +21,9 @@ class PoseAge:
     """How long ago the newest pose came, and what that makes of an image at it.
 
     A pose ages from its arrival: its stamp may be of another clock, such as that of a tracker
-    which is ahead, or of the day it was recorded. How long is too long are the parameters of
-    `PoseAgeSettings`.
+    which is ahead, or of the day it was recorded. It ages while ROS's time goes on, and never by
+    more than has really passed: that time may be set, and stands still while a bag is paused. How
+    long is too long are the parameters of `PoseAgeSettings`.
 
     Args:
         node: whose clock is used, and which gets the parameters.
@@ -28,7 +31,7 @@ class PoseAge:
 
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
-        self._arrivals: dict[int, int] = {}  # ns, by stamps in ns
+        self._arrivals: dict[int, tuple[int, int]] = {}  # ns, as `_now`, by stamps in ns
         self._settings = LiveSettings(node, {"age": Group(PoseAgeSettings())})
 
     def came(self, stamp: TimeMessage) -> None:
@@ -66,10 +69,12 @@ class PoseAge:
 
     def _since(self, stamp: int) -> float:
         """s since the pose with that stamp came."""
-        now = self._now()
-        if self._arrivals[stamp] > now:  # time was set back, as when a bag starts again
-            self._arrivals[stamp] = now
-        return 1e-9 * (now - self._arrivals[stamp])
+        now, real = self._now()
+        came, really = self._arrivals[stamp]
+        if came > now:  # time was set back, as when a bag starts again
+            self._arrivals[stamp] = came, really = now, real
+        return 1e-9 * min(now - came, real - really)
 
-    def _now(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
+    def _now(self) -> tuple[int, int]:
+        """ns of ROS's time, and of one that nobody sets."""
+        return int(self._node.get_clock().now().nanoseconds), time.monotonic_ns()

@@ -242,7 +242,7 @@ class SessionRecorder(GuardedNode):
         self._told = lost
         self.health.dropped = bag.losses.total
         while bag.untold:
-            self.health.problem("disk", bag.untold.popleft())
+            self.health.problem(*bag.untold.popleft())
         if new:
             self._events.lost(new)
             count = sum(map(sum, new.values()))

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, FileTakenError
 from us_sim.recording.losses import Loss, Losses, news
 from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import LOST
@@ -60,7 +60,8 @@ class WriteBehind:
     def __init__(self, bag: BagWriter, max_cache_size: int) -> None:
         self.losses = Losses()
         self.problem = ""  # why nothing is written at present
-        self.untold: deque[str] = deque(maxlen=100)  # problems, for whoever tells a person
+        #: Problems for whoever tells a person: ``disk`` or ``file``, and a sentence.
+        self.untold: deque[tuple[str, str]] = deque(maxlen=100)
         self._bag = bag
         self._limit = max_cache_size
         self._waiting: list[Message | Callable[[], None]] = []
@@ -129,7 +130,7 @@ class WriteBehind:
         """Write what waits, and close the bag.
 
         Raises:
-            BagError: the disk is full; what was written before stays readable.
+            BagError: as `BagWriter.close`.
         """
         with self._changed:
             self._ending = True
@@ -192,6 +193,8 @@ class WriteBehind:
         """Work on the bag; a message of that topic is lost if it fails."""
         try:
             work()
+        except FileTakenError as error:
+            self._complain(str(error), "file")
         except BagError as error:
             self._complain(str(error))
         except Exception as error:  # nothing may end the thread, and nothing be lost unsaid
@@ -203,10 +206,10 @@ class WriteBehind:
                 self.losses.add(name, in_recorder=count)
             self._disk_lost = self._bag.lost.copy()
 
-    def _complain(self, problem: str) -> None:
+    def _complain(self, problem: str, kind: str = "disk") -> None:
         if problem != self.problem:
             self.problem = problem
-            self.untold.append(problem)
+            self.untold.append((kind, problem))
 
     def _note_losses(self) -> None:
         """Say in the file what is missing, if more is missing than it says."""

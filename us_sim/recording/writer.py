@@ -21,7 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, FileTakenError
 from us_sim.recording.bag_names import BagNames
 from us_sim.recording.contents import Contents
 from us_sim.recording.mcap_output import McapOutput, Place
@@ -219,7 +219,8 @@ class BagWriter:
         """Ends the chunk and hands everything to the operating system.
 
         Raises:
-            BagError: the bag is closed, the disk is full, or the file was taken away.
+            BagError: the bag is closed, or the disk is full.
+            FileTakenError: the file was removed or moved.
         """
         with self._writing():
             self._output.end_chunk()
@@ -231,7 +232,8 @@ class BagWriter:
         """Ends the present file and goes on in a further one.
 
         Raises:
-            BagError: the bag is closed, the disk is full, or the file was taken away.
+            BagError: the bag is closed, or the disk is full.
+            FileTakenError: the file was removed or moved.
         """
         with self._writing():
             self._go_on()
@@ -251,8 +253,8 @@ class BagWriter:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full; what was written before stays readable. Or the file was
-                taken away.
+            BagError: the disk is full; what was written before stays readable.
+            FileTakenError: the file was removed or moved.
         """
         self._ended = True
         if not self._closed_because:
@@ -374,10 +376,10 @@ class BagWriter:
                 )
 
     def _tell_taken_away(self, then: str = "") -> None:
-        """Raise BagError where a file was taken away, once."""
+        """Raise FileTakenError where a file was taken away, once."""
         told, self._taken_away = "; ".join(self._taken_away), []
         if told:
-            raise BagError(told + then)
+            raise FileTakenError(told + then)
 
     def _add_metadata(self, output: McapOutput) -> None:
         lines = self._contents.metadata(output, self.custom_data).lines()

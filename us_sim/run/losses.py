@@ -73,7 +73,7 @@ class Outcome:
             if self.recorded < self.made:
                 of = f" of {self.made} that were made"
             told.append(f"{self.recorded} images were recorded{of}")
-        if len(self.files) > 1:
+        if self.files:
             told.append(f"the recording is in {_listed([file.name for file in self.files])}")
         return "; ".join(told) if self.losses or self._lacks_images else ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 
+from us_sim.errors import StampError
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
@@ -51,5 +52,9 @@ class OpenIGTLinkInput(TrackerInput):
             problems, self._problems = self._problems, {}
         for kind, sentence in problems.items():
             self._device.refuse(kind, sentence)
-        if measurement is not None:
+        if measurement is None:
+            return
+        try:
             self._device.take(measurement)
+        except StampError as error:
+            self._device.refuse("stamp", f"{self._client.place}: {error}; it is not used")

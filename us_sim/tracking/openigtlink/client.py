@@ -61,7 +61,8 @@ class OpenIGTLinkClient:
         self._settings = settings
         self._body = body
         self._take, self._problem, self._say_connected = take, problem, connected
-        self._place = f"{settings.host}:{settings.port}"
+        #: The server's address, for a person.
+        self.place = f"{settings.host}:{settings.port}"
         self._names: dict[str, None] = {}
         self._heard = time.monotonic()
         self._stamp = 0  # ns, of the newest pose handed on
@@ -88,7 +89,7 @@ class OpenIGTLinkClient:
                     why = getattr(error, "strerror", None) or error
                     self._problem(
                         "connection",
-                        f"no poses from an OpenIGTLink server at {self._place} ({why}): start it, "
+                        f"no poses from an OpenIGTLink server at {self.place} ({why}): start it, "
                         f"or set tracker.openigtlink in the scene; it is tried again",
                     )
             self._closing.wait(_RETRY_S)
@@ -123,7 +124,7 @@ class OpenIGTLinkClient:
             poses = poses_in(header, body)
         except TrackingError as error:
             if self._is_wanted(header.device) or header.kind.endswith("TDATA"):
-                self._problem("message", f"{self._place}: {error}; it is not used")
+                self._problem("message", f"{self.place}: {error}; it is not used")
             return
         for name, matrix in poses:
             if not self._is_wanted(name):
@@ -132,11 +133,11 @@ class OpenIGTLinkClient:
             try:
                 pose = self._in_metres(matrix)
             except PoseError as error:
-                self._problem("pose", f"{self._place}: {name}: {error}; it is not used")
+                self._problem("pose", f"{self.place}: {name}: {error}; it is not used")
                 continue
             if header.stamp and header.stamp == self._stamp:
                 # Some servers repeat the last pose of a body that they do not see.
-                self._problem("repeated", f"{self._place}: {name} is only a repeat; it is not used")
+                self._problem("repeated", f"{self.place}: {name} is only a repeat; it is not used")
                 continue
             self._stamp = header.stamp
             self._take(Measurement(header.stamp, pose))
@@ -157,7 +158,7 @@ class OpenIGTLinkClient:
             self._heard = time.monotonic()
             self._problem(
                 "body",
-                f"{self._place} sends no poses of {wanted}: set tracker.body in the scene to one "
+                f"{self.place} sends no poses of {wanted}: set tracker.body in the scene to one "
                 f"of {', '.join(self._names)}",
             )
         return False
