@@ -92,7 +92,11 @@ aruco_bc_markers:
     body = read_rigid_body(path)
     assert (body.dictionary, body.ids.tolist()) == ("ARUCO_MIP_36h12", [81])
     assert np.allclose(body.corners, RigidBody.single("ARUCO_MIP_36h12", 81, 0.04).corners)
-    path.write_text(path.read_text().replace("InfoType: 1", "InfoType: 0"))
+    known = path.read_text()
+    path.write_text(known.replace("id: 81", f"id: {2**70}"))
+    with pytest.raises(TrackingError, match=f"marker {2**70}: dictionary .* has only markers 0 to"):
+        read_rigid_body(path)
+    path.write_text(known.replace("InfoType: 1", "InfoType: 0"))
     with pytest.raises(TrackingError, match="its markers are in pixels"):
         read_rigid_body(path)
 
@@ -130,6 +134,8 @@ def test_boards_are_read(tmp_path):
     [
         ("a.txt", "", "there is no marker in it"),
         ("a.txt", "1 2 3", "line 1: a marker has 16 numbers"),
+        ("a.txt", f"inf{' 0' * 15}", "line 1: a marker has 16 numbers"),
+        ("a.txt", f"1e30{' 0' * 15}", "markers 0 to 1023"),
         ("a.txt", "# markers\none 2 3", "line 2: 'one 2 3' is not a row of numbers"),
         ("a.yaml", "[1]", "must be a mapping"),
         ("a.yaml", "{a: [", "not a YAML file"),

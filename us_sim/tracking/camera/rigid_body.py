@@ -83,7 +83,7 @@ class RigidBody:
     chessboard: Chessboard | None = None
 
     def __post_init__(self) -> None:
-        ids = np.array(self.ids, dtype=np.int64)
+        ids = np.array(self.ids)
         corners = np.array(self.corners, dtype=np.float64)
         object.__setattr__(self, "dictionary", proper_name(self.dictionary))
         if ids.ndim != 1 or not len(ids) or corners.shape != (len(ids), 4, 3):
@@ -94,6 +94,7 @@ class RigidBody:
         for number, quadrilateral in zip(ids.tolist(), corners, strict=True):
             _require_in_dictionary(self.dictionary, number)
             _require_marker(number, quadrilateral)
+        ids = ids.astype(np.int64)
         numbers, counts = np.unique(ids, return_counts=True)
         if counts.max() > 1:
             raise TrackingError(f"marker {numbers[counts.argmax()]} is in the body twice")

@@ -200,7 +200,7 @@ def _table(text: str, dictionary: str) -> RigidBody:
             raise TrackingError(
                 f"line {number}: {line.strip()!r} is not a row of numbers"
             ) from None
-        if len(values) != 16 or values[0] != int(values[0]):
+        if len(values) != 16 or not values[0].is_integer():
             raise TrackingError(
                 f"line {number}: a marker has 16 numbers (its number, the middle and four corners "
                 f"in mm), not {len(values)}"
