@@ -23,17 +23,18 @@ from typing import Any
 
 import numpy as np
 
+from tests.fuzz.good_input import good_input
 from us_sim.evaluation.latency.usage import usage_of
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.settings import NODES
 from us_sim.progress import Progress
 from us_sim.run.graph import NodeProcess, ProcessGroup, keep_on_this_host, simulation_nodes
 from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
 from us_sim.settings.setting import kinds_of
 
 import rclpy  # isort: skip - provided by us_sim.nodes where ROS 2 is not installed
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 from rcl_interfaces import srv
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -197,13 +198,12 @@ def edge_of(kind: str, rng: random.Random) -> int:
 class Attack:
     """A graph that runs, and what is sent to it."""
 
-    def __init__(self, processes: list[NodeProcess], source: str, folder: Path, seed: int) -> None:
+    def __init__(self, processes: list[NodeProcess], scene: Scene, folder: Path, seed: int) -> None:
         self._rng = random.Random(seed)
         self._group = ProcessGroup(folder / "nodes.log")
         self._group.start(processes)
         self._node = GuardedNode("attacker")  # what it sends comes back to it, too
-        self._pose = self._node.create_publisher(PoseStamped, "tracker/pose", 10)
-        self._played = source == "pose"
+        self._input = good_input(self._node, scene)
         self._sent: deque[tuple[str, bytes]] = deque(maxlen=ROUND)
         self._reported: dict[str, float] = {}
         self._images: set[int] = set()
@@ -220,8 +220,8 @@ class Attack:
         self._spin(2.0)
         topics = self._topics()
         for number in range(60):
-            if self._played:
-                self._send_pose(number)
+            if self._input is not None:
+                self._input.send(number)
             self._spin(0.05)
         for topic in topics:
             topic.begin(self._node)
@@ -283,28 +283,19 @@ class Attack:
         self._good.clear()  # what is spoiled has stamps from before
         self._bad_nodes = 0
         while time.monotonic() - began < PATIENCE:
-            if self._played:
-                sent.append(self._send_pose(len(sent)))
+            if self._input is not None:
+                sent.append(self._input.send(len(sent)))
                 self._good.add(sent[-1])
             self._spin(0.05)
             self._require_all()
             silent = [n for n in self._group.pids if time.monotonic() - self._reported[n] > 5.0]
-            there = not self._played or len(self._images & set(sent[5:])) > 5
+            there = self._input is None or len(self._images & set(sent[5:])) > 5
             if there and not silent:
                 break
         else:
             raise RuntimeError(f"{', '.join(silent)} silent" if silent else "poses give no images")
         if self._bad_nodes:
             raise RuntimeError("tissue/nodes is not finite")
-
-    def _send_pose(self, number: int) -> int:
-        message = PoseStamped()
-        stamp = self._node.get_clock().now()
-        message.header.stamp = stamp.to_msg()
-        message.header.frame_id = "patient"
-        message.pose.position.z = 0.004 + 1e-5 * (number % 100)
-        self._pose.publish(message)
-        return int(stamp.nanoseconds)
 
     def write_down(self, file: Path) -> None:
         """What was sent in the last round."""
@@ -365,7 +356,7 @@ def _attack(name: str, args: argparse.Namespace) -> int:
             for number in range(rounds):
                 if attack is None:
                     place = Path(tempfile.mkdtemp(dir=folder))
-                    attack = Attack(processes, scene.tracker.source.name, place, args.seed + number)
+                    attack = Attack(processes, scene, place, args.seed + number)
                 if fault := attack.round():
                     failed += 1
                     args.out.mkdir(parents=True, exist_ok=True)
