@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 NODES = [
     "camera_driver",
     "haptic_renderer",
+    "image_writer",
     "openigtlink_bridge",
     "path_player",
     "probe_tracker",

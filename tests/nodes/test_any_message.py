@@ -343,6 +343,12 @@ def test_no_message_ends_the_rendering_for_the_hand(bench, small_scene, tmp_path
     assert all(map(is_finite, wrenches))
 
 
+def test_a_folder_for_images_that_cannot_be_made_is_refused(bench, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsSimError, match=r"the folder .*images cannot be made: Not a directory"):
+        bench.make(ImageWriter, folder=str(tmp_path / "file" / "images"))
+
+
 def test_no_image_ends_the_writing_of_images(bench, tmp_path):
     node = bench.make(ImageWriter, folder=str(tmp_path))
     node.health = Health(node, "images")

@@ -3,6 +3,8 @@
 The camera is one of paper: an object in place of OpenCV's capture, since no hardware is here.
 """
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -154,6 +156,7 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
     [
         ({"source": "nothing.avi"}, "there is no such file"),
         ({"source": "{text}"}, "no video that OpenCV can read"),
+        ({"source": "{pipe}"}, "neither a file nor a device"),
         (
             {"source": "0", "encoding": "yuv"},
             "encoding: 'yuv' is not one of mono8, bgr8",
@@ -165,6 +168,7 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
 def test_what_cannot_be_used_is_refused_in_a_sentence(bench, tmp_path, bad, sentence):
     text = tmp_path / "text.avi"
     text.write_text("no video\n")
-    bad = {key: value.format(text=text) for key, value in bad.items()}
+    os.mkfifo(tmp_path / "pipe.avi")
+    bad = {k: v.format(text=text, pipe=tmp_path / "pipe.avi") for k, v in bad.items()}
     with pytest.raises(UsSimError, match=sentence):
         bench.make(CameraDriver, **bad)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import errno
+import hashlib
+import os
 import sys
 import threading
 from pathlib import Path
@@ -194,11 +196,24 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
     assert replace(again, path=None, origin="") == replace(load_scene(scene), path=None, origin="")
 
 
-def test_a_missing_attachment_is_refused(bench, tmp_path):
-    with pytest.raises(BagError, match=r"none\.yaml cannot be attached: No such file"):
-        bench.make(
-            SessionRecorder, file=str(tmp_path / "a.mcap"), attach=[str(tmp_path / "none.yaml")]
-        )
+@pytest.mark.parametrize(
+    ("name", "why"), [("none.yaml", "No such file"), ("pipe", "it is no file"), (".", "no file")]
+)
+def test_what_cannot_be_attached_is_refused(bench, tmp_path, name, why):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BagError, match=f"cannot be attached: .*{why}"):
+        bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), attach=[str(tmp_path / name)])
+
+
+def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):
+    large = tmp_path / "large.bin"
+    large.write_bytes(bytes(5 << 20))
+    file = tmp_path / "a.mcap"
+    end(bench, bench.make(SessionRecorder, file=str(file), attach=[str(large)]))
+    made = {path.name: path for path in extract(file, tmp_path / "out")}
+    checksum = hashlib.sha256(bytes(5 << 20)).hexdigest()
+    assert made["files.txt"].read_text() == f"{checksum}  {large}\n"
+    assert large.name not in made
 
 
 @newer_than_jazzy

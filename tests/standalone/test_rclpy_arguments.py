@@ -174,8 +174,9 @@ def test_unknown_arguments_are_told() -> None:
 def test_files_that_are_no_parameter_files_are_refused(tmp_path: Path, text: str) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(text)
-    with pytest.raises(RuntimeError, match="Couldn't parse params file"):
-        rclpy.init(context=Context(), args=["--ros-args", "--params-file", str(file)])
+    for path in (str(file), "/dev/zero"):
+        with pytest.raises(RuntimeError, match="Couldn't parse params file"):
+            rclpy.init(context=Context(), args=["--ros-args", "--params-file", path])
 
 
 def test_log_levels_come_from_arguments(bench_with) -> None:

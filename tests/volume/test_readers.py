@@ -245,6 +245,8 @@ def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch
         ("space origin: (0,0,0)", "space origin: (0,0,nan)", "vectors of three finite numbers"),
         ("encoding: raw", "encoding: hex", "in the encoding 'hex'"),
         ("encoding: raw", "encoding: raw\nencoding: gzip", "has 'encoding' twice"),
+        ("kinds: ", f"kinks: {3000 * '0'}\nkinds: ", "a line of 3007 characters"),
+        ("kinds: ", f"{3000 * 'k'}\nkinds: ", "a line of 3000 characters"),
     ],
 )
 def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message):
@@ -255,6 +257,14 @@ def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message
     path.write_bytes(content.replace(old.encode(), new.encode()))
     with pytest.raises(VolumeError, match=message):
         read_volume(path)
+
+
+def test_an_nrrd_header_may_say_much_in_its_own_words(tmp_path):
+    path = tmp_path / "a.nrrd"
+    sitk.WriteImage(sitk.GetImageFromArray(GREY.transpose(2, 1, 0)), str(path))
+    words = f"# {3000 * 'a'}\nterminology:={3000 * 'b'}\nencoding: "
+    path.write_bytes(path.read_bytes().replace(b"encoding: ", words.encode()))
+    np.testing.assert_array_equal(read_volume(path).intensities, GREY)
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except MemoryError:
+        print("us-sim: there is not enough memory", file=sys.stderr)
+        return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)

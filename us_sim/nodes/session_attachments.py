@@ -36,27 +36,45 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
     attached = {"versions.txt": ("text/plain", versions().encode())}
     if settings.parameters:
         attached["parameters.yaml"] = "application/yaml", settings.parameters.encode()
+    listed: dict[Path, str] = {}  # checksums
     for name in settings.attach:
-        _attach(attached, Path(name).expanduser())
+        path = Path(name).expanduser()
+        try:
+            is_large = path.stat().st_size > LARGEST
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise BagError(f"{path} cannot be attached: {why}") from None
+        if not path.is_file():
+            raise BagError(f"{path} cannot be attached: it is no file")
+        if is_large:
+            listed[path] = _checksum(path)
+        else:
+            _attach(attached, path)
     if settings.scene is not None:
-        _attach_scene(attached, settings.scene, settings.volume)
+        listed |= _attach_scene(attached, settings.scene, settings.volume)
+    if listed:
+        lines = [f"{checksum}  {path}\n" for path, checksum in sorted(listed.items())]
+        attached["files.txt"] = "text/plain", "".join(lines).encode()
     return attached
 
 
-def _attach_scene(attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None) -> None:
+def _attach_scene(
+    attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None
+) -> dict[Path, str]:
+    """Attach a scene and its small files; the checksums of all its files."""
     document, _ = read_document(find_scene(scene), find_scene)
     if volume:
         kept = {key: value for key, value in document["volume"].items() if key != "phantom"}
         document["volume"] = kept | {"file": volume}
-    listed, places = [], {}
+    listed: dict[Path, str] = {}
+    places = {}
     for path in sorted(set(_files(load_scene(scene, volume=volume)))):
         small = path.is_file() and path.stat().st_size <= LARGEST
         places[path] = path.name if small and _attach(attached, path) else str(path)
-        listed.append(f"{_checksum(path)}  {path}")
+        listed[path] = _checksum(path)
     text = yaml.safe_dump(_placed(document, places), sort_keys=False, allow_unicode=True)
     attached["scene.yaml"] = "application/yaml", text.encode()
-    if listed:
-        attached["files.txt"] = "text/plain", "\n".join([*listed, ""]).encode()
+    return listed
 
 
 def _attach(attached: dict[str, tuple[str, bytes]], path: Path) -> bool:

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
+from us_sim.run.parameter_texts import require_texts
 from us_sim.scene.scene import Scene
 
 __all__ = [
@@ -61,6 +62,9 @@ class NodeProcess:
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
+
+    def __post_init__(self) -> None:
+        require_texts(self.all_parameters)
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
@@ -289,7 +293,12 @@ class _Running:
         self.told = False  # that it has ended
         self._show = show
         self.reader = threading.Thread(target=self._read, daemon=True)
-        self.reader.start()
+        try:
+            self.reader.start()
+        except RuntimeError as error:
+            self.process.kill()
+            self.process.wait()
+            raise UsSimError(f"{node.node} cannot be followed: {error}") from None
 
     def _read(self) -> None:
         assert self.process.stdout is not None

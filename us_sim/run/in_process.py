@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from us_sim.errors import UsSimError
+from us_sim.run.parameter_texts import require_texts
 
 __all__ = ["node_in_process"]
 
@@ -21,6 +22,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
     from rclpy.exceptions import ParameterException
     from rclpy.parameter import Parameter
 
+    require_texts(parameters)
     kind = "".join(word.capitalize() for word in name.split("_"))
     make = getattr(importlib.import_module(f"us_sim.nodes.{name}"), kind)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]

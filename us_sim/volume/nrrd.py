@@ -25,6 +25,10 @@ __all__ = ["nrrd_voxels"]
 
 _LARGEST_HEADER = 1 << 20
 
+_LONGEST_FIELD = 1000
+"""Characters: what ITK's reader says of a line that it cannot use is written to a place of about
+two thousand."""
+
 _TYPES = {
     1: "signed char|int8|int8_t|uchar|unsigned char|uint8|uint8_t",
     2: "short|short int|signed short|signed short int|int16|int16_t"
@@ -126,6 +130,12 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
         while line := file.readline(_LARGEST_HEADER).decode("latin-1").rstrip("\r\n"):
             key, colon, value = line.partition(": ")
             key = key.strip().lower()
+            free = line.startswith("#") or (":=" in line and not colon)
+            if len(line) > _LONGEST_FIELD and not free:
+                raise VolumeError(
+                    f"{path}: its header has a line of {len(line)} characters, {line[:30]!r} and "
+                    f"on; export it again"
+                )
             if colon and not key.startswith("#"):
                 if key in fields:
                     raise VolumeError(f"{path}: its header has {key!r} twice; export it again")

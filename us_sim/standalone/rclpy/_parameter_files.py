@@ -17,6 +17,8 @@ __all__ = ["NodeParameter", "parse_parameter_file", "read_parameter_file"]
 NodeParameter = tuple[str, str, Any]  # node name or wildcard, parameter name, value
 
 _KEY = "ros__parameters"
+_LARGEST = 1 << 20
+"""Characters of a file."""
 
 
 def read_parameter_file(path: str) -> list[NodeParameter]:
@@ -26,10 +28,15 @@ def read_parameter_file(path: str) -> list[NodeParameter]:
         ParameterSyntaxError: the file cannot be read or is no parameter file.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as file:  # which may be a pipe
+            text = file.read(_LARGEST + 1)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ParameterSyntaxError(f"Error opening YAML file {path}: {reason}") from None
+    if len(text) > _LARGEST:
+        raise ParameterSyntaxError(
+            f"Error opening YAML file {path}: of its characters {_LARGEST} are read at most"
+        )
     return parse_parameter_file(text, path)
 
 

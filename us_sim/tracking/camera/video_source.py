@@ -40,7 +40,7 @@ class VideoSource:
             it to them.
 
     Raises:
-        TrackingError: the file is not there.
+        TrackingError: the file is not there, or it is a folder or a pipe.
     """
 
     def __init__(self, source: str, *, size: tuple[int, int] | None = None, rate: float = 0.0):
@@ -57,7 +57,13 @@ class VideoSource:
                     f"{source}: there is no such file; give a video, a camera's number or a "
                     f"stream's address"
                 )
-        self.is_file = not is_live and not stat.S_ISCHR(os.stat(path).st_mode)
+        mode = 0 if is_live else os.stat(path).st_mode
+        if not (is_live or stat.S_ISREG(mode) or stat.S_ISCHR(mode)):
+            raise TrackingError(
+                f"{source}: it is neither a file nor a device; give a video, a camera's number or "
+                f"a stream's address"
+            )
+        self.is_file = stat.S_ISREG(mode)
         self._target = str(path) if not is_live else self.name
 
     def open(self) -> bool:
