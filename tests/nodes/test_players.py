@@ -1,8 +1,13 @@
 """Paths and recordings played again: pace, stamps, lockstep, ends."""
 
+import re
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
@@ -15,6 +20,7 @@ from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.session_player import SessionPlayer
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000
 STEP = 20_000_000
@@ -182,6 +188,44 @@ def test_a_recording_of_which_nothing_can_be_played_is_refused(bench, tmp_path, 
     file = _bag_of(tmp_path / "foreign.mcap", types)
     with pytest.raises(BagError, match="holds nothing that can be played: "):
         bench.make(SessionPlayer, path=str(file))
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """A recording of 100 messages in some chunks, the second of which is damaged."""
+    file = tmp_path / "damaged.mcap"
+    with BagWriter(file, chunk_size=500) as bag:
+        bag.add_topic("/said", "std_msgs/msg/String")
+        for k in range(100):
+            bag.write("/said", bytes(serialize_message(String(data=f"{k:03}"))), EPOCH + k)
+    with file.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[1]
+    content = bytearray(file.read_bytes())
+    content[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 1
+    file.write_bytes(content)
+    return file
+
+
+def test_of_a_damaged_recording_the_rest_is_played_and_what_is_missing_is_said(bench, damaged):
+    said = bench.collect(String, "/said")
+    player = bench.make(SessionPlayer, path=str(damaged), rate=100.0)
+    bench.spin_until(lambda: player.finished.done() and said and said[-1].data == "099")
+    sentence = str(player.finished.exception())
+    assert re.match(
+        r"\d+ of 100 messages of .*damaged.mcap were played; .* chunk at byte", sentence
+    )
+    assert player.health.problems("damage") == 1
+    assert not player.failures
+
+
+def test_a_damaged_recording_ends_the_player_with_a_status(damaged):
+    command = [sys.executable, "-m", "us_sim.nodes.session_player", "--ros-args"]
+    ended = subprocess.run(
+        [*command, "-p", f"path:={damaged}"], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert re.search(r"^us_sim: \d+ of 100 messages of ", ended.stderr, re.MULTILINE)
+    assert "Traceback" not in ended.stderr
 
 
 def test_a_recording_is_published_as_it_was(bench, shared_data):

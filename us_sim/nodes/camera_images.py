@@ -53,10 +53,11 @@ def camera_from(message: CameraInfo) -> CameraModel:
     Raises:
         TrackingError: it is not calibrated, or the numbers are none of a camera.
     """
-    if not (np.abs([*message.k, *message.d]) <= _LARGEST).all():
+    numbers = np.array([*message.k, *message.d], dtype=np.float64)
+    if (bad := numbers[~(np.abs(numbers) <= _LARGEST)]).size:
         raise TrackingError(
-            f"the camera's matrix {list(message.k)} or its distortion {list(message.d)} holds a "
-            f"number that is not finite or far too large: calibrate the camera again"
+            f"the camera's matrix or its distortion holds {bad[0]:g}, which is not finite or far "
+            f"too large: calibrate the camera again"
         )
     return CameraModel(
         message.width,

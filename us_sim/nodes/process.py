@@ -36,8 +36,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
 
     A node with a ``finished`` future ends when that is done; told to end before, or while it is
-    made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input is one
-    sentence on stderr and exit status 1. With `STANDBY` in the environment it waits first.
+    made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input, also as
+    the exception of that future, is one sentence on stderr and exit status 1. With `STANDBY` in
+    the environment it waits first.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
@@ -71,6 +72,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
             node.destroy_node()
         with contextlib.suppress(Exception):  # rclpy's signal thread may be doing the same
             rclpy.try_shutdown()
+    finished = getattr(node, "finished", None)
+    if finished is not None and finished.done() and finished.exception() is not None:
+        return _refused(finished.exception())
     return _interrupted(node)
 
 

@@ -54,6 +54,9 @@ class SessionPlayer(GuardedNode):
             self.get_logger().warning(self.health.warning)
         if self._bag.note:
             self.get_logger().warning(self._bag.note)
+        self._count = sum(self._bag.topic(name).message_count for name in self._topics)
+        self._damage: list[str] = []
+        self._sent = 0
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._begun = 0
@@ -84,9 +87,7 @@ class SessionPlayer(GuardedNode):
 
     def _begin(self) -> None:
         self._start.cancel()
-        self._messages = iter(self._bag.messages(list(self._topics)))
-        self._waiting = next(self._messages, None)
-        self._begun = self.get_clock().now().nanoseconds
+        self._begin_messages()
         self._first = self._waiting.log_time if self._waiting else 0
         self.health.state = "playing"
         self.create_timer(0.002, self._tick)
@@ -97,16 +98,42 @@ class SessionPlayer(GuardedNode):
         while self._waiting is not None and self._waiting.log_time - self._first <= elapsed:
             self._topics[self._waiting.topic].publish(self._waiting.data)
             self.health.published(self._waiting.topic)
-            self._waiting = next(self._messages, None)
+            self._sent += 1
+            self._waiting = self._next()
         if self._waiting is not None or self.finished.done():
             return
         if self._loop:
-            self._messages = iter(self._bag.messages(list(self._topics)))
-            self._waiting = next(self._messages, None)
-            self._begun = self.get_clock().now().nanoseconds
+            self._begin_messages()
             return
         self.health.state = "finished"
-        self.finished.set_result(None)
+        if self._damage or self._sent < self._count:
+            self.finished.set_exception(
+                BagError(
+                    f"{self._sent} of {self._count} messages of {self._bag.path} were played"
+                    + "".join(f"; {sentence}" for sentence in self._damage[:1])
+                )
+            )
+        else:
+            self.finished.set_result(None)
+
+    def _begin_messages(self) -> None:
+        self._damage.clear()
+        self._sent = 0
+        self._messages = iter(self._bag.messages(list(self._topics), self._damage))
+        self._waiting = self._next()
+        self._begun = self.get_clock().now().nanoseconds
+
+    def _next(self) -> BagMessage | None:
+        """The next message; what is damaged is said, and passed over where that can be."""
+        known = len(self._damage)
+        try:
+            message = next(self._messages, None)
+        except BagError as error:
+            self._damage.append(str(error))
+            message = None
+        for sentence in self._damage[known:]:
+            self.health.problem("damage", sentence)
+        return message
 
 
 def _joined(sentences: list[str]) -> str:

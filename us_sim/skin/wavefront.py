@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.settings.spelling import shown
 
 __all__ = ["parse_wavefront"]
 
@@ -44,7 +45,7 @@ def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
                     raise ValueError("a face has three vertices or more")
                 triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
         except ValueError as error:
-            raise MeshError(f"line {number}: `{line.strip()}`: {error}") from error
+            raise MeshError(f"line {number}: {shown(line.strip())}: {str(error)[:100]}") from error
     return (
         np.array(points, dtype=np.float64).reshape(-1, 3),
         np.array(triangles, dtype=np.int32).reshape(-1, 3),
