@@ -19,7 +19,7 @@ from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
 from us_sim.run.domain_lock import alone_on_domain
-from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, ending
+from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, RECORDER, ending
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import plan_of
 from us_sim.run.restarts import Restarts, going_on
@@ -30,6 +30,8 @@ from us_sim.settings.setting import rules_of
 from us_sim.share import find_bag
 
 LOOK_S = 0.1
+COMPILES = {"sigterm_timeout": "2", "sigkill_timeout": "1"}
+"""s after Ctrl-C; a node that compiles hears no signal, and only the recorder has what to keep."""
 ARGUMENTS = {
     "scene": ("upper_arm", "scene file, or name of an installed one"),
     "path": ("", "bag with a probe path to play; empty: poses come from outside"),
@@ -89,6 +91,7 @@ class Supervised:
             parameters=[process.all_parameters],
             output="screen",
             on_exit=partial(self.ended, process.node),
+            **({} if process.node == RECORDER else COMPILES),
         )
         return self.actions[process.node]
 

@@ -17,7 +17,7 @@ from us_sim.recording.reader import read_bag
 
 def test_what_is_published_is_recorded_as_it_was(bench, tmp_path):
     file = tmp_path / "session.mcap"
-    recorder = bench.make(SessionRecorder, file=str(file))
+    recorder = bench.make(SessionRecorder, file=str(file), exclude=["/diagnostics"])
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     bench.peer.create_publisher(String, "early", latched).publish(String(data="before"))
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -21,6 +21,7 @@ from us_sim.recording import writer
 from us_sim.recording.metadata import read_metadata
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import read_bag
+from us_sim.recording.repair import repair
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"
@@ -179,6 +180,22 @@ def test_flush_makes_everything_readable_before_the_bag_is_closed(tmp_path):
     assert [half.deserialize(message).data for message in half.messages()] == ["hi"]
     bag.close()
     assert read_bag(tmp_path).complete
+
+
+@pytest.mark.parametrize("name", ["session.mcap", "bag"])
+def test_what_metadata_that_cannot_be_written_says_to_do_helps(tmp_path, name):
+    folder = tmp_path / "bag"
+    bag = BagWriter(tmp_path / "bag" / name if name.endswith(".mcap") else folder)
+    bag.add_topic("/note", STRING)
+    bag.write("/note", HI, EPOCH)
+    bag.split()
+    bag.write("/note", HI, EPOCH + 1)
+    (folder / "metadata.yaml").mkdir()
+    with pytest.raises(BagError, match=f"`us-sim bag repair {folder}` makes a bag that has it"):
+        bag.close()
+    (folder / "metadata.yaml").rmdir()
+    assert repair(folder, tmp_path / "repaired").message_count == 2
+    assert read_metadata(tmp_path / "repaired" / "metadata.yaml").message_count == 2
 
 
 def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):

@@ -280,7 +280,8 @@ class BagWriter:
                     metadata_file.unlink()
             raise BagError(
                 f"{metadata_file} cannot be written ({error.strerror}): the recording can be read "
-                f"without it, and `ros2 bag reindex -s mcap {metadata_file.parent}` makes it"
+                f"without it, and `us-sim bag repair {metadata_file.parent}` makes a bag that has "
+                f"it"
             ) from None
 
     def __enter__(self) -> BagWriter:
