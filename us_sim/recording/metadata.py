@@ -21,6 +21,7 @@ import yaml
 
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile, qos_from_yaml
+from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = ["BagMetadata", "FileEntry", "TopicEntry", "read_metadata"]
@@ -102,7 +103,7 @@ def read_metadata(file: Path) -> BagMetadata:
         BagError: it cannot be read, is not such a file, or is of a newer version.
     """
     try:
-        document = load_yaml(file.read_text(encoding="utf-8"))
+        document = load_yaml(read_text(file))
         information = document["rosbag2_bagfile_information"]
         version = int(information["version"])
         if version > _NEWEST_VERSION:

@@ -18,6 +18,7 @@ from us_sim.errors import SceneError
 from us_sim.scene.scene import Scene
 from us_sim.settings.choice import Choice
 from us_sim.settings.setting import Settings, kinds_of, rules_of
+from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import LARGEST_YAML, YamlError, load_yaml
 
 __all__ = ["merged", "read_document"]
@@ -131,7 +132,7 @@ def _yaml(path: Path) -> Any:
             raise SceneError(
                 f"{path}: has {path.stat().st_size} bytes, which is no scene: name one that is"
             )
-        return load_yaml(path.read_text(encoding="utf-8"))
+        return load_yaml(read_text(path))
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
     except YamlError as error:

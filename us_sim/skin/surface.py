@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
+from us_sim.settings.text_file import read_text
 from us_sim.skin.wavefront import parse_wavefront
 
 _CORNERS = {"triangle": 3, "quad": 4}
@@ -164,7 +165,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
     faces: NDArray[np.integer]
     try:
         if path.suffix.lower() == ".obj":
-            points, faces = parse_wavefront(path.read_text(errors="replace"))
+            points, faces = parse_wavefront(read_text(path, errors="replace"))
         else:
             points, faces = _faces_by_meshio(path)
         if not len(faces):

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
+from us_sim.settings.text_file import read_bytes, read_text
 
 __all__ = ["read_landmarks", "read_table", "read_wires"]
 
@@ -72,27 +74,26 @@ def read_table(
     path = Path(path)
     quantities = {name: Quantity(dimension) for name, dimension in columns.items()}
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            missing = [name for name in (label, *columns) if name not in header]
-            if missing:
-                raise CalibrationError(
-                    f"{path}: has no column {missing[0]}; its first line must be "
-                    f"{','.join([label, *columns])}"
-                )
-            rows = []
-            for row in reader:
-                values = []
-                for name, quantity in quantities.items():
-                    try:
-                        values.append(quantity.parse(row[name] or ""))
-                    except ValueError as error:
-                        raise CalibrationError(
-                            f"{path}: line {reader.line_num}: {name}: {error}"
-                        ) from error
-                rows.append(((row[label] or "").strip(), values))
+        reader = csv.DictReader(io.StringIO(read_text(path, "utf-8-sig")), skipinitialspace=True)
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        missing = [name for name in (label, *columns) if name not in header]
+        if missing:
+            raise CalibrationError(
+                f"{path}: has no column {missing[0]}; its first line must be "
+                f"{','.join([label, *columns])}"
+            )
+        rows = []
+        for row in reader:
+            values = []
+            for name, quantity in quantities.items():
+                try:
+                    values.append(quantity.parse(row[name] or ""))
+                except ValueError as error:
+                    raise CalibrationError(
+                        f"{path}: line {reader.line_num}: {name}: {error}"
+                    ) from error
+            rows.append(((row[label] or "").strip(), values))
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -126,7 +127,7 @@ def _read(
 
 def _document(path: Path) -> ElementTree.Element:
     try:
-        text = path.read_bytes()
+        text = read_bytes(path)
         # Entities that expand without end are a known attack; no phantom needs any.
         if b"<!ENTITY" in text:
             raise CalibrationError(f"{path}: defines entities, which is not allowed; remove them")

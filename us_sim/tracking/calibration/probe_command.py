@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
+from us_sim.settings.text_file import read_text
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
 from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
 from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
@@ -89,8 +90,7 @@ def _features(path: Path) -> dict[str, NDArray[np.float64]]:
 
 def _has_ends(path: Path) -> bool:
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            return "x2" in file.readline()
+        return "x2" in read_text(path).partition("\n")[0]
     except (OSError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path}: cannot be read: {error}") from error
 

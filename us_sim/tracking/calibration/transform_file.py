@@ -32,6 +32,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 
 __all__ = [
@@ -154,7 +155,7 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = load_yaml(path.read_text(encoding="utf-8"))
+        document = load_yaml(read_text(path))
     except FileNotFoundError:
         raise CalibrationError(
             f"{path}: there is no such file; `us-sim calibrate` writes transforms"

@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 
 from us_sim.errors import TrackingError
+from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.model import CameraModel
 
@@ -34,7 +35,7 @@ def read_camera_info(path: Path | str) -> CameraModel:
     """
     path = Path(path)
     try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
+        content = load_yaml(read_text(path))
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, YamlError) as error:

@@ -32,6 +32,7 @@ from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.markers import square
 from us_sim.tracking.camera.rigid_body import RigidBody
@@ -171,7 +172,7 @@ def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> Rig
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
