@@ -52,7 +52,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     """
 
     def decorate(kernel: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(**options)(kernel)
+        dispatcher = numba.njit(no_cfunc_wrapper=True, **options)(kernel)
         if cache and isinstance(dispatcher, Dispatcher):
             dispatcher._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return dispatcher
