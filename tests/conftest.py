@@ -14,16 +14,19 @@ _WORKER = "PYTEST_XDIST_WORKER"
 
 _TISSUE = ("tissue", "evaluation/hand", "evaluation/stability", "evaluation/tissue")
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
-the other one what is beside them."""
+the others what is beside them."""
 
 _BESIDE = ("slicing", "evaluation", "demo", "tracking", "volume", "skin", "geometry")
 
-_TWO_PROCESSES = pytest.StashKey[bool]()
+_BY_GROUPS = pytest.StashKey[bool]()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Run everything in two processes, where nothing else was asked for."""
+    """Run everything in three processes, where nothing else was asked for.
+
+    Two keep two cores busy; a third runs while one of them waits for messages or processes.
+    """
     option = config.option
     everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     chosen = option.keyword or option.markexpr or option.collectonly or option.usepdb
@@ -36,8 +39,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         and option.numprocesses is None
         and (os.cpu_count() or 1) > 1
     ):
-        config.stash[_TWO_PROCESSES] = True
-        option.numprocesses = 2
+        config.stash[_BY_GROUPS] = True
+        option.numprocesses = 3
         option.dist = "loadscope"
         option.loadscopereorder = False
 
@@ -45,7 +48,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Who gives groups of tests to the processes."""
-    if _TWO_PROCESSES not in config.stash:
+    if _BY_GROUPS not in config.stash:
         return None
     from xdist.scheduler import LoadScopeScheduling
 
@@ -93,34 +96,14 @@ def shared_data() -> Path:
     return folder
 
 
-SMALL_SCENE = """
-name: small
-volume: {phantom: upper_arm, seed: 1, voxel_size: 1 mm}
-probe:
-  aperture: 40 mm
-  depth: 40 mm
-  image: [96, 80]
-  collider: {shape: rounded_box, length: 46 mm, width: 14 mm, height: 40 mm, rounding: 4 mm}
-tissue:
-  mesh: {lower: [-36 mm, -30 mm, 0], upper: [36 mm, 30 mm, 50 mm], nodes: [9, 6, 8]}
-  fixed: [bottom, sides]
-  materials:
-    skin: {young_modulus: 30 kPa}
-    fat: {young_modulus: 5 kPa}
-    muscle: {young_modulus: 12 kPa}
-    bone: {young_modulus: 1 MPa}
-    artery: {young_modulus: 200 kPa}
-    vein: {young_modulus: 0.4 kPa, poisson_ratio: 0.05}
-    nerve: {young_modulus: 40 kPa}
-skin: {size: [120 mm, 100 mm], spacing: 8 mm, flat_width: 72 mm, radius: 45 mm}
-"""
+SMALL_SCENE = Path(__file__).with_name("small_scene.yaml")
 
 
 @pytest.fixture(scope="session")
 def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene with everything in it, small enough for a test."""
+    """A copy of `small_scene.yaml`, for scenes beside it."""
     file = tmp_path_factory.mktemp("scene") / "small.yaml"
-    file.write_text(SMALL_SCENE)
+    file.write_text(SMALL_SCENE.read_text())
     return file
 
 

@@ -17,22 +17,9 @@ from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.tracking.camera.info import read_camera_info
 from us_sim.tracking.camera.rigid_body_file import read_rigid_body
 
-FULL = """name: small
-volume: {phantom: upper_arm, seed: 1, voxel_size: 1 mm}
-probe:
-  aperture: 40 mm
-  depth: 40 mm
-  image: [96, 80]
-  collider: {shape: rounded_box, length: 46 mm, width: 14 mm, height: 40 mm, rounding: 4 mm}
-tissue:
-  solver: fem
-  mesh: {lower: [-36 mm, -30 mm, 0], upper: [36 mm, 30 mm, 50 mm], nodes: [9, 6, 8]}
-  fixed: [bottom, sides]
-  materials: &these
-    skin: {young_modulus: 30 kPa}
-    vein: {young_modulus: 0.4 kPa, poisson_ratio: 0.05}
-structures: [vein]
-skin: {size: [120 mm, 100 mm], spacing: 8 mm, flat_width: 72 mm, radius: 45 mm}
+SMALL = Path(__file__).parents[1] / "small_scene.yaml"
+
+MORE = """structures: [vein]
 imaging: {gain: 3 dB, time_gain: [0 dB, 3 dB]}
 tracker: {source: pose, filter: {method: one_euro}}
 """
@@ -75,7 +62,8 @@ topics
 
 def scene_seeds(_: Path) -> Iterator[bytes]:
     """Everything in one, and those that are installed."""
-    yield FULL.encode()
+    small = SMALL.read_text().replace("tissue:\n", "tissue:\n  solver: fem\n")
+    yield (small.replace("materials:", "materials: &these") + MORE).encode()
     root = next(iter(shared_roots()))
     for file in sorted((root / "config" / "scenes").glob("upper_arm*.yaml")):
         yield file.read_bytes()

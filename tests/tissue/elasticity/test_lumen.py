@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from neo_hookean_meshes import BOTH, CELLS, TETRAHEDRA, assert_slopes, random_field
 from scipy.integrate import quad
 from scipy.optimize import brentq, minimize
 from tissue_block import block, block_mesh
@@ -26,9 +27,6 @@ from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
-CELLS = box_mesh([-0.02, -0.008, 0.004, 0.02], [0.0, 0.01, 0.03], [0.0, 0.005, 0.02, 0.03])
-TETRAHEDRA = TetrahedralMesh(CELLS.nodes, CELLS.tetrahedra)
-BOTH = pytest.mark.parametrize("mesh", [CELLS, TETRAHEDRA], ids=["cells", "tetrahedra"])
 VEIN = Material(5e3, 0.1, 1060.0, lumen_pressure=1000.0)
 MUSCLE = Material(15e3, 0.45, 1060.0)
 
@@ -53,10 +51,6 @@ def vessels(mesh, seed=5):
         fraction,
         np.where(fraction > 0, rng.uniform(300, 3000, count), 0.0),
     )
-
-
-def random_field(size, seed=1, mesh=CELLS):
-    return np.random.default_rng(seed).normal(size=(3, len(mesh.nodes))) * size
 
 
 @pytest.mark.parametrize("outside", [100.0, 500.0, 999.0])
@@ -128,27 +122,12 @@ def test_hardly_any_lumen_is_the_solid_as_long_as_it_is_pressed_by_less_than_blo
 @pytest.mark.parametrize("size", [1e-4, 3e-3, 1e-2])
 def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
     tissue = NeoHookean(mesh, vessels(mesh), np.float64)
-    displacement, change = random_field(size), random_field(1.0, 2)
-    step = 1e-4 * size
-
-    def slope(function):
-        return (function(displacement + step * change) - function(displacement - step * change)) / (
-            2 * step
-        )
-
-    forces = tissue.forces(displacement)
-    assert np.vdot(forces, change) == pytest.approx(
-        slope(tissue.energy), abs=1e-7 * np.linalg.norm(forces) * np.linalg.norm(change)
-    )
-    tissue.linearise(displacement)
-    product = tissue.tangent_product(change)
-    error = np.linalg.norm(product - slope(tissue.forces))
-    assert error < 1e-6 * np.linalg.norm(product)
+    assert_slopes(tissue, size)
     matrix = np.eye(3 * tissue.count).reshape(-1, 3, tissue.count)
     blocks = np.array([tissue.tangent_product(np.ascontiguousarray(c)).ravel() for c in matrix])
     blocks = blocks.reshape(3, tissue.count, 3, tissue.count)
     # The nodes' part of the bulk stiffness is counted as it is at rest.
-    tissue.linearise(np.zeros_like(displacement))
+    tissue.linearise(np.zeros((3, tissue.count)))
     nodal = volumetric_split(vessels(mesh)).nodal * (vessels(mesh).lumen_fraction == 0)
     assert nodal.any()
     assert abs(blocks - blocks.transpose(2, 3, 0, 1)).max() < 1e-12 * abs(blocks).max()

@@ -37,7 +37,9 @@ __all__ = [
     "PER_WIDTH",
     "PRESSURES",
     "ROWS",
+    "SCALAR",
     "SUMS",
+    "SYMMETRIC",
     "add_field",
     "add_out",
     "copy_field",
@@ -65,6 +67,9 @@ OUT = PRESSURES + 5
 
 ROWS = OUT + 48
 """Number of rows of a buffer."""
+
+SCALAR, _VECTOR, SYMMETRIC = np.int64(1), np.int64(3), np.int64(6)
+"""Rows a corner, of a number, a vector and a symmetric matrix."""
 
 
 @njit(**INLINED)
@@ -112,14 +117,14 @@ def add_out(lanes, row, step, grid, first, rows, values):
 def copy_field(field, grid, first, rows, lanes):
     """Rows 3 corner + axis of lanes: the field (3, N) at the corners of cells."""
     for axis in range(3):
-        copy_in(field[axis], grid, first, rows, lanes, FIELD + axis, 3)
+        copy_in(field[axis], grid, first, rows, lanes, FIELD + axis, _VECTOR)
 
 
 @njit(**LOOP)
 def add_field(lanes, grid, first, rows, field):
     """Add rows 3 corner + axis from OUT on to the field (3, N)."""
     for axis in range(3):
-        add_out(lanes, OUT + axis, 3, grid, first, rows, field[axis])
+        add_out(lanes, OUT + axis, _VECTOR, grid, first, rows, field[axis])
 
 
 @njit(**INLINED)
@@ -225,27 +230,28 @@ def put_forces(p, q, r, s, t, rows, w, lanes):
     x = _corner_forces(
         p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2], s[0], s[1], s[2], t[0], t[1], t[2], g
     )
-    _put_eight(x, lanes, OUT, 3, w)
+    _put_eight(x, lanes, OUT, _VECTOR, w)
     y = _corner_forces(
         p[3], p[4], p[5], q[3], q[4], q[5], r[3], r[4], r[5], s[3], s[4], s[5], t[3], t[4], t[5], g
     )
-    _put_eight(y, lanes, OUT + 1, 3, w)
+    _put_eight(y, lanes, OUT + 1, _VECTOR, w)
     z = _corner_forces(
         p[6], p[7], p[8], q[6], q[7], q[8], r[6], r[7], r[8], s[6], s[7], s[8], t[6], t[7], t[8], g
     )
-    _put_eight(z, lanes, OUT + 2, 3, w)
+    _put_eight(z, lanes, OUT + 2, _VECTOR, w)
 
 
 @njit(**INLINED)
 def put_volumes(p, q, r, s, t, w, lanes):
     """Rows corner from OUT on: the five tetrahedra's contributions to each corner, summed."""
     at_one, at_two, at_four = (p + t) + (r + s), (p + t) + (q + s), (p + t) + (q + r)
-    _put_eight((p, at_one, at_two, s, at_four, r, q, t + (q + r + s)), lanes, OUT, 1, w)
+    corners = (p, at_one, at_two, s, at_four, r, q, t + (q + r + s))
+    _put_eight(corners, lanes, OUT, SCALAR, w)
 
 
 @njit(**INLINED)
-def put_sum(a, b, c, d, lanes, corner, w):
-    """Rows of a corner: the sum of four blocks."""
+def put_sum(a, b, c, d, lanes, row, w):
+    """Six rows from ``row`` on: the sum of four blocks."""
     total = (
         (a[0] + b[0]) + (c[0] + d[0]),
         (a[1] + b[1]) + (c[1] + d[1]),
@@ -254,4 +260,4 @@ def put_sum(a, b, c, d, lanes, corner, w):
         (a[4] + b[4]) + (c[4] + d[4]),
         (a[5] + b[5]) + (c[5] + d[5]),
     )
-    put_six(total, lanes, OUT + 6 * corner, w)
+    put_six(total, lanes, row, w)

@@ -46,10 +46,8 @@ def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDAr
 
 
 @njit(**INLINED)
-def emptied(h, lumen, i, per, w):
-    """`emptying` of the i-th of ``per`` tetrahedra of lane w, times its volume."""
-    v = i * LANES + w
-    step = per * LANES
+def emptied(h, lumen, v, step):
+    """`emptying` of a tetrahedron, times its volume; its constants are at v and so many apart."""
     return emptying(
         volume_change(h),
         (
@@ -69,8 +67,8 @@ def add_lumens(field, rows, lumen, entry, row, lanes):
     for w in range(LANES):
         p, q, r, s, t = gradients(field, rows, w)
         v = row * LANES + w
-        lanes[v] += emptied(p, lumen, 0, 5, w)[entry]
-        lanes[v + LANES] += emptied(q, lumen, 1, 5, w)[entry]
-        lanes[v + 2 * LANES] += emptied(r, lumen, 2, 5, w)[entry]
-        lanes[v + 3 * LANES] += emptied(s, lumen, 3, 5, w)[entry]
-        lanes[v + 4 * LANES] += emptied(t, lumen, 4, 5, w)[entry]
+        lanes[v] += emptied(p, lumen, w, 5 * LANES)[entry]
+        lanes[v + LANES] += emptied(q, lumen, w + LANES, 5 * LANES)[entry]
+        lanes[v + 2 * LANES] += emptied(r, lumen, w + 2 * LANES, 5 * LANES)[entry]
+        lanes[v + 3 * LANES] += emptied(s, lumen, w + 3 * LANES, 5 * LANES)[entry]
+        lanes[v + 4 * LANES] += emptied(t, lumen, w + 4 * LANES, 5 * LANES)[entry]

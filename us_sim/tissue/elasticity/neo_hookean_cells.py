@@ -29,7 +29,9 @@ from us_sim.tissue.elasticity.cell_lanes import (
     PER_WIDTH,
     PRESSURES,
     ROWS,
+    SCALAR,
     SUMS,
+    SYMMETRIC,
     add_field,
     add_out,
     copy_field,
@@ -109,7 +111,7 @@ class CellSums(NodalSums):
 @njit(**LOOP)
 def _nodal_pressures(nodal, grid, first, rows, lanes):
     """Rows from PRESSURES on: each tetrahedron's nodal weight times its nodes' sum."""
-    copy_in(nodal, grid, first, rows, lanes, SUMS, 1)
+    copy_in(nodal, grid, first, rows, lanes, SUMS, SCALAR)
     for w in range(LANES):
         v = SUMS * LANES + w
         s1, s2 = lanes[v + LANES], lanes[v + 2 * LANES]
@@ -221,7 +223,7 @@ def _volume_changes(displacement, grid, constants, lanes, nodal):
                 w,
                 lanes,
             )
-        add_out(lanes, OUT, 1, grid, first, rows, nodal)
+        add_out(lanes, OUT, SCALAR, grid, first, rows, nodal)
 
 
 @njit(**LOOP)
@@ -308,7 +310,7 @@ def _volume_slopes(change, grid, constants, tangent, lanes, nodal):
                 w,
                 lanes,
             )
-        add_out(lanes, OUT, 1, grid, first, rows, nodal)
+        add_out(lanes, OUT, SCALAR, grid, first, rows, nodal)
 
 
 @njit(**LOOP)
@@ -374,15 +376,15 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
             i, j, k = HALF * i, HALF * j, HALF * k
             c = cofactor_change(t)
             put_six(p0, lanes, OUT, w)
-            put_sum(block((-i, -j, k), c, shear[4], bulk[4]), pz, rx, sy, lanes, 1, w)
-            put_sum(block((-i, j, -k), c, shear[4], bulk[4]), py, qx, sz, lanes, 2, w)
+            put_sum(block((-i, -j, k), c, shear[4], bulk[4]), pz, rx, sy, lanes, OUT + 6, w)
+            put_sum(block((-i, j, -k), c, shear[4], bulk[4]), py, qx, sz, lanes, OUT + 12, w)
             put_six(s0, lanes, OUT + 18, w)
-            put_sum(block((i, -j, -k), c, shear[4], bulk[4]), px, qy, rz, lanes, 4, w)
+            put_sum(block((i, -j, -k), c, shear[4], bulk[4]), px, qy, rz, lanes, OUT + 24, w)
             put_six(r0, lanes, OUT + 30, w)
             put_six(q0, lanes, OUT + 36, w)
-            put_sum(block((i, j, k), c, shear[4], bulk[4]), qz, ry, sx, lanes, 7, w)
+            put_sum(block((i, j, k), c, shear[4], bulk[4]), qz, ry, sx, lanes, OUT + 42, w)
         for entry in range(6):
-            add_out(lanes, OUT + entry, 6, grid, chunk * LANES, rows, blocks[entry])
+            add_out(lanes, OUT + entry, SYMMETRIC, grid, chunk * LANES, rows, blocks[entry])
 
 
 CellSums._kernels = Kernels(

@@ -58,6 +58,8 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["TetrahedraSums"]
 
+_ROW = np.int64(LANES)  # no literal, for which numba would compile `emptied` again
+
 _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
     SHAPE + 9,
     SHAPE + 10,
@@ -68,7 +70,7 @@ _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
 """Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
 number."""
 
-_GRADIENT, _K, _BULK, _TANGENT = 0, 9, 10, 11
+_GRADIENT, _K, _BULK, _TANGENT = np.int64(0), 9, 10, 11
 """Rows that the tangent needs: the displacement's gradient, V (p - mu), V times the slope of p by
 J; and their number."""
 
@@ -123,7 +125,7 @@ def _energy(displacement, nodes, constants, lumens, lanes):
         if lumens[0][chunk] >= 0:
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
-                lanes[OUT * LANES + w] += emptied(gradient(lanes, rows, w), lumen, 0, 1, w)[0]
+                lanes[OUT * LANES + w] += emptied(gradient(lanes, rows, w), lumen, w, _ROW)[0]
         for w in range(LANES):
             total += lanes[OUT * LANES + w]
     return total
@@ -172,7 +174,7 @@ def _forces(displacement, nodal, nodes, constants, lumens, lanes, forces):
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
                 h = gradient(lanes, rows, w)
-                pressure = _pressure(h, lanes, rows, w) + emptied(h, lumen, 0, 1, w)[1]
+                pressure = _pressure(h, lanes, rows, w) + emptied(h, lumen, w, _ROW)[1]
                 put_forces(stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
         else:
             for w in range(LANES):
@@ -200,7 +202,7 @@ def _linearise(displacement, nodal, nodes, constants, lumens, lanes, tangent):
         if lumens[0][chunk] >= 0:
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
-                _, pressure, slope = emptied(gradient(lanes, rows, w), lumen, 0, 1, w)
+                _, pressure, slope = emptied(gradient(lanes, rows, w), lumen, w, _ROW)
                 kept[_K * LANES + w] += pressure
                 kept[_BULK * LANES + w] += slope
 

@@ -116,21 +116,21 @@ def gradient(field, constants, w):
 
 
 @njit(**INLINED)
-def _put_row(px, py, pz, constants, w, lanes, axis):
-    """Along one axis, the force of a row of the stress times volume at all four nodes."""
+def _put_row(px, py, pz, constants, w, lanes, row):
+    """Along the axis of ``row``, the force of the stress's row times volume at all four nodes."""
     a0, a1, a2, b0, b1, b2, c0, c1, c2 = nine(constants, SHAPE, w)
     a = px * a0 + py * a1 + pz * a2
     b = px * b0 + py * b1 + pz * b2
     c = px * c0 + py * c1 + pz * c2
-    lanes[(OUT + axis) * LANES + w] = -(a + b + c)
-    lanes[(OUT + 3 + axis) * LANES + w] = a
-    lanes[(OUT + 6 + axis) * LANES + w] = b
-    lanes[(OUT + 9 + axis) * LANES + w] = c
+    lanes[row * LANES + w] = -(a + b + c)
+    lanes[(row + 3) * LANES + w] = a
+    lanes[(row + 6) * LANES + w] = b
+    lanes[(row + 9) * LANES + w] = c
 
 
 @njit(**INLINED)
 def put_forces(p, constants, w, lanes):
     """Rows 3 b + axis from OUT on: the force of the stress p, times volume, at the b-th node."""
-    _put_row(p[0], p[1], p[2], constants, w, lanes, 0)
-    _put_row(p[3], p[4], p[5], constants, w, lanes, 1)
-    _put_row(p[6], p[7], p[8], constants, w, lanes, 2)
+    _put_row(p[0], p[1], p[2], constants, w, lanes, OUT)
+    _put_row(p[3], p[4], p[5], constants, w, lanes, OUT + 1)
+    _put_row(p[6], p[7], p[8], constants, w, lanes, OUT + 2)

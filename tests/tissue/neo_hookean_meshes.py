@@ -1,0 +1,39 @@
+"""A few cells and their tetrahedra, and what forces and tangents of neo-Hookean tissue must be."""
+
+import numpy as np
+import pytest
+
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+
+CELLS = box_mesh([-0.02, -0.008, 0.004, 0.02], [0.0, 0.01, 0.03], [0.0, 0.005, 0.02, 0.03])
+TETRAHEDRA = TetrahedralMesh(CELLS.nodes, CELLS.tetrahedra)
+BOTH = pytest.mark.parametrize("mesh", [CELLS, TETRAHEDRA], ids=["cells", "tetrahedra"])
+
+
+def random_field(size: float, seed: int = 1, mesh: TetrahedralMesh = CELLS) -> np.ndarray:
+    """Displacements (3, N), normally distributed; ``size`` in m."""
+    return np.random.default_rng(seed).normal(size=(3, len(mesh.nodes))) * size
+
+
+def assert_slopes(tissue: NeoHookean, size: float) -> None:
+    """The forces are the slope of the energy and the tangent is theirs, at a random field.
+
+    The tissue is linearised there afterwards.
+    """
+    displacement, change = random_field(size), random_field(1.0, 2)
+    step = 1e-4 * size
+
+    def slope(function):
+        return (function(displacement + step * change) - function(displacement - step * change)) / (
+            2 * step
+        )
+
+    forces = tissue.forces(displacement)
+    assert np.vdot(forces, change) == pytest.approx(
+        slope(tissue.energy), abs=1e-7 * np.linalg.norm(forces) * np.linalg.norm(change)
+    )
+    tissue.linearise(displacement)
+    product = tissue.tangent_product(change)
+    error = np.linalg.norm(product - slope(tissue.forces))
+    assert error < 1e-6 * np.linalg.norm(product)
