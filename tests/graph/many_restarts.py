@@ -179,7 +179,7 @@ def main():
             assert run.poll() is None, (folder / "said.txt").read_text()
         ends = time.monotonic() + 60.0 * asked.minutes
         while len(done) < asked.count and time.monotonic() < ends:
-            listener.spin(2.0 + chance.random())
+            listener.spin(1.0 + chance.random())
             listener.wait_for_full_rate()
             node = chance.choice(sorted(listener.pids))
             done.append(restart(listener, node, chance.choice(SIGNALS)))

@@ -1,5 +1,7 @@
 """What the system gives a run that cannot be used is said before a node starts, in a sentence."""
 
+import os
+import signal
 import threading
 
 import pytest
@@ -12,6 +14,25 @@ from us_sim.run.graph import NodeProcess, ProcessGroup
 def test_a_name_that_is_no_text_is_refused(value):
     with pytest.raises(UsSimError, match=r"file: .*udcff.* is no text in UTF-8"):
         NodeProcess("session_recorder", {"file": value})
+
+
+def test_ctrl_c_while_a_process_is_started_is_heard():
+    """Python itself forgets what is raised in what `logging` does around a fork."""
+    forking = []
+
+    def interrupt():
+        if forking and forking.pop() == os.getpid():
+            os.kill(os.getpid(), signal.SIGINT)
+
+    os.register_at_fork(after_in_parent=interrupt)
+    group = ProcessGroup()
+    forking.append(os.getpid())
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            group.start([NodeProcess("probe_tracker")])
+        assert group.is_running("probe_tracker")  # and so it can be ended
+    finally:
+        group.stop()
 
 
 def test_without_threads_no_process_is_left(monkeypatch):

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
+from us_sim.run.deferred_signals import deferred_signals
 from us_sim.run.parameter_texts import require_texts
 from us_sim.scene.scene import Scene
 
@@ -174,16 +175,18 @@ class ProcessGroup:
         A node of the same name that has ended is replaced, by one that stands by if there is one.
         """
         for process in processes:
-            standby = self._standbys.pop(process.node, None)
-            if standby is None or not standby.go_on(process, self._show):
-                standby = _Running(process, self._show)
-            self._running[process.node] = standby
+            with deferred_signals():
+                standby = self._standbys.pop(process.node, None)
+                if standby is None or not standby.go_on(process, self._show):
+                    standby = _Running(process, self._show)
+                self._running[process.node] = standby
 
     def stand_by(self, process: NodeProcess) -> bool:
         """Have a second process of a node; whether it is ready."""
         standby = self._standbys.get(process.node)
         if standby is None or standby.process.poll() is not None:
-            standby = self._standbys[process.node] = _Running(process, None)
+            with deferred_signals():
+                standby = self._standbys[process.node] = _Running(process, None)
         return standby.said == STANDING_BY
 
     def _show(self, line: str) -> None:
