@@ -14,7 +14,7 @@ _WORKER = "PYTEST_XDIST_WORKER"
 
 _TISSUE = ("tissue", "evaluation/hand", "evaluation/stability", "evaluation/tissue")
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
-the others what is beside them."""
+the other one what is beside them."""
 
 _BESIDE = ("slicing", "evaluation", "demo", "tracking", "volume", "skin", "geometry")
 
@@ -23,10 +23,7 @@ _BY_GROUPS = pytest.StashKey[bool]()
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Run everything in three processes, where nothing else was asked for.
-
-    Two keep two cores busy; a third runs while one of them waits for messages or processes.
-    """
+    """Run everything in two processes, where nothing else was asked for."""
     option = config.option
     everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     chosen = option.keyword or option.markexpr or option.collectonly or option.usepdb
@@ -40,7 +37,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         and (os.cpu_count() or 1) > 1
     ):
         config.stash[_BY_GROUPS] = True
-        option.numprocesses = 3
+        option.numprocesses = 2
         option.dist = "loadscope"
         option.loadscopereorder = False
 

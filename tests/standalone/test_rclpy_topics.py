@@ -289,7 +289,7 @@ def test_processes_exchange_messages(bench) -> None:
         try:
             assert connected(bench, publisher)
             assert bench.spin_until(lambda: node.count_publishers("answer") == 1)
-            assert "/echo" in node.get_fully_qualified_node_names()
+            assert bench.spin_until(lambda: "/echo" in node.get_fully_qualified_node_names())
 
             def answered() -> list[String]:
                 publisher.publish(String(data="vein"))
@@ -301,4 +301,4 @@ def test_processes_exchange_messages(bench) -> None:
             other.terminate()
             other.wait(timeout=10)
     assert bench.spin_until(lambda: node.count_publishers("answer") == 0)
-    assert "/echo" not in node.get_fully_qualified_node_names()
+    assert bench.spin_until(lambda: "/echo" not in node.get_fully_qualified_node_names())

@@ -8,9 +8,10 @@ after some milliseconds, and so to each node that a pose passes through. Linux l
 
 from __future__ import annotations
 
+import contextlib
 import os
 
-__all__ = ["go_first", "scheduling_of"]
+__all__ = ["go_along", "go_first", "scheduling_of"]
 
 _PRIORITY = 1
 """The lowest of those that go first: drivers of devices may go before."""
@@ -24,13 +25,24 @@ def go_first() -> str:
     """
     if not hasattr(os, "sched_setscheduler"):
         return "ordinary"
-    policy = os.SCHED_RR | getattr(os, "SCHED_RESET_ON_FORK", 0)
+    return "realtime" if _schedule(os.SCHED_RR, _PRIORITY) else "ordinary"
+
+
+def go_along() -> None:
+    """Let all present threads of this process run as ordinary programs again."""
+    if hasattr(os, "sched_setscheduler"):
+        _schedule(os.SCHED_OTHER, 0)
+
+
+def _schedule(policy: int, priority: int) -> bool:
+    policy |= getattr(os, "SCHED_RESET_ON_FORK", 0)
     try:
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), policy, os.sched_param(_PRIORITY))
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
     except OSError:
-        return "ordinary"
-    return "realtime"
+        return False
+    return True
 
 
 def scheduling_of(pid: int) -> str:

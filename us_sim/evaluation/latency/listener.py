@@ -27,7 +27,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     from rclpy.signals import SignalHandlerOptions
 
     from us_sim.nodes.arrivals import Arrivals
-    from us_sim.nodes.realtime import go_first
+    from us_sim.nodes.realtime import go_along, go_first
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -45,5 +45,6 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     try:
         yield node
     finally:
+        go_along()
         context.try_shutdown()
         thread.join(timeout=5.0)
