@@ -197,12 +197,19 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "why"), [("none.yaml", "No such file"), ("pipe", "it is no file"), (".", "no file")]
+    ("name", "why"),
+    [
+        ("none.yaml", "No such file"),
+        ("pipe", "it is no file"),
+        (".", "no file"),
+        ("~nobody-at-all/a", "home"),
+    ],
 )
 def test_what_cannot_be_attached_is_refused(bench, tmp_path, name, why):
     os.mkfifo(tmp_path / "pipe")
+    name = name if name.startswith("~") else str(tmp_path / name)
     with pytest.raises(BagError, match=f"cannot be attached: .*{why}"):
-        bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), attach=[str(tmp_path / name)])
+        bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), attach=[name])
 
 
 def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):

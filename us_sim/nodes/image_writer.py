@@ -39,7 +39,7 @@ class ImageWriter(GuardedNode):
     def _write(self, message: Image) -> None:
         file = self._folder / f"{self.count:06d}.png"
         if not cv2.imwrite(str(file), pixels_from(message)):
-            raise OSError(f"{file} cannot be written; choose another folder with --out")
+            raise OSError(f"{file} cannot be written; choose another folder")
         self.count += 1
 
 

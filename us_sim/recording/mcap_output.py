@@ -50,9 +50,8 @@ _LENGTH = struct.Struct("<Q")
 
 _COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
 
-
 _COUNT = struct.Struct("<HI")  # channel, messages
-_PLACE = struct.Struct("<9xQQQ")  # of a chunk's index record: start, end, where the chunk begins
+_SPAN = struct.Struct("<9xQQQ")  # of a chunk's index record: start, end, where the chunk begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +62,9 @@ class _WrittenChunk:
     counts: bytes  # `_COUNT` of each channel
 
     @property
-    def place(self) -> tuple[int, int, int]:
+    def span(self) -> tuple[int, int, int]:
         """Lowest and highest log time, ns, and where in the file it begins."""
-        first, last, begin = _PLACE.unpack_from(self.index)
+        first, last, begin = _SPAN.unpack_from(self.index)
         return first, last, begin
 
 
@@ -333,14 +332,14 @@ class McapOutput:
         """Forget messages that are not in the file, while no chunk is in progress."""
         self.counts -= counts
         self.dropped += counts
-        places = [chunk.place for chunk in self._chunks]
-        self.start = min((first for first, _, _ in places), default=None)
-        self.end = max((last for _, last, _ in places), default=None)
+        spans = [chunk.span for chunk in self._chunks]
+        self.start = min((first for first, _, _ in spans), default=None)
+        self.end = max((last for _, last, _ in spans), default=None)
 
     def _drop_last_chunk(self) -> None:
         """Take back the last chunk, and what was written after it."""
         chunk = self._chunks.pop()
-        self._cut(chunk.place[2])
+        self._cut(chunk.span[2])
         self._attachments = [each for each in self._attachments if each.offset < self._size]
         self._metadata = [each for each in self._metadata if each.offset < self._size]
         topics = {channel.id: topic for topic, channel in self._channels.items()}

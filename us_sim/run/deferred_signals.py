@@ -39,9 +39,7 @@ def deferred_signals() -> Iterator[None]:
         return
     came: list[int] = []
     handlers = {
-        number: handler
-        for number in _NUMBERS
-        if callable(handler := signal.getsignal(number)) and not isinstance(handler, int)
+        number: handler for number in _NUMBERS if callable(handler := signal.getsignal(number))
     }
     for number in handlers:
         signal.signal(number, lambda number, _: came.append(number))
