@@ -11,8 +11,8 @@ import SimpleITK as sitk
 
 from tests.fuzz.target import target
 from us_sim.recording.path import read_path
-from us_sim.volume.readers import read_volume
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.files.readers import read_volume
+from us_sim.volume.sequences.sweep import read_sweep
 
 VOXELS = np.arange(6 * 5 * 4, dtype=np.int16).reshape(6, 5, 4)
 

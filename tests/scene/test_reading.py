@@ -15,7 +15,7 @@ from us_sim.scene.reading import find_scene, load_scene, parse_scene
 from us_sim.share import shared_path
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.sequences.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(
     """

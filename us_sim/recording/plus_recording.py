@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
-from us_sim.volume.metaimage import metaimage_header
-from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
+from us_sim.volume.files.metaimage import metaimage_header
+from us_sim.volume.sequences.sequence_header import frame_fields, frame_matrix, frame_time
 
 __all__ = ["TrackerRecording", "TransformChain", "read_tracker_recording"]
 

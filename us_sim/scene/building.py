@@ -53,11 +53,11 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
         VolumeError: its file cannot be read.
     """
     if scene.volume.file:
-        from us_sim.volume.readers import read_volume
+        from us_sim.volume.files.readers import read_volume
 
         volume = read_volume(Path(scene.volume.file))
     else:
-        from us_sim.volume.phantom import cached_phantom
+        from us_sim.volume.phantom.phantom import cached_phantom
 
         assert scene.volume.phantom is not None
         volume = cached_phantom(

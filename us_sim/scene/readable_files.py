@@ -27,7 +27,7 @@ def check_files(scene: Scene) -> list[str]:
     """
     checked = []
     if scene.volume.file:
-        from us_sim.volume.readers import read_placement
+        from us_sim.volume.files.readers import read_placement
 
         read_placement(Path(scene.volume.file))
         checked.append("volume.file (its header)")

@@ -108,7 +108,7 @@ def structures_of(
             if given.file:
                 yield Structure(name, colour, EmbeddedSurface(mesh, *_surface_of(scene, name)))
                 continue
-            from us_sim.volume.label_surface import label_surface, spacing_for
+            from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
 
             spacing = spacing or spacing_for(volume, list(labels.values()), triangles, box)
             around = label_surface(volume, labels[name], spacing, box)

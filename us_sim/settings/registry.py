@@ -40,7 +40,7 @@ SLICERS = Choice(
 )
 
 PHANTOMS = Choice(
-    "phantom", key="phantom", error=VolumeError, upper_arm="us_sim.volume.phantom:upper_arm"
+    "phantom", key="phantom", error=VolumeError, upper_arm="us_sim.volume.phantom.phantom:upper_arm"
 )
 
 PROBES = Choice(

@@ -14,8 +14,8 @@ from us_sim.evaluation.slice.recorded_frames import compare_with_recorded
 from us_sim.evaluation.slice.recorded_pairs import normalised_cross_correlation
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.volume.readers import read_volume
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.files.readers import read_volume
+from us_sim.volume.sequences.sweep import read_sweep
 
 SPACING = 0.314818e-3
 

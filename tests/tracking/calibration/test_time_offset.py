@@ -14,7 +14,7 @@ from us_sim.tracking.calibration.position_signal import (
 )
 from us_sim.tracking.calibration.recorded_motion import read_signal
 from us_sim.tracking.calibration.time_offset import find_time_offset
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.sequences.sweep import read_sweep
 
 
 def strokes(times):

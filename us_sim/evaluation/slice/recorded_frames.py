@@ -28,8 +28,8 @@ from us_sim.evaluation.slice.recorded_pairs import (
 )
 from us_sim.evaluation.slice.recorded_pictures import draw_recorded
 from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.volume.readers import read_volume
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.files.readers import read_volume
+from us_sim.volume.sequences.sweep import read_sweep
 
 __all__ = ["RecordedComparison", "compare_with_recorded"]
 

@@ -26,7 +26,7 @@ from us_sim.slicing.cutting.slicer import Slicer, create_slicer
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.volume.sweep import Sweep
+from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
 __all__ = [

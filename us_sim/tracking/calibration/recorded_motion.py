@@ -31,9 +31,9 @@ from us_sim.tracking.calibration.position_signal import (
     signal_of_images,
     signal_of_positions,
 )
-from us_sim.volume.metaimage import metaimage_header
-from us_sim.volume.sequence_header import frame_fields
-from us_sim.volume.sweep import Sweep, read_sweep
+from us_sim.volume.files.metaimage import metaimage_header
+from us_sim.volume.sequences.sequence_header import frame_fields
+from us_sim.volume.sequences.sweep import Sweep, read_sweep
 
 __all__ = ["read_motion", "read_signal", "seconds_of"]
 

@@ -8,7 +8,7 @@ import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sweep import read_sweep
+from us_sim.volume.sequences.sweep import read_sweep
 
 COLUMNS, ROWS, FRAMES = 5, 4, 3
 GREY = np.random.Generator(np.random.PCG64(5)).integers(

@@ -1,7 +1,7 @@
 """A check that an image file holds the bytes that its header promises.
 
 >>> import tempfile, pathlib
->>> from us_sim.volume.stored_size import check_stored_size
+>>> from us_sim.volume.files.stored_size import check_stored_size
 >>> header = "ObjectType = Image\\nNDims = 3\\nDimSize = 4 5 6\\nElementType = MET_SHORT\\n"
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     path = pathlib.Path(folder, "cut.mha")
@@ -16,10 +16,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from us_sim.errors import VolumeError
-from us_sim.volume.metaimage import metaimage_header, metaimage_voxels
-from us_sim.volume.nifti import nifti_voxels
-from us_sim.volume.nrrd import nrrd_voxels
-from us_sim.volume.stored_voxels import StoredVoxels
+from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
+from us_sim.volume.files.nifti import nifti_voxels
+from us_sim.volume.files.nrrd import nrrd_voxels
+from us_sim.volume.files.stored_voxels import StoredVoxels
 
 __all__ = ["check_stored_size"]
 

@@ -6,7 +6,7 @@ wherever the mean echo is even (Wagner, Smith, Sandrik, Lopez 1983). Interfaces 
 the scale of a wavelength add an echo of one phase, which does not speckle.
 
 >>> import numpy as np
->>> from us_sim.volume.speckle import PointSpread, echo_envelope
+>>> from us_sim.volume.phantom.speckle import PointSpread, echo_envelope
 >>> even = np.ones((40, 40, 80), np.float32)
 >>> depth = np.arange(80) * 0.3e-3
 >>> random = np.random.Generator(np.random.PCG64(1))

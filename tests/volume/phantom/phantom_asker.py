@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from us_sim.volume.phantom import upper_arm
-from us_sim.volume.phantom_cache import kept_volume
+from us_sim.volume.phantom.phantom import upper_arm
+from us_sim.volume.phantom.phantom_cache import kept_volume
 from us_sim.volume.volume import Volume
 
 

@@ -1,7 +1,7 @@
 """What the header of an NRRD file says of its voxels (teem.sourceforge.net/nrrd/format.html).
 
 >>> import pathlib, tempfile
->>> from us_sim.volume.nrrd import nrrd_voxels
+>>> from us_sim.volume.files.nrrd import nrrd_voxels
 >>> header = b"NRRD0004\\ntype: short\\ndimension: 3\\nsizes: 4 5 6\\nencoding: raw\\n\\n"
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     path = pathlib.Path(folder, "volume.nrrd")
@@ -19,7 +19,7 @@ import re
 from pathlib import Path
 
 from us_sim.errors import VolumeError
-from us_sim.volume.stored_voxels import StoredVoxels
+from us_sim.volume.files.stored_voxels import StoredVoxels
 
 __all__ = ["nrrd_voxels"]
 

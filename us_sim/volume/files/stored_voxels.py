@@ -4,7 +4,7 @@ A library that reads an image believes its header: it takes memory for what that
 the file holds less, what was in that memory before passes for tissue.
 
 >>> import pathlib, tempfile, zlib
->>> from us_sim.volume.stored_voxels import StoredVoxels
+>>> from us_sim.volume.files.stored_voxels import StoredVoxels
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     file = pathlib.Path(folder, "voxels.raw")
 ...     _ = file.write_bytes(zlib.compress(bytes(100)))

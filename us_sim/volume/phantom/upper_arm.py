@@ -5,7 +5,7 @@ follow what ultrasound shows at mid-arm: the brachial artery between a vein and 
 in a sheath under the fascia, biceps above and brachialis below, the humerus to one side.
 
 >>> import numpy as np
->>> from us_sim.volume.upper_arm import UPPER_ARM_LABELS, UpperArm
+>>> from us_sim.volume.phantom.upper_arm import UPPER_ARM_LABELS, UpperArm
 >>> arm = UpperArm(seed=1)
 >>> x, z = np.linspace(-0.036, 0.036, 90), np.linspace(0.0, 0.054, 70)
 >>> section = arm.section(x, 0.0, z)
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from us_sim.volume.texture import SmoothNoise, sheets
-from us_sim.volume.tube import Tube
+from us_sim.volume.phantom.texture import SmoothNoise, sheets
+from us_sim.volume.phantom.tube import Tube
 
 __all__ = ["UPPER_ARM_BLOCK", "UPPER_ARM_LABELS", "ArmSection", "UpperArm"]
 

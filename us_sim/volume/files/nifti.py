@@ -1,7 +1,7 @@
 """What the header of a NIfTI file says of its voxels (nifti.nimh.nih.gov, nifti1.h and nifti2.h).
 
 >>> import pathlib, tempfile, SimpleITK
->>> from us_sim.volume.nifti import nifti_voxels
+>>> from us_sim.volume.files.nifti import nifti_voxels
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     path = pathlib.Path(folder, "volume.nii.gz")
 ...     SimpleITK.WriteImage(SimpleITK.Image([4, 5, 6], SimpleITK.sitkInt16), str(path))
@@ -18,7 +18,7 @@ import zlib
 from pathlib import Path
 
 from us_sim.errors import VolumeError
-from us_sim.volume.stored_voxels import StoredVoxels
+from us_sim.volume.files.stored_voxels import StoredVoxels
 
 __all__ = ["nifti_voxels"]
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from us_sim.volume.texture import SmoothNoise, sheets
-from us_sim.volume.tube import Tube
+from us_sim.volume.phantom.texture import SmoothNoise, sheets
+from us_sim.volume.phantom.tube import Tube
 
 BLOCK = np.array([[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]])
 

@@ -5,8 +5,8 @@ import pytest
 
 from us_sim.errors import VolumeError
 from us_sim.volume.measure import label_area
-from us_sim.volume.phantom import cached_phantom, upper_arm
-from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+from us_sim.volume.phantom.phantom import cached_phantom, upper_arm
+from us_sim.volume.phantom.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
 from us_sim.volume.volume import Volume
 
 COARSE = 0.8e-3

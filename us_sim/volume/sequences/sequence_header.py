@@ -1,6 +1,6 @@
 """The fields of each frame in the header of a sequence file of Plus: transforms, status, time.
 
->>> from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
+>>> from us_sim.volume.sequences.sequence_header import frame_fields, frame_matrix, frame_time
 >>> header = {"NDims": "3", "Seq_Frame0003_Timestamp": "0.5"}
 >>> header["Seq_Frame0003_ProbeToTrackerTransform"] = "1 0 0 7 0 1 0 0 0 0 1 0 0 0 0 1"
 >>> frames = frame_fields(header)

@@ -1,7 +1,7 @@
 """Surfaces around labelled structures of a volume, by marching cubes.
 
 >>> import numpy as np
->>> from us_sim.volume.label_surface import label_surface
+>>> from us_sim.volume.surfaces.label_surface import label_surface
 >>> from us_sim.volume.volume import Volume
 >>> labels = np.zeros((40, 40, 40), np.uint8)
 >>> labels[10:30, 10:30, 10:30] = 6

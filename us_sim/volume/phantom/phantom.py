@@ -1,6 +1,6 @@
 """Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
 
->>> from us_sim.volume.phantom import upper_arm
+>>> from us_sim.volume.phantom.phantom import upper_arm
 >>> arm = upper_arm(seed=1, voxel_size=2e-3)
 >>> arm.shape, arm.label_names[6]
 ((36, 30, 27), 'vein')
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
-from us_sim.volume.phantom_cache import kept_volume
+from us_sim.volume.phantom.phantom_cache import kept_volume
 from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.volume import Volume
 
@@ -50,8 +50,8 @@ def upper_arm(
         VolumeError: the seed or the voxel size is out of range.
     """
     # A phantom that is kept needs none of it, and a node should start quickly.
-    from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
-    from us_sim.volume.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+    from us_sim.volume.phantom.speckle import PointSpread, echo_envelope, log_compress
+    from us_sim.volume.phantom.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
 
     for name, quantity, value in (("seed", SEED, seed), ("voxel size", VOXEL_SIZE, voxel_size)):
         try:

@@ -4,7 +4,7 @@ A MetaImage file whose third axis is time, and whose header gives every frame it
 millimetres, row by row), their status and a time stamp (plustoolkit.org, "Sequence file").
 
 >>> import pathlib, tempfile
->>> from us_sim.volume.sweep import read_sweep
+>>> from us_sim.volume.sequences.sweep import read_sweep
 >>> header = '''ObjectType = Image
 ... NDims = 3
 ... DimSize = 4 3 1
@@ -39,9 +39,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.metaimage import metaimage_header, metaimage_voxels
-from us_sim.volume.sequence_header import frame_fields, frame_matrix, frame_time
-from us_sim.volume.stored_voxels import StoredVoxels
+from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
+from us_sim.volume.files.stored_voxels import StoredVoxels
+from us_sim.volume.sequences.sequence_header import frame_fields, frame_matrix, frame_time
 
 __all__ = ["Sweep", "read_sweep"]
 

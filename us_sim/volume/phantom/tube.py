@@ -1,7 +1,7 @@
 """An elliptical tube along y that swings gently: a vessel, a nerve or the shaft of a bone.
 
 >>> import numpy as np
->>> from us_sim.volume.tube import Tube
+>>> from us_sim.volume.phantom.tube import Tube
 >>> vein = Tube(centre=(2e-3, 13e-3), radii=(3.5e-3, 2.75e-3))
 >>> distance, _ = vein.distance(np.array([2e-3]), 0.0, np.array([13e-3 - 2.75e-3]))
 >>> abs(round(float(distance[0, 0]), 9))

@@ -1,7 +1,7 @@
 """Volume files into frame ``patient``: MetaImage, NRRD and NIfTI, through SimpleITK.
 
 >>> import tempfile, SimpleITK
->>> from us_sim.volume.readers import read_volume
+>>> from us_sim.volume.files.readers import read_volume
 >>> image = SimpleITK.Image([30, 20, 10], SimpleITK.sitkUInt8)
 >>> image.SetSpacing([0.5, 0.5, 1.0]); image.SetOrigin([-7.0, 0.0, 3.0])  # mm
 >>> with tempfile.TemporaryDirectory() as folder:
@@ -23,7 +23,7 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.stored_size import check_stored_size
+from us_sim.volume.files.stored_size import check_stored_size
 from us_sim.volume.volume import Volume
 
 __all__ = ["read_placement", "read_volume"]

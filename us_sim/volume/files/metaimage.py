@@ -1,7 +1,7 @@
 """Headers of MetaImage files: their fields, and what they say of the voxels.
 
 >>> import pathlib, tempfile
->>> from us_sim.volume.metaimage import metaimage_header, metaimage_voxels
+>>> from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
 >>> header = "ObjectType = Image\\nNDims = 3\\nDimSize = 4 5 6\\nElementType = MET_SHORT\\n"
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     path = pathlib.Path(folder, "volume.mha")
@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from us_sim.errors import VolumeError
-from us_sim.volume.stored_voxels import StoredVoxels
+from us_sim.volume.files.stored_voxels import StoredVoxels
 
 __all__ = ["metaimage_header", "metaimage_voxels"]
 

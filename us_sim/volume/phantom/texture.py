@@ -4,7 +4,7 @@ The noise is fixed by its seed and its lengths alone, so the same tissue comes o
 size.
 
 >>> import numpy as np
->>> from us_sim.volume.texture import SmoothNoise
+>>> from us_sim.volume.phantom.texture import SmoothNoise
 >>> block = np.array([[0.0, 0.0, 0.0], [0.02, 0.02, 0.02]])
 >>> noise = SmoothNoise(np.random.Generator(np.random.PCG64(1)), block, (2e-3, 2e-3, 1e-3))
 >>> noise.plane(np.linspace(0.0, 0.02, 50), 0.01, np.linspace(0.0, 0.02, 80)).shape

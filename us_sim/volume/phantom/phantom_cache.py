@@ -1,8 +1,8 @@
 """Volumes in the user's cache folder, memory-mapped by all processes that use them.
 
 >>> import os, tempfile
->>> from us_sim.volume.phantom_cache import kept_volume
->>> from us_sim.volume.phantom import upper_arm
+>>> from us_sim.volume.phantom.phantom_cache import kept_volume
+>>> from us_sim.volume.phantom.phantom import upper_arm
 >>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
 ...     made = kept_volume("arm", lambda: upper_arm(seed=1, voxel_size=3e-3))
 ...     kept = kept_volume("arm", lambda: 1 / 0)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import VolumeError
-from us_sim.volume.label_surface import label_surface, spacing_for
-from us_sim.volume.phantom import cached_phantom
+from us_sim.volume.phantom.phantom import cached_phantom
+from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
 from us_sim.volume.volume import Volume
 
 

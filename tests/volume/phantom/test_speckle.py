@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from us_sim.volume.speckle import PointSpread, echo_envelope, log_compress
+from us_sim.volume.phantom.speckle import PointSpread, echo_envelope, log_compress
 
 VOXEL = 0.3e-3
 SHAPE = (90, 80, 100)

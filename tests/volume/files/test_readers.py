@@ -9,8 +9,8 @@ import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
-from us_sim.volume import stored_voxels
-from us_sim.volume.readers import read_volume
+from us_sim.volume.files import stored_voxels
+from us_sim.volume.files.readers import read_volume
 
 SHAPE = (4, 5, 6)
 GREY = np.random.Generator(np.random.PCG64(2)).integers(0, 256, SHAPE, dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""Volume files of other programs, read and written."""
