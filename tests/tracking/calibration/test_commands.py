@@ -160,7 +160,7 @@ def test_probe_from_times_and_from_poses(tmp_path, capsys):
     body = corner + spacing * np.stack([pixels[:, 0], 0 * times, pixels[:, 1]], axis=1)
     positions = pin - turns.apply(body)
     recording = bag(tmp_path / "probe.mcap", times, positions, turns)
-    chosen = range(5, 395, 5)
+    chosen = [*range(0, 395, 5), 399]  # the first pose and the last among them
     with (tmp_path / "timed.csv").open("w") as file:
         rows = csv.writer(file)
         rows.writerow(["feature", "column", "row", "time"])
@@ -199,6 +199,46 @@ def test_probe_from_times_and_from_poses(tmp_path, capsys):
         capsys, "probe", tmp_path / "posed.csv", "--phantom", other, *origin, "--out", "x.yaml"
     )
     assert "has no pin, which" in said
+
+
+@pytest.mark.parametrize("time", ["1699999999.9", "1700000004.1", "1700000002.25"])
+def test_sightings_without_a_pose_are_refused(tmp_path, capsys, time):
+    times = np.concatenate([np.arange(0, 2.05, 0.1), np.arange(2.5, 4.05, 0.1)])
+    turns = Rotation.from_euler("x", times[:, None])
+    recording = bag(tmp_path / "probe.mcap", times, np.zeros((len(times), 3)), turns)
+    (tmp_path / "seen.csv").write_text(f"feature,column,row,time\npin,100,200,{time}\n")
+    chosen = ("--recording", recording, "--origin", 0, 0, "--out", tmp_path / "x.yaml")
+    assert "no pose around" in refusal(capsys, "probe", tmp_path / "seen.csv", *chosen)
+
+
+def test_probe_that_hardly_turned_over_few_wires_is_remarked_on(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    wires = {f"w{k}": [0.02 * k, 0, 0.01 * k**2, 0.02 * (k + 1), 0.04, 0.01] for k in range(4)}
+    with (tmp_path / "wires.csv").open("w") as file:
+        rows = csv.writer(file)
+        rows.writerow(["name", "x1", "y1", "z1", "x2", "y2", "z2"])
+        rows.writerows([name, *ends] for name, ends in wires.items())
+    with (tmp_path / "seen.csv").open("w") as file:
+        rows = csv.writer(file)
+        rows.writerow(["feature", "column", "row", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for k in range(80):
+            name = f"w{k % 4}"
+            ends = np.reshape(wires[name], (2, 3))
+            place = ends[0] + rng.uniform(0.1, 0.9) * (ends[1] - ends[0])
+            pixel = rng.uniform(50, 450, 2)
+            turn = Rotation.from_rotvec(np.radians(3.0) * rng.uniform(-0.5, 0.5, 3))
+            body = turn.apply([0.01 + 2e-4 * pixel[0], 0.02, 0.06 + 2e-4 * pixel[1]])
+            rows.writerow([name, *pixel, *(place - body), *turn.as_quat()])
+    out = tmp_path / "probe.yaml"
+    chosen = ("--phantom", tmp_path / "wires.csv", "--origin", 250, 0, "--out", out)
+    assert calibrate("probe", tmp_path / "seen.csv", *chosen) == 0
+    said = capsys.readouterr().out
+    assert "the probe turned by only 4°, which determines little" in said
+    assert "4 features are too few" in said
+    written = yaml.safe_load(out.read_text())
+    assert np.radians(2.5) < written["residuals"]["turned"] < np.radians(5.2)
+    assert written["standard_deviations"]["clusters"] == 12
+    assert written["standard_deviations"]["cluster"] == "part of a feature's sightings"
 
 
 def test_camera_from_photos_of_a_chessboard(tmp_path, capsys):

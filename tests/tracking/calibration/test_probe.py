@@ -85,15 +85,54 @@ def test_known_pixels_stay_as_they_are():
     assert np.abs(errors(found)[:3]).max() < 3e-4
 
 
-@pytest.mark.parametrize("noise", [{"pixel_noise": 2.0}, {"pose_noise": 4e-4}])
-def test_errors_are_as_large_as_the_covariance_says(noise):
+def related(rng, count, clusters, bias, noise):
+    """(count, 3) m errors: of each cluster its own, and those of neighbours correlate by 0.9."""
+    own = bias * rng.standard_normal((clusters, 3))
+    slow = noise * rng.standard_normal((count // clusters, clusters, 3))
+    for k in range(1, len(slow)):
+        slow[k] = 0.9 * slow[k - 1] + np.sqrt(1 - 0.9**2) * slow[k]
+    return (own + slow).reshape(count, 3)
+
+
+@pytest.mark.parametrize(
+    ("features", "known", "bias", "noise"),
+    [
+        (NWIRES, NWIRES, 0.0, {"pixel_noise": 2.0}),
+        (NWIRES, NWIRES, 2e-4, {"pose_noise": 2e-4}),
+        ({"pin": np.array([[0.2, -0.1, 0.4]])}, {}, 0.0, {"pose_noise": 2e-4}),
+    ],
+)
+def test_errors_are_as_large_as_the_deviations_say(features, known, bias, noise):
+    # Of each wire a bias, and errors of the tracker that drift, as real recordings have them.
     rng = np.random.default_rng(11)
-    normal = []
+    said, happened = [], []
+    count = 90
     for _ in range(40):
-        found = calibrate_probe(sightings(rng, NWIRES, 90, **noise), NWIRES)
-        normal.append(errors(found) / deviations(found))
-    # 320 correlated deviates, at most a few per cent beyond what few sightings let them scatter.
-    assert np.sqrt(np.mean(np.square(normal))) == pytest.approx(1.0, abs=0.15)
+        made = sightings(rng, features, count, **{"pixel_noise": 0.0, **noise, "pose_noise": 0.0})
+        drift = related(rng, count, len(features), bias, noise.get("pose_noise", 0.0))
+        made = [
+            PixelSighting(
+                seen.feature,
+                seen.column,
+                seen.row,
+                Pose(seen.pose.position + error, seen.pose.orientation),
+            )
+            for seen, error in zip(made, drift, strict=True)
+        ]
+        found = calibrate_probe(made, known)
+        said.append(deviations(found))
+        happened.append(errors(found))
+    for part in (slice(0, 3), slice(3, 6), slice(6, 8)):
+        true = np.sqrt(np.mean(np.square(np.array(happened)[:, part])))
+        assert np.sqrt(np.mean(np.square(np.array(said)[:, part]))) == pytest.approx(true, rel=0.3)
+
+
+def test_the_body_turned_by_as_much_as_it_did():
+    rng = np.random.default_rng(4)
+    made = sightings(rng, NWIRES, 90, turn=0.02)
+    turns = Rotation.from_quat([seen.pose.orientation for seen in made])
+    largest = max((turns * turn.inv()).magnitude().max() for turn in turns)
+    assert calibrate_probe(made, NWIRES).turned == pytest.approx(largest, rel=0.15)
 
 
 def test_wrong_sightings_are_left_out():

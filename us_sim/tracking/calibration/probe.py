@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.clustered_covariance import cluster_numbers, clustered_covariance
 
 __all__ = ["PixelSighting", "ProbeCalibration", "calibrate_probe"]
 
@@ -68,6 +69,8 @@ class ProbeCalibration:
     residuals: NDArray[np.float64]  # (N,) m, of all sightings
     inliers: NDArray[np.bool_]  # (N,)
     covariance: NDArray[np.float64]  # (8, 8) of position, rotation (about the body's axes), spacing
+    clusters: NDArray[np.intp]  # (N,) of sightings whose errors are taken to be related
+    turned: float  # rad, by which the body turned: about the largest angle between two poses
     points: Mapping[str, NDArray[np.float64]]  # (3,) m, where features were found to be
 
     def probe_pose(self, column: float, row: float) -> Pose:
@@ -118,13 +121,17 @@ def calibrate_probe(
             f"mm: give the poses and the phantom in metres"
         )
     residuals = np.linalg.norm(seen.distances(image), axis=1)
+    clusters = cluster_numbers([sighting.feature for sighting in sightings])
+    _, of_used = np.unique(clusters[inliers], return_inverse=True)
     return ProbeCalibration(
         image.matrix,
         image.spacing,
         math.sqrt(float((residuals[inliers] ** 2).mean())),
         residuals,
         inliers,
-        _covariance(used, image, jacobian),
+        _covariance(used, image, jacobian, of_used.astype(np.intp)),
+        clusters,
+        _turned(used.rotations),
         dict(zip(unknown, image.points, strict=True)),
     )
 
@@ -288,20 +295,19 @@ def _gain(seen: _Sightings, image: _Image, jacobian: NDArray[np.float64]) -> flo
 
 
 def _covariance(
-    seen: _Sightings, image: _Image, jacobian: NDArray[np.float64]
+    seen: _Sightings, image: _Image, jacobian: NDArray[np.float64], clusters: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """(8, 8) of position, rotation and spacing, whatever the directions of the errors.
-
-    The sandwich estimate (White 1980), since pixels err in the image's plane and poses anyhow.
-    """
-    count, size = len(seen.pixels), jacobian.shape[1]
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    slopes = jacobian.reshape(count, 3, size)
-    pulls = np.einsum("nij,ni->nj", slopes, seen.distances(image))
-    # Every sighting tells two to three numbers.
-    freedom = count / max(count - size / 2.5, 1.0)
-    full = inverse @ (pulls.T @ pulls) @ inverse * freedom
+    """(8, 8) of position, rotation and spacing, from errors that are related within clusters."""
+    slopes = jacobian.reshape(len(seen.pixels), 3, -1)
+    full = clustered_covariance(slopes, seen.distances(image), clusters)
     order = [3, 4, 5, 0, 1, 2] + ([6, 7] if seen.spacing is None else [])
     covariance = np.zeros((8, 8))
     covariance[: len(order), : len(order)] = full[np.ix_(order, order)]
     return covariance
+
+
+def _turned(rotations: NDArray[np.float64]) -> float:
+    """About the largest angle, rad, between two of the rotations (N, 3, 3)."""
+    turns = Rotation.from_matrix(rotations)
+    farthest = turns[int((turns * turns[0].inv()).magnitude().argmax())]
+    return float((turns * farthest.inv()).magnitude().max())

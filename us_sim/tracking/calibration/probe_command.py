@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.settings.text_file import read_text
+from us_sim.tracking.calibration.clustered_covariance import ENOUGH_FEATURES
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
-from us_sim.tracking.calibration.probe import PixelSighting, calibrate_probe
+from us_sim.tracking.calibration.probe import PixelSighting, ProbeCalibration, calibrate_probe
 from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
 from us_sim.tracking.calibration.settings import ProbeSettings, Progress
 from us_sim.tracking.calibration.transform_file import read_transform, write_transform
@@ -23,6 +25,9 @@ __all__ = ["calibrate_image"]
 _PIXEL = {"column": "number", "row": "number"}
 _POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "qz", "qw"), "number")
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated
+_ROUNDED = 1e-3  # s, by which a time may differ from the stamp that it means
+_LITTLE_TURN = math.radians(20.0)
+_FEATURE, _PART = "feature", "part of a feature's sightings"
 
 
 def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
@@ -49,6 +54,8 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
     )
     deviations = np.sqrt(np.diag(found.covariance))
     rejected = int((~found.inliers).sum())
+    clusters = len(np.unique(found.clusters[found.inliers]))
+    features = len({sighting.feature for sighting in seen})
     write_transform(
         out,
         found.probe_pose(*settings.origin),
@@ -60,6 +67,7 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
             "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
             "sightings": len(seen),
             "rejected": rejected,
+            "turned": found.turned,  # rad, by which the body turned
         },
         more={
             "pixel_spacing": found.spacing,  # m, between columns and between rows
@@ -69,6 +77,9 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
                 "position": deviations[:3],  # m, of pixel (0, 0)
                 "rotation": deviations[3:6],  # rad, about the body's axes
                 "pixel_spacing": deviations[6:],  # m
+                # Errors are taken to be independent between these, and related within each.
+                "clusters": clusters,
+                "cluster": _FEATURE if features >= ENOUGH_FEATURES else _PART,
             },
             **({"points": found.points} if found.points else {}),  # m
         },
@@ -77,8 +88,24 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
         f"{out}: pixels of {1e3 * found.spacing[0]:.4f} × {1e3 * found.spacing[1]:.4f} mm, RMS "
         f"{1e3 * found.rms:.2f} mm over {len(seen) - rejected} sightings, {rejected} left out, "
         f"± {1e3 * float(np.linalg.norm(deviations[:3])):.2f} mm and "
-        f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°"
+        f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°{_remarks(found, features)}"
     )
+
+
+def _remarks(found: ProbeCalibration, features: int) -> str:
+    """What makes the result less certain than it could be."""
+    said = ""
+    if found.turned < _LITTLE_TURN:
+        said += (
+            f"; the probe turned by only {math.degrees(found.turned):.0f}°, which determines "
+            f"little: turn it by 30° or more about all axes"
+        )
+    if len(found.points) < features < ENOUGH_FEATURES:
+        said += (
+            f"; {features} {'feature is' if features == 1 else 'features are'} too few to tell "
+            f"what a misplaced one does to the result: the deviations leave that out"
+        )
+    return said
 
 
 def _features(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -115,17 +142,32 @@ def _with_times(
     for feature, (column, row, time) in read_table(
         path, _PIXEL | {"time": "time"}, label="feature"
     ):
-        after = int(np.searchsorted(stamps, time))
-        if not 0 < after < len(stamps) or stamps[after] - stamps[after - 1] > _LONGEST_GAP:
+        before, after, fraction = _around(stamps, time)
+        if stamps[after] - stamps[before] > _LONGEST_GAP or not 0.0 <= fraction <= 1.0:
             raise CalibrationError(
                 f"{path}: sighting {len(seen) + 1}: {recording.name} has no pose around "
                 f"{time:.3f} s; it goes from {stamps[0]:.3f} to {stamps[-1]:.3f} s"
             )
-        before, behind = (motion.pose(first[k]) for k in (after - 1, after))
-        fraction = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        pose = to_phantom @ interpolate(before, behind, fraction)
+        pose = interpolate(motion.pose(first[before]), motion.pose(first[after]), fraction)
+        pose = to_phantom @ pose
         seen.append(PixelSighting(feature, column, row, pose))
     return seen
+
+
+def _around(stamps: NDArray[np.float64], time: float) -> tuple[int, int, float]:
+    """The stamps before and after a time, and the fraction of the way from one to the other.
+
+    Where a stamp is the time but for rounding, it is both. Before the first and after the last
+    stamp the fraction is not from 0 to 1.
+    """
+    after = int(np.clip(np.searchsorted(stamps, time), 1, max(len(stamps) - 1, 1)))
+    for k in (after - 1, min(after, len(stamps) - 1)):
+        if abs(stamps[k] - time) <= _ROUNDED:
+            return k, k, 0.0
+    if after == len(stamps):
+        return 0, 0, math.nan
+    before = after - 1
+    return before, after, float((time - stamps[before]) / (stamps[after] - stamps[before]))
 
 
 def _by_feature(
