@@ -3,6 +3,7 @@
 __all__ = [
     "BagError",
     "CalibrationError",
+    "CaseError",
     "MaterialError",
     "MeshError",
     "MessageError",
@@ -65,6 +66,10 @@ class SolverError(UsSimError):
 
 class VolumeError(UsSimError):
     """A volume cannot be read or sampled."""
+
+
+class CaseError(UsSimError):
+    """A case cannot be read, or cannot be made or changed where it was asked to."""
 
 
 class ProbeError(UsSimError):

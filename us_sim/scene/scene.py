@@ -12,9 +12,10 @@ from typing import Any
 
 from us_sim.errors import SceneError
 from us_sim.geometry.placement import Placement
+from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.registry import COLLIDERS, FILTERS, PROBES, SLICERS, SOLVERS, TRACKERS
+from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
 from us_sim.slicing.formation.imaging import Imaging
@@ -85,35 +86,6 @@ class StructureSettings(Settings):
             raise self.refused("", "has both `file` and `label`; keep one")
         if not self.file and (self.unit != 1.0 or self.pose != Placement()):
             raise self.refused("", "`unit` and `pose` are for a surface from a `file` only")
-
-
-@dataclass(frozen=True)
-class ProbeSettings(Settings):
-    """The transducer: its geometry, the image it makes, and the shape that presses."""
-
-    section = "probe"
-    error = SceneError
-
-    array: Chosen = setting(
-        description="kind of transducer",
-        choice=PROBES,
-        place="beside",
-        default=Chosen("linear"),
-    )
-    image: tuple[int, int] | int | None = setting(
-        Quantity("number", 1, 4096),
-        "[columns, rows], or the number of rows of square pixels; not given: [512, 512] of a "
-        "linear array, else 512",
-        default=None,
-    )
-    collider: Chosen | None = setting(
-        description="shape that presses", choice=COLLIDERS, default=None
-    )
-
-    @property
-    def geometry(self) -> str:
-        """The kind of transducer."""
-        return self.array.name
 
 
 @dataclass(frozen=True)

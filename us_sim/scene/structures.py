@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SceneError, UsSimError
 from us_sim.scene.scene import Scene
+from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
 if TYPE_CHECKING:
@@ -31,17 +32,6 @@ if TYPE_CHECKING:
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["Structure", "colour_of", "require_labels", "structures_of"]
-
-Colour = tuple[float, float, float]
-
-# As anatomical atlases paint them.
-_COLOURS: dict[str, Colour] = {
-    "artery": (0.85, 0.15, 0.15),
-    "bone": (0.93, 0.9, 0.8),
-    "nerve": (0.95, 0.85, 0.3),
-    "vein": (0.25, 0.4, 0.85),
-}
-_ANY_OTHER: Colour = (0.7, 0.6, 0.55)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +46,7 @@ class Structure:
 def colour_of(scene: Scene, name: str) -> Colour:
     """Red, green and blue of a structure: the scene's, or what its label's name suggests."""
     given = scene.structures[name]
-    return given.colour or _COLOURS.get(given.label or name, _ANY_OTHER)
+    return given.colour or anatomical_colour(given.label or name)
 
 
 def require_labels(scene: Scene, volume: Volume) -> None:

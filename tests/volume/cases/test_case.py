@@ -1,0 +1,164 @@
+"""Cases that are read as they were written, and those of which no good can come."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from us_sim.errors import CaseError, VolumeError
+from us_sim.geometry.placement import Placement
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.reading import Reader
+from us_sim.tissue.elasticity.material import Material
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.files.writing import write_labels, write_volume
+from us_sim.volume.volume import Volume
+
+
+def test_a_case_is_read_as_it_was_made(make_case, block):
+    probe = {"geometry": "convex", "radius": "50 mm", "opening_angle": "60 deg", "depth": "18 cm"}
+    probe["collider"] = {"shape": "sphere", "radius": "2 cm"}
+    made = CaseSettings(
+        "block",
+        "forearm",
+        "A block: 60 × 40 × 50 mm",
+        Reader("probe").read(ProbeSettings, probe),
+        Placement((0.01, 0, 0), (0.0, 1.0, 0.0, 0.0)),
+        7e-3,
+        Material(5e3, 0.49),
+        {"vein": CaseStructure(6, Material(1e3, 0.1, 1060.0, 800.0), (0.1, 0.2, 0.3))},
+        ("bottom", "sides"),
+    )
+    case = read_case(make_case(settings=made))
+    assert case.settings == made
+    volume = case.volume()
+    np.testing.assert_array_equal(volume.intensities, block.intensities)
+    np.testing.assert_array_equal(volume.labels, block.labels)
+    np.testing.assert_allclose(volume.index_to_patient, block.index_to_patient, atol=1e-15)
+    assert volume.label_names == {0: "tissue", 6: "vein"}
+
+
+def test_a_case_without_labels_is_a_volume_alone(make_case):
+    case = read_case(make_case(labelled=False))
+    assert not case.has_labels
+    assert case.volume().labels is None
+    assert case.surfaces == {}
+    assert case.tissue is None
+
+
+def changed(folder, text):
+    (folder / "case.yaml").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is empty; a case has at least a name"),
+        ("name: a\nregoin: arm\n", "regoin: unknown key; did you mean `region`?"),
+        ("name: ../../etc\n", "name: '../../etc': a name is no path"),
+        ("name: a\nstructures: {../../up: {label: 6}}\n", "a name is no path"),
+        ("name: a\nstructures: {vein: {label: 6}, vena: {label: 6}}\n", "6 is `vein` already"),
+        ("name: a\nstructures: {vein: {label: 0}}\n", "label: 0 is outside 1 to 255"),
+        ("name: a\nstructures: {top: {label: 6}}\n", "means something else already"),
+        ("name: a\nfixed: [botom]\n", "did you mean 'bottom'?"),
+        ("name: a\naround: livr\n", "did you mean 'liver'"),
+        ("name: a\nname: b\n", "key `name` is there twice"),
+        ("name: [\n", "is not YAML"),
+        ("- a\n", "must be a mapping of keys"),
+        ("name: a\nstart: {position: [1 km, 0, 0]}\n", "start.position"),
+        ("name: a\nvolume: ../../../etc/passwd\n", "volume: unknown key"),
+    ],
+)
+def test_what_a_case_cannot_say_is_refused_in_a_sentence(make_case, text, sentence):
+    folder = changed(make_case(), text)
+    with pytest.raises(CaseError) as refused:
+        read_case(folder)
+    assert sentence in str(refused.value)
+    assert str(folder) in str(refused.value)
+
+
+def test_a_place_without_a_case_is_refused(tmp_path, make_case):
+    with pytest.raises(CaseError, match="there is no such case"):
+        read_case(tmp_path / "nothing")
+    with pytest.raises(CaseError, match=r"it has no case\.yaml"):
+        read_case(tmp_path)
+    folder = make_case()
+    (folder / "volume.nrrd").unlink()
+    with pytest.raises(CaseError, match=r"it has no volume\.nrrd"):
+        read_case(folder)
+
+
+def test_links_in_a_circle_are_refused(tmp_path, make_case):
+    os.symlink(tmp_path / "b", tmp_path / "a")
+    os.symlink(tmp_path / "a", tmp_path / "b")
+    with pytest.raises(CaseError, match="in a circle"):
+        read_case(tmp_path / "a")
+    folder = make_case()
+    os.symlink("labels.nrrd", folder / "again")
+    (folder / "labels.nrrd").unlink()
+    os.symlink("again", folder / "labels.nrrd")
+    with pytest.raises(CaseError, match="in a circle"):
+        read_case(folder)
+
+
+def test_a_link_out_of_the_case_is_refused_and_one_to_the_case_is_not(tmp_path, make_case):
+    folder = make_case()
+    os.symlink(folder, tmp_path / "elsewhere")
+    assert read_case(tmp_path / "elsewhere").settings.name == "block"
+    shutil.move(folder / "labels.nrrd", tmp_path / "secret.nrrd")
+    os.symlink("../secret.nrrd", folder / "labels.nrrd")
+    with pytest.raises(CaseError, match="leads out of the case"):
+        read_case(folder)
+
+
+def test_voxels_in_another_file_are_refused(tmp_path, make_case):
+    folder = make_case()
+    data = (folder / "volume.nrrd").read_bytes()
+    header, _, voxels = data.partition(b"\n\n")
+    (tmp_path / "secret.raw").write_bytes(voxels)
+    (folder / "volume.nrrd").write_bytes(header + b"\ndata file: ../secret.raw\n\n")
+    with pytest.raises(VolumeError, match="keeps its voxels in another file"):
+        read_case(folder).volume()
+
+
+def test_labels_must_be_on_the_volumes_grid(make_case, block):
+    folder = make_case()
+    shifted = block.index_to_patient.copy()
+    shifted[0, 3] += 1e-4
+    write_labels(folder / "labels.nrrd", Volume(block.intensities, shifted, block.labels))
+    with pytest.raises(CaseError, match=r"is on another grid than volume.nrrd .* 0.1 mm apart"):
+        read_case(folder).volume()
+    fewer = block.labels[:, :, :-1]
+    write_labels(folder / "labels.nrrd", Volume(fewer, block.index_to_patient, fewer))
+    with pytest.raises(CaseError, match=r"30 × 20 × 24 voxels, 30 × 20 × 25 there"):
+        read_case(folder).volume()
+
+
+def test_every_label_is_a_structure_and_every_structure_is_there(make_case):
+    folder = changed(make_case(), "name: a\n")
+    with pytest.raises(CaseError, match="has the label 6, which is no structure"):
+        read_case(folder).volume()
+    changed(folder, "name: a\nstructures: {vein: {label: 6}, artery: {label: 7}}\n")
+    with pytest.raises(CaseError, match=r"structures.artery: label 7 occurs nowhere"):
+        read_case(folder).volume()
+
+
+def test_a_damaged_volume_is_refused_before_it_takes_memory(make_case, block):
+    folder = make_case()
+    write_volume(folder / "volume.nrrd", block)
+    data = (folder / "volume.nrrd").read_bytes()
+    (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 3000 20 25"))
+    with pytest.raises(VolumeError, match="bytes of image data where its header says"):
+        read_case(folder).volume()
+    (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 9000 9000 9000"))
+    with pytest.raises(VolumeError, match="are read at most"):
+        read_case(folder).volume()
+
+
+def test_bones_and_the_bottom_are_held_unless_the_case_says_other():
+    structures = {"rib": CaseStructure(1), "vein": CaseStructure(2)}
+    assert CaseSettings("a", structures=structures).held == ("bottom", "rib")
+    assert CaseSettings("a", structures=structures, fixed=("sides",)).held == ("sides",)

@@ -1,0 +1,149 @@
+"""A case is made whole or not at all."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+
+from us_sim.errors import CaseError
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.cases.provenance import Source, Step, add_step
+from us_sim.volume.cases.settings import CaseSettings
+from us_sim.volume.cases.writing import changed_case, new_case, write_case_settings
+from us_sim.volume.files.writing import write_volume
+
+
+@pytest.mark.parametrize("interruption", [RuntimeError, KeyboardInterrupt, CaseError])
+def test_nothing_is_left_of_a_case_that_was_broken_off(tmp_path, block, interruption):
+    def broken_off():
+        with new_case(tmp_path / "arm") as folder:
+            write_volume(folder / "volume.nrrd", block)
+            write_case_settings(folder, CaseSettings("arm"))
+            raise interruption("halfway")
+
+    with pytest.raises(interruption):
+        broken_off()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_left_of_a_case_that_is_none(tmp_path, block):
+    with (
+        pytest.raises(CaseError, match=rf"^{tmp_path}/arm: is no case, as it has no case.yaml"),
+        new_case(tmp_path / "arm") as folder,
+    ):
+        write_volume(folder / "volume.nrrd", block)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_case_that_is_there_is_not_written_over(make_case):
+    folder = make_case()
+    before = (folder / "case.yaml").read_bytes()
+    with pytest.raises(CaseError, match="exists already"), new_case(folder):
+        pass
+    assert (folder / "case.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", [".hidden", "a:b", " a"])
+def test_a_case_has_a_name_that_folders_can_have(tmp_path, name):
+    with pytest.raises(CaseError, match="a name"), new_case(tmp_path / name):
+        pass
+
+
+def test_a_change_takes_the_place_of_the_case_only_when_all_of_it_is_right(make_case):
+    folder = make_case()
+    with changed_case(folder) as partial:
+        write_case_settings(partial, CaseSettings("other", structures={}))
+        (partial / "labels.nrrd").unlink()
+        assert read_case(folder).settings.name == "block"  # not yet
+    assert read_case(folder).settings.name == "other"
+    with pytest.raises(CaseError, match="another grid"), changed_case(folder) as partial:
+        (partial / "labels.nrrd").write_bytes(
+            (folder / "volume.nrrd")
+            .read_bytes()
+            .replace(b"space origin: (-30", b"space origin: (-31")
+        )
+    assert not read_case(folder).has_labels
+    assert sorted(folder.parent.iterdir()) == [folder]
+
+
+def test_two_programs_do_not_change_one_case_at_a_time(make_case):
+    folder = make_case()
+    with (
+        changed_case(folder),
+        pytest.raises(CaseError, match="another program is changing"),
+        changed_case(folder),
+    ):
+        pass
+
+
+def test_what_a_killed_program_left_is_removed_and_never_what_one_is_writing(tmp_path, block):
+    script = """
+        import sys, time
+        from us_sim.volume.cases.writing import new_case
+        with new_case(sys.argv[1]) as folder:
+            print(folder, flush=True)
+            time.sleep(60)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "arm")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+        partial = writer.stdout.readline().strip()
+        with new_case(tmp_path / "arm") as folder:
+            write_volume(folder / "volume.nrrd", block)
+            write_case_settings(folder, CaseSettings("arm"))
+            assert os.path.isdir(partial)
+        writer.send_signal(signal.SIGKILL)
+    assert os.path.isdir(partial)
+    with changed_case(tmp_path / "arm"):
+        assert not os.path.isdir(partial)
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+
+
+def test_a_change_broken_off_between_its_renames_says_where_the_case_is(make_case):
+    folder = make_case()
+    os.rename(folder, folder.with_name(".block.before-x"))
+    with pytest.raises(CaseError, match=r"rename .block.before-x to it"):
+        read_case(folder)
+
+
+def test_steps_are_kept_in_order_with_what_went_in(make_case):
+    folder = make_case()
+    started = time.time()
+    with changed_case(folder) as partial:
+        source = Source.of(partial / "volume.nrrd", "volume")
+        add_step(partial, Step("imported", {"spacing": 5e-4, "method": "linear"}, {}, (source,)))
+        add_step(partial, Step("segmented", {"seeds": [[1.0, 2.0]]}, {"voxels": 12}))
+    imported, segmented = read_case(folder).steps
+    # As sha256sum has it of the same bytes.
+    digest = subprocess.run(
+        ["sha256sum", folder / "volume.nrrd"], capture_output=True, text=True, check=True
+    ).stdout.split()[0]
+    assert imported.sources == (Source("volume", digest),)
+    assert imported.settings == {"spacing": 5e-4, "method": "linear"}
+    assert segmented.counts == {"voxels": 12}
+    text = (folder / "provenance.yaml").read_text()
+    assert str(folder) not in text
+    assert time.strftime("%Y", time.localtime(started)) not in text  # nor when
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["/data/doe.mha", "doe_jane.mha", "C:\\doe", "Doe^Jane", "two\nlines", "x" * 200, object()],
+)
+def test_a_step_keeps_nothing_that_may_say_whose_it_is(value):
+    with pytest.raises(CaseError, match=r"provenance: settings\.source"):
+        Step("imported", {"source": value})
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["steps: 3", "[]", "steps: [{what: made}]", "steps: [{what: /a/b, us_sim: '1'}]", "a: [", ""],
+)
+def test_a_provenance_that_is_none_is_refused(make_case, text):
+    folder = make_case()
+    (folder / "provenance.yaml").write_text(text)
+    with pytest.raises(CaseError, match=r"provenance\.yaml"):
+        read_case(folder)

@@ -1,0 +1,1 @@
+"""Cases: folders with a volume, its labels, surfaces and tissue, ready to scan."""

@@ -1,0 +1,149 @@
+"""What ``case.yaml`` says: what the case is of, its structures, and how to scan it.
+
+>>> from us_sim.settings.reading import Reader
+>>> from us_sim.volume.cases.settings import CaseSettings
+>>> case = Reader("case.yaml").read(CaseSettings, {
+...     "name": "liver", "region": "abdomen", "structures": {"portal vein": {"label": 1}},
+...     "start": {"position": ["49 mm", "92 mm", "127 mm"], "orientation": [0, 1, 0, 0]}})
+>>> case.material_of("portal vein").lumen_pressure, case.press
+(1000.0, 0.012)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from us_sim.errors import CaseError
+from us_sim.geometry.placement import Placement
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import shown, unknown
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
+from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+
+__all__ = ["AROUND", "CaseSettings", "CaseStructure", "check_name"]
+
+AROUND = "tissue"
+"""Name of what is in no structure: label 0, or all of a volume without labels."""
+
+_LONGEST_NAME = 80
+_FACES = ("top", "bottom", "left", "right", "front", "back", "sides")
+
+
+def check_name(name: str) -> str | None:
+    """What is wrong with the name of a case or of a structure, which become names of files."""
+    if not name.strip() or len(name) > _LONGEST_NAME or not name.isprintable():
+        return f"{shown(name)}: a name has 1 to {_LONGEST_NAME} printable characters"
+    if set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip():
+        return f"{shown(name)}: a name is no path: use letters, digits, blanks, - and _"
+    return None
+
+
+def _material(given: Material | str | None, name: str) -> Material:
+    if isinstance(given, Material):
+        return given
+    return KINDS[given if given is not None else kind_of(name)]
+
+
+@dataclass(frozen=True)
+class CaseStructure(Settings):
+    """One structure of a case: a label of ``labels.nrrd``."""
+
+    section = "structures"
+    error = CaseError
+
+    label: int = setting(Quantity("number", 1, 255), "its number in `labels.nrrd`")
+    material: Material | str | None = setting(
+        description="elastic constants, or a kind of tissue; not given: what its name suggests",
+        choices=tuple(KINDS),
+        default=None,
+    )
+    colour: Colour | None = setting(
+        Quantity("number", 0.0, 1.0),
+        "red, green, blue; not given: what its name suggests",
+        default=None,
+    )
+
+
+@dataclass(frozen=True)
+class CaseSettings(Settings):
+    """A case: the keys of its ``case.yaml``."""
+
+    error = CaseError
+
+    name: str = setting(description="of the case; never the patient's")
+    region: str = setting(description="of the body: `abdomen`", default="")
+    description: str = setting(description="for a person", default="")
+    probe: ProbeSettings | None = setting(
+        description="transducer that it is best scanned with", default=None
+    )
+    start: Placement | None = setting(
+        description="pose of the probe where it touches the skin, in the volume's own frame; not "
+        "given: found from the volume",
+        default=None,
+    )
+    press: float = setting(
+        Quantity("length", 0.0, 0.1), "how deep the proposed path presses", default=12e-3
+    )
+    around: Material | str = setting(
+        description="elastic constants, or a kind of tissue, of what is in no structure",
+        choices=tuple(KINDS),
+        default="tissue",
+    )
+    structures: Mapping[str, CaseStructure] = setting(
+        description="labels of `labels.nrrd`, by name", default_factory=dict
+    )
+    fixed: tuple[str, ...] = setting(
+        description="faces (bottom, sides, ...) and structures that are held; not given: the "
+        "bottom, and structures of bone",
+        default=(),
+    )
+
+    def check(self) -> None:
+        """Names are names, and no two structures are one label."""
+        if problem := check_name(self.name):
+            raise self.refused("name", problem)
+        seen: dict[int, str] = {}
+        for name, structure in self.structures.items():
+            if problem := check_name(name):
+                raise self.refused("structures", problem)
+            if name == AROUND or name in _FACES:
+                raise self.refused(
+                    f"structures.{name}", "means something else already: choose another name"
+                )
+            if structure.label in seen:
+                raise self.refused(
+                    f"structures.{name}.label",
+                    f"{structure.label} is `{seen[structure.label]}` already: merge the two, or "
+                    f"give one of them a label of its own",
+                )
+            seen[structure.label] = name
+        for i, name in enumerate(self.fixed):
+            if name not in (*_FACES, *self.structures):
+                raise self.refused(f"fixed[{i}]", unknown(name, (*_FACES, *self.structures)))
+
+    def material_of(self, name: str) -> Material:
+        """Elastic constants of a structure, or of what is around them all (`AROUND`)."""
+        if name == AROUND:
+            return _material(self.around, AROUND)
+        return _material(self.structures[name].material, name)
+
+    def colour_of(self, name: str) -> Colour:
+        """Red, green and blue of a structure."""
+        return self.structures[name].colour or anatomical_colour(name)
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Faces and structures that do not move."""
+        if self.fixed:
+            return self.fixed
+        bones = [name for name in self.structures if self.material_of(name) == KINDS["bone"]]
+        return ("bottom", *bones)
+
+    @property
+    def label_names(self) -> dict[int, str]:
+        """What the labels' numbers mean, 0 included."""
+        return {0: AROUND} | {one.label: name for name, one in self.structures.items()}

@@ -1,0 +1,184 @@
+"""Making and changing case folders: all of a change is there, or nothing.
+
+A case is written into a folder beside its place, checked, and renamed; on any error that folder is
+removed. What a program that was killed left behind is removed by the next that writes there.
+
+>>> import tempfile
+>>> from us_sim.volume.cases.settings import CaseSettings
+>>> from us_sim.volume.cases.writing import new_case, write_case_settings
+>>> with tempfile.TemporaryDirectory() as root:
+...     with new_case(f"{root}/arm") as folder:
+...         write_case_settings(folder, CaseSettings(name="arm"))
+Traceback (most recent call last):
+...
+us_sim.errors.CaseError: ...arm: is no case, as it has no volume.nrrd; ...
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import yaml
+
+from us_sim.errors import CaseError, VolumeError
+from us_sim.settings.writing import document_of
+from us_sim.volume.cases.case import CASE, LABELS, read_case
+from us_sim.volume.cases.settings import CaseSettings, check_name
+
+__all__ = ["changed_case", "new_case", "write_case_settings"]
+
+
+@contextmanager
+def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A folder to fill; it becomes the case at the end, when it is one.
+
+    Args:
+        folder: of the new case; its parents are made.
+
+    Yields:
+        The folder to write to, beside that.
+
+    Raises:
+        CaseError: there is something at that place already, it cannot be made, or what was written
+            is no case.
+    """
+    folder = _place(folder)
+    if os.path.lexists(folder):
+        raise CaseError(f"{folder}: exists already; choose another name, or remove it")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
+    with _partial(folder) as partial:
+        yield partial
+        _check(folder, partial)
+        try:
+            os.rename(partial, folder)
+        except OSError as error:
+            raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
+
+
+@contextmanager
+def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """A copy of a case to change; it takes the case's place at the end, when it still is one.
+
+    Raises:
+        CaseError: there is no case, another program is changing it, or what was written is none.
+    """
+    folder = read_case(folder).folder
+    with _locked(folder), _partial(folder) as partial:
+        try:
+            shutil.copytree(folder, partial, dirs_exist_ok=True)
+        except (OSError, shutil.Error) as error:
+            raise CaseError(f"{folder}: cannot be copied: {error}") from error
+        yield partial
+        _check(folder, partial)
+        before = partial.with_name(partial.name.replace(".partial-", ".before-"))
+        try:
+            os.rename(folder, before)
+            try:
+                os.rename(partial, folder)
+            except OSError:
+                os.rename(before, folder)
+                raise
+        except OSError as error:
+            raise CaseError(f"{folder}: cannot be changed: {error.strerror}") from error
+        shutil.rmtree(before, ignore_errors=True)
+
+
+def write_case_settings(folder: Path, settings: CaseSettings) -> None:
+    """Write ``case.yaml`` into a folder of `new_case` or `changed_case`.
+
+    Raises:
+        CaseError: it cannot be written.
+    """
+    document = document_of(settings)
+    text = yaml.safe_dump(
+        document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+    partial = folder / f".{CASE}.partial"
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, folder / CASE)
+    except OSError as error:
+        raise CaseError(f"{folder / CASE}: cannot be written: {error.strerror}") from error
+
+
+def _place(folder: str | os.PathLike[str]) -> Path:
+    path = Path(os.path.abspath(Path(folder).expanduser()))
+    if problem := check_name(path.name):
+        raise CaseError(f"{folder}: {problem}")
+    return path
+
+
+def _check(folder: Path, partial: Path) -> None:
+    """Refuse what is no case, in words that name the place it was meant for."""
+    try:
+        case = read_case(partial)
+        case.placement()
+        if (partial / LABELS).exists():
+            case.check_grids()
+    except (CaseError, VolumeError) as error:
+        raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error
+
+
+@contextmanager
+def _partial(folder: Path) -> Iterator[Path]:
+    """A folder beside another, removed at the end if it is still there."""
+    for left_over in folder.parent.glob(f".{folder.name}.partial-*"):
+        _remove_if_left(left_over)
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    except OSError as error:
+        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
+    mask = os.umask(0)
+    os.umask(mask)
+    partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
+    held = _held(partial)
+    try:
+        yield partial
+    finally:
+        if held is not None:
+            os.close(held)
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove_if_left(folder: Path) -> None:
+    """Remove what a program that ended has left; one that is at work holds it."""
+    held = _held(folder)
+    if held is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    held = _held(folder)
+    if held is None or not os.path.samestat(os.fstat(held), folder.stat()):
+        raise CaseError(f"{folder}: another program is changing this case; try again when it ended")
+    try:
+        yield
+    finally:
+        os.close(held)
+
+
+def _held(folder: Path) -> int | None:
+    """A lock on a folder, which ends with the program; None where another has it."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(number)
+        return None
+    except OSError:
+        pass  # a file system without locks, such as some of networks
+    return number
