@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -78,6 +79,21 @@ def sequence_seeds(_: Path) -> Iterator[bytes]:
         yield header.encode() + data
 
 
+def nrrd_sequence_seeds(_: Path) -> Iterator[bytes]:
+    """The same as NRRD, in another orientation; and in colours."""
+    frames = "".join(FRAME.format(number) for number in range(4)).replace(" = ", ":=")
+    for sizes, kinds, code in (
+        ("6 4 1 4", "domain domain domain list", "UNA"),
+        ("3 2 4 4", "vector domain domain list", "FM"),
+    ):
+        for encoding, pack in (("raw", bytes), ("gzip", gzip.compress)):
+            header = (
+                f"NRRD0004\ntype: uint8\ndimension: 4\nsizes: {sizes}\nkinds: {kinds}\n"
+                f"encoding: {encoding}\nUltrasoundImageOrientation:={code}\n{frames}\n"
+            )
+            yield header.encode() + pack(bytes(range(96)))
+
+
 @target("sweep", ".igs.mha", sequence_seeds)
 def sweep(path: Path) -> None:
     """All images, and where they are."""
@@ -86,9 +102,15 @@ def sweep(path: Path) -> None:
     assert all(image.shape == (read.rows, read.columns) for image in read.images())
 
 
+target("sweep-nrrd", ".igs.nrrd", nrrd_sequence_seeds)(sweep)
+
+
 @target("tracker", ".igs.mha", sequence_seeds)
 def tracker(path: Path) -> None:
     """A path of it."""
     poses = read_path(path, "ProbeToTracker")
     assert np.isfinite(poses.positions).all()
     assert np.isfinite(poses.orientations).all()
+
+
+target("tracker-nrrd", ".igs.nrrd", nrrd_sequence_seeds)(tracker)

@@ -5,6 +5,7 @@ import pytest
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
+from us_sim.recording.path import read_path
 from us_sim.recording.plus_recording import read_tracker_recording
 
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
@@ -39,7 +40,7 @@ def test_millimetres_become_metres_and_the_recorders_clock_stays(tmp_path):
     recording = read_tracker_recording(write(tmp_path, [sample(7.25, ProbeToTracker=MOVED)]))
     assert recording.times == [7.25]
     expected = np.array([[0, -1, 0, 0.01], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]])
-    np.testing.assert_allclose(recording.transforms["ProbeToTracker"][0], expected)
+    np.testing.assert_allclose(recording.transforms["ProbeToTracker"].matrices[0], expected)
     path = recording.probe_path("Probe")
     assert path.stamps == [7_250_000_000]
     assert (path.frame_id, path.rejected, path.note) == ("Tracker", 0, "")
@@ -50,7 +51,7 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
     path = write(tmp_path, [sample(ProbeToTracker=MOVED, ReferenceToTracker=other)])
     recording = read_tracker_recording(path)
     probe, reference = (
-        Pose.from_matrix(recording.transforms[name][0])
+        Pose.from_matrix(recording.transforms[name].matrices[0])
         for name in ("ProbeToTracker", "ReferenceToTracker")
     )
     for name in ("Probe", "ProbeToTracker"):
@@ -87,9 +88,9 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
 def test_what_is_no_pose_is_not_valid_and_counted(tmp_path, bad, reason):
     good = sample(ProbeToTracker=MOVED)
     recording = read_tracker_recording(write(tmp_path, [good, good | bad, good]))
-    assert recording.left_out == {"ProbeToTracker": {reason: 1}}
-    assert recording.valid["ProbeToTracker"].tolist() == [True, False, True]
-    assert np.isnan(recording.transforms["ProbeToTracker"][1]).all()
+    assert recording.left_out("ProbeToTracker") == {reason: 1}
+    assert recording.transforms["ProbeToTracker"].valid.tolist() == [True, False, True]
+    assert np.isnan(recording.transforms["ProbeToTracker"].matrices[1]).all()
     path = recording.probe_path()
     assert (len(path), path.rejected) == (2, 1)
     assert reason in path.note
@@ -97,7 +98,7 @@ def test_what_is_no_pose_is_not_valid_and_counted(tmp_path, bad, reason):
 
 def test_a_body_that_only_stands_at_the_origin_is_believed(tmp_path):
     recording = read_tracker_recording(write(tmp_path, [sample(ProbeToTracker=IDENTITY)] * 3))
-    assert recording.valid["ProbeToTracker"].all()
+    assert recording.transforms["ProbeToTracker"].valid.all()
 
 
 def test_a_sample_without_a_time_is_left_out_whole(tmp_path):
@@ -114,8 +115,8 @@ def test_files_that_cannot_be_used_say_why_in_a_sentence(tmp_path):
     picture = tmp_path / "picture.mha"
     picture.write_bytes(bytes(1000))
     cases = {
-        tmp_path / "missing.igs.mha": "No such file",
-        picture: "is no tracker recording",
+        tmp_path / "missing.igs.mha": "there is no such file",
+        picture: "is neither MetaImage nor NRRD",
     }
     for path, sentence in cases.items():
         with pytest.raises(TrackingError, match=sentence):
@@ -134,7 +135,9 @@ def test_files_that_cannot_be_used_say_why_in_a_sentence(tmp_path):
 def test_a_rotation_that_a_tracker_rounded_is_made_one_again(tmp_path):
     rounded = "1.0003 0 0 10 0 1.0003 0 20 0 0 1.0003 30 0 0 0 1"
     recording = read_tracker_recording(write(tmp_path, [sample(ProbeToTracker=rounded)]))
-    np.testing.assert_allclose(recording.transforms["ProbeToTracker"][0, :3, :3], np.eye(3))
+    np.testing.assert_allclose(
+        recording.transforms["ProbeToTracker"].matrices[0, :3, :3], np.eye(3)
+    )
 
 
 def test_names_that_lead_nowhere_say_which_there_are(tmp_path):
@@ -151,10 +154,34 @@ def test_names_that_lead_nowhere_say_which_there_are(tmp_path):
             call()
 
 
+def test_bodies_whose_names_hold_to_are_read_as_plus_reads_them(tmp_path):
+    names = ["ToolToTracker", "ToolTipToTool", "TorsoToTracker", "TestToolToTracker"]
+    path = write(tmp_path, [sample(**dict.fromkeys(names, MOVED))])
+    recording = read_tracker_recording(path)
+    assert sorted(recording.transforms) == sorted(names)
+    for body, reference in (("Torso", "Tracker"), ("TestTool", "Tracker"), ("ToolTip", "Tool")):
+        assert recording.probe_path(body).frame_id == reference
+    (tip,), _ = recording.poses("ToolTipToTracker")
+    tool = recording.transforms["ToolToTracker"].matrices[0]
+    np.testing.assert_allclose(tip, tool @ tool, atol=1e-12)
+
+
+def test_a_recording_may_be_nrrd(tmp_path):
+    lines = ["NRRD0004", "type: uint8", "dimension: 4", "sizes: 0 0 0 2", "encoding: raw"]
+    lines += ["kinds: domain domain domain list", "Seq_Frame0000_Timestamp:=1.5"]
+    lines += [f"Seq_Frame000{k}_ToolToTrackerTransform:={MOVED}" for k in (0, 1)]
+    lines += ["Seq_Frame0001_Timestamp:=1.75"]
+    path = tmp_path / "recording.igs.nrrd"
+    path.write_text("\n".join(lines) + "\n\n")
+    recorded = read_path(path)
+    assert (recorded.topic, recorded.duration) == ("ToolToTracker", 0.25)
+    np.testing.assert_allclose(recorded.positions[1], [0.01, 0.02, 0.03])
+
+
 def test_the_invalid_sample_and_the_outlier_of_a_real_recording_are_left_out(recordings):
     recording = read_tracker_recording(recordings / "TransformInterpolationTest.igs.mha")
     assert len(recording) == 500
-    assert recording.left_out == {
+    assert {name: recording.left_out(name) for name in recording.transforms} == {
         "ProbeToTracker": {"ProbeToTrackerTransformStatus is not OK": 1},
         "ReferenceToTracker": {"an identity among poses that are none": 1},
     }
@@ -174,9 +201,10 @@ def test_the_invalid_sample_and_the_outlier_of_a_real_recording_are_left_out(rec
 )
 def test_real_recordings_are_read_whole(recordings, name, samples, rate):
     recording = read_tracker_recording(recordings / f"{name}.igs.mha")
-    assert (len(recording), recording.left_out, recording.untimed) == (samples, {}, 0)
+    assert (len(recording), recording.untimed) == (samples, 0)
+    assert all(series.valid.all() for series in recording.transforms.values())
     assert (samples - 1) / np.ptp(recording.times) == pytest.approx(rate, rel=0.02)
-    stylus = recording.transforms["StylusToTracker"]
+    stylus = recording.transforms["StylusToTracker"].matrices
     np.testing.assert_allclose(np.linalg.det(stylus[:, :3, :3]), 1.0, atol=1e-12)
 
 

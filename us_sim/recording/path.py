@@ -26,6 +26,7 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.topic import BagMessage, BagTopic
 from us_sim.recording.writer import BagWriter
+from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
 
 __all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path"]
 
@@ -82,7 +83,7 @@ class ProbePath:
 
 
 def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
-    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``).
+    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
 
     Poses that are not finite or have no orientation are left out and counted.
 
@@ -110,7 +111,7 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
 
 def is_tracker_recording(path: str | Path) -> bool:
     """Whether a file's name is that of a sequence of Plus."""
-    return Path(path).suffix.lower() in (".mha", ".mhd")
+    return Path(path).suffix.lower() in SEQUENCE_SUFFIXES
 
 
 def write_path(

@@ -165,6 +165,39 @@ def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_data):
         read_volume(path)
 
 
+def test_a_real_volume_in_which_plus_left_the_status_of_a_frame_is_a_volume(shared_data):
+    path = shared_data / "plus-spine-freehand" / "VolumeReconstructorTestNNMEANvolumeRef.mha"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    assert b"Seq_Frame0000_ImageStatus" in path.open("rb").read(1000)
+    volume = read_volume(path)
+    assert volume.shape == (147, 106, 105)
+    np.testing.assert_allclose(
+        volume.index_to_patient[:3, 3], [-0.0745217, 0.165573, 0.029072], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("kinds", "frames", "message"),
+    [
+        ("domain domain domain", 1, None),
+        ("domain domain list", 1, "sequence of tracked frames"),
+        ("", 1, None),
+        ("", 2, "sequence of tracked frames"),
+    ],
+)
+def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
+    tmp_path, kinds, frames, message
+):
+    fields = {f"Seq_Frame{k:04d}_ImageStatus": "OK" for k in range(frames)}
+    path = _metaimage(tmp_path / "a.mha", **({"Kinds": kinds} if kinds else {}), **fields)
+    if message is None:
+        assert read_volume(path).shape == (4, 5, 6)
+    else:
+        with pytest.raises(VolumeError, match=message):
+            read_volume(path)
+
+
 @pytest.mark.parametrize(
     ("fields", "data", "message"),
     [

@@ -16,7 +16,6 @@ array([[0.01, 0.02, 0.03]])
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -31,9 +30,9 @@ from us_sim.tracking.calibration.position_signal import (
     signal_of_images,
     signal_of_positions,
 )
-from us_sim.volume.files.metaimage import metaimage_header
-from us_sim.volume.sequences.sequence_header import frame_fields
+from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
+from us_sim.volume.sequences.transform_name import split_transform_name
 
 __all__ = ["read_motion", "read_signal", "seconds_of"]
 
@@ -42,7 +41,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
     """The valid poses of a body.
 
     Args:
-        path: a bag, or a tracker recording of Plus (.igs.mha).
+        path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd).
         name: a topic; or a transform such as StylusToTracker, or StylusToReference where both
             are recorded. May be None where there is one.
 
@@ -59,13 +58,13 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
             raise CalibrationError(
                 f"{path}: holds several transforms; name one with --pose: "
                 f"{', '.join(recording.transforms)}, or one to Reference such as "
-                f"{sorted(bodies)[-1].partition('To')[0] if bodies else 'Stylus'}ToReference"
+                f"{_body(sorted(bodies)[-1]) if bodies else 'Stylus'}ToReference"
             )
         name = bodies[0]
     if name in recording.transforms:
         return recording.probe_path(name)
-    body, _, reference = name.partition("To")
-    return recording.probe_path(body, reference or None)
+    body, reference = split_transform_name(name) or (name, None)
+    return recording.probe_path(body, reference)
 
 
 def read_signal(
@@ -86,11 +85,11 @@ def read_signal(
     Raises:
         UsSimError: it cannot be read, or shows no motion.
     """
-    if is_tracker_recording(path) and (images or not _has_transforms(path)):
+    if is_tracker_recording(path) and (images or not read_sequence(path).transforms):
         sweep = read_sweep(path, tracked=False)
         return signal_of_images(sweep.times, _with_progress(sweep, progress))
     if images:
-        raise CalibrationError(f"{path}: images are read from recordings of Plus (.igs.mha) only")
+        raise CalibrationError(f"{path}: is a bag; images are read from recordings of Plus only")
     motion = read_motion(path, name)
     return signal_of_positions(seconds_of(motion), motion.positions)
 
@@ -100,11 +99,8 @@ def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
     return np.asarray(1e-9 * motion.stamps, np.float64)
 
 
-def _has_transforms(path: Path) -> bool:
-    if not os.path.isfile(path):
-        raise CalibrationError(f"{path}: there is no such file")
-    frames = frame_fields(metaimage_header(path)[0])
-    return any(key.endswith("Transform") for fields in frames.values() for key in fields)
+def _body(name: str) -> str:
+    return (split_transform_name(name) or (name, ""))[0]
 
 
 def _with_progress(

@@ -21,9 +21,12 @@ from pathlib import Path
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_voxels import StoredVoxels
 
-__all__ = ["nrrd_voxels"]
+__all__ = ["nrrd_header", "nrrd_voxels"]
 
-_LARGEST_HEADER = 1 << 20
+_LARGEST_HEADER = 1 << 26
+"""Bytes; an hour of tracked frames takes less."""
+
+_LONGEST_LINE = 1 << 16
 
 _LONGEST_FIELD = 1000
 """Characters: what ITK's reader says of a line that it cannot use is written to a place of about
@@ -54,7 +57,7 @@ def nrrd_voxels(path: Path) -> StoredVoxels:
         VolumeError: it is no such header, its data file is missing, or the voxels are stored in a
             way that cannot be checked.
     """
-    fields, header_bytes = _header(path)
+    fields, _, header_bytes = nrrd_header(path)
     size = fields.get("sizes", "").split()
     dimension = fields.get("dimension", "")
     if dimension != str(len(size)) or not all(re.fullmatch(r"[1-9][0-9]{0,17}", n) for n in size):
@@ -118,28 +121,39 @@ def _is_vector(text: str) -> bool:
         return False
 
 
-def _header(path: Path) -> tuple[dict[str, str], int]:
-    """The fields of a header, whose names are in lower case, and the bytes up to its voxels."""
+def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
+    """The fields of a header, its further keys and values, and the bytes up to its voxels.
+
+    The fields' names are in lower case; keys are as they were written (``key:=value``).
+
+    Raises:
+        VolumeError: it is no NRRD header, has a field twice or a line too long, or does not end.
+    """
     fields: dict[str, str] = {}
+    pairs: dict[str, str] = {}
     with path.open("rb") as file:
         if not file.readline(64).startswith(b"NRRD"):
             raise VolumeError(
                 f"{path}: cannot be read as an image: it does not begin as NRRD does; give an "
                 f"MHA, NRRD or NIfTI volume"
             )
-        while line := file.readline(_LARGEST_HEADER).decode("latin-1").rstrip("\r\n"):
-            key, colon, value = line.partition(": ")
-            key = key.strip().lower()
-            free = line.startswith("#") or (":=" in line and not colon)
-            if len(line) > _LONGEST_FIELD and not free:
+        while line := file.readline(_LONGEST_LINE).decode("latin-1").rstrip("\r\n"):
+            if file.tell() > _LARGEST_HEADER:
+                raise VolumeError(f"{path}: cannot be read as an image: its header does not end")
+            if line.startswith("#"):
+                continue
+            key, colon, value = line.partition(":")
+            if value.startswith("="):
+                pairs[key.strip()] = value[1:].strip()
+                continue
+            if len(line) > _LONGEST_FIELD:
                 raise VolumeError(
                     f"{path}: its header has a line of {len(line)} characters, {line[:30]!r} and "
                     f"on; export it again"
                 )
-            if colon and not key.startswith("#"):
+            key = key.strip().lower()
+            if colon and value.startswith(" "):
                 if key in fields:
                     raise VolumeError(f"{path}: its header has {key!r} twice; export it again")
                 fields[key] = value.strip()
-            if file.tell() > _LARGEST_HEADER:
-                raise VolumeError(f"{path}: cannot be read as an image: its header does not end")
-        return fields, file.tell()
+        return fields, pairs, file.tell()

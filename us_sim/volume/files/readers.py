@@ -23,6 +23,7 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.files.frame_sequence import holds_sequence
 from us_sim.volume.files.stored_size import check_stored_size
 from us_sim.volume.volume import Volume
 
@@ -85,6 +86,11 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         raise VolumeError(f"{path}: there is no such file")
     if not os.path.isfile(path):
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD or NIfTI volume")
+    if holds_sequence(path):
+        raise VolumeError(
+            f"{path}: is a sequence of tracked frames, not a volume; make one of it with "
+            f"`us-sim reconstruct {path.name} --out volume.nrrd`"
+        )
     stored = check_stored_size(path)
     header = sitk.ImageFileReader()
     header.SetImageIO(_READERS[path.name.lower().removesuffix(".gz").rpartition(".")[2]])
@@ -95,10 +101,6 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         raise VolumeError(
             f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume"
         ) from error
-    if any(key.startswith("Seq_Frame") for key in header.GetMetaDataKeys()):
-        raise VolumeError(
-            f"{path}: is a sequence of tracked frames, not a volume; reconstruct a volume from it"
-        )
     placement = _placement(path, header)
     value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
     if stored.expected != math.prod(header.GetSize()) * value:

@@ -11,22 +11,24 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.volume.files.frame_sequence import FRAME_KEY
+
 __all__ = ["frame_fields", "frame_matrix", "frame_time"]
 
-_FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
+_LARGEST = 1e7
+"""mm, of any transform's numbers, so that products of them stay finite."""
 
 
 def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
     """The fields of each frame by its number, their names without ``Seq_Frame0000_``."""
     frames: dict[int, dict[str, str]] = {}
     for key, value in header.items():
-        if match := _FRAME_KEY.fullmatch(key):
+        if match := FRAME_KEY.fullmatch(key):
             frames.setdefault(int(match[1]), {})[match[2]] = value
     return frames
 
@@ -50,6 +52,7 @@ def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         steps = np.linalg.norm(matrix[:3, :3], axis=0)
         spans = abs(np.linalg.det(matrix[:3, :3] / steps)) > 1e-6
+        spans &= steps.min() > 1.0 / _LARGEST and np.abs(matrix).max() < _LARGEST
     if not (np.isfinite(matrix).all() and spans and np.array_equal(matrix[3], [0, 0, 0, 1])):
         raise ValueError("a transform that is singular or not finite")
     return matrix
