@@ -77,7 +77,9 @@ setup(
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
         "space_mouse": ["hidapi>=0.14"],
+        "surfaces": ["fast-simplification>=0.1.7"],
         "test": [
+            "fast-simplification>=0.1.7",
             "hypothesis>=6.100",
             "meshio>=5.3",
             "mypy>=1.10",

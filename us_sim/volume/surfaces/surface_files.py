@@ -1,0 +1,136 @@
+"""Surfaces into files: STL, PLY, OBJ and VTK's VTP, in millimetres on DICOM's axes.
+
+Each says in its header that its axes are left, posterior and superior (``SPACE=LPS``), which
+3D Slicer looks for and other programs skip.
+
+>>> import pathlib, tempfile
+>>> import numpy as np
+>>> from us_sim.volume.surfaces.closed_surface import ClosedSurface
+>>> from us_sim.volume.surfaces.surface_files import write_surface
+>>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]]) * 1e-3
+>>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+>>> with tempfile.TemporaryDirectory() as folder:
+...     path = pathlib.Path(folder, "vein.obj")
+...     write_surface(path, ClosedSurface(corners, faces))
+...     print(path.read_text().splitlines()[2])
+v 3 0 0
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.surfaces.closed_surface import ClosedSurface
+
+__all__ = ["SURFACE_FORMATS", "write_surface"]
+
+_MILLIMETRES = 1e3
+_SAID = "us_sim; millimetres; SPACE=LPS"
+
+
+def write_surface(path: Path, surface: ClosedSurface) -> None:
+    """Write a surface to a file; one of that name is replaced, at once or not at all.
+
+    Raises:
+        VolumeError: the name ends in none of `SURFACE_FORMATS`, or the file cannot be written.
+    """
+    written = _WRITERS.get(path.suffix.lower())
+    if written is None:
+        raise VolumeError(f"{path}: a surface file ends in .{', .'.join(SURFACE_FORMATS)}")
+    points = surface.vertices * _MILLIMETRES
+    try:
+        with tempfile.NamedTemporaryFile(
+            dir=path.parent, prefix=f".{path.name}.", delete=False
+        ) as file:
+            try:
+                file.write(written(points, surface.triangles))
+                file.close()
+                os.chmod(file.name, 0o666 & ~_umask())
+                os.replace(file.name, path)
+            except BaseException:
+                os.unlink(file.name)
+                raise
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _stl(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
+    """Binary STL: 80 bytes of header, and 50 for each triangle."""
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets = np.zeros(len(triangles), record)
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["normal"] = np.divide(normals, lengths, where=lengths > 0, out=np.zeros_like(normals))
+    facets["corners"] = corners
+    header = _SAID.encode().ljust(80)
+    return header + np.uint32(len(triangles)).astype("<u4").tobytes() + facets.tobytes()
+
+
+def _ply(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
+    """Binary PLY, little-endian (paulbourke.net/dataformats/ply)."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {_SAID}\n"
+        f"element vertex {len(points)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.zeros(len(triangles), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    faces["count"], faces["corners"] = 3, triangles
+    return header.encode() + points.astype("<f4").tobytes() + faces.tobytes()
+
+
+def _obj(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
+    """Wavefront's text, whose indices begin at 1."""
+    lines = [f"# {_SAID}"]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in points.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _vtp(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
+    """VTK's XML polygons, their arrays in base64 (docs.vtk.org, "VTK XML Formats")."""
+    space = " ".join(str(byte) for byte in b"LPS\0")
+    ends = np.arange(3, 3 * len(triangles) + 1, 3)
+    return f"""<?xml version="1.0"?>
+<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
+<!-- {_SAID} -->
+<PolyData>
+<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{space}</Array>
+</FieldData>
+<Piece NumberOfPoints="{len(points)}" NumberOfPolys="{len(triangles)}">
+<Points>{_array("Float32", points.astype("<f4"), "Points", 3)}</Points>
+<Polys>{_array("Int64", triangles.astype("<i8"), "connectivity")}
+{_array("Int64", ends.astype("<i8"), "offsets")}</Polys>
+</Piece>
+</PolyData>
+</VTKFile>
+""".encode()
+
+
+def _array(kind: str, values: NDArray[np.generic], name: str, components: int = 1) -> str:
+    raw = values.tobytes()
+    packed = base64.b64encode(np.uint64(len(raw)).astype("<u8").tobytes() + raw).decode()
+    return (
+        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
+        f'format="binary">{packed}</DataArray>'
+    )
+
+
+_WRITERS = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".obj": _obj}
+
+SURFACE_FORMATS = tuple(suffix[1:] for suffix in _WRITERS)
+"""What surfaces may be written as."""
