@@ -105,7 +105,11 @@ def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):
         ({"file": "{bag}"}, {"lockstep": True}, "give the recording with --path"),
         ({"file": "{bag}", "frame": "moon"}, {}, "in frame 'patient'"),
         ({"file": "{bag}", "body": "nothing"}, {}, "nothing"),
-        ({"file": "{recording}"}, {}, "name one of ProbeToTracker, ReferenceToTracker"),
+        (
+            {"file": "{recording}"},
+            {},
+            "name one by tracker.body, of ProbeToTracker, Ref",
+        ),
         ({}, {"source": "moon"}, "probe_tracker.source: 'moon' is not one of pose, pose_array"),
     ],
 )

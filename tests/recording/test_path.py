@@ -127,8 +127,8 @@ def test_which_topic(tmp_path):
             read_path(tmp_path / "bag.mcap")
         for topic in ("/haptic/pose", "/probe/pose"):
             bag.add_topic(topic, POSE_STAMPED)
-    with pytest.raises(BagError, match="several topics: name one of /haptic/pose, /probe/pose"):
-        read_path(tmp_path)
+    with pytest.raises(BagError, match="topics: name one by --pose, of /haptic/pose, /probe/pose"):
+        read_path(tmp_path, option="--pose")
     with pytest.raises(BagError, match="/note as std_msgs/msg/String: a path needs geometry_msgs"):
         read_path(tmp_path, "note")
     with pytest.raises(BagError, match="no topic /moon/pose; it has /haptic/pose, /note"):

@@ -77,8 +77,11 @@ def document(tmp_path):
 
 
 def test_what_could_be_read_is_said(document, tmp_path, capsys):
+    mesh = "tissue.mesh.file (4 nodes; fixed: `bottom` holds 1 of 4 nodes, which is little; "
     keys = [
-        *("volume.file (its header)", "tissue.mesh.file", "structures.vessel.file", "skin.file"),
+        "volume.file (its header)",
+        f"{mesh}see tissue.fixed and tissue.mesh.margin)",
+        *("structures.vessel.file", "skin.file"),
         *("tracker.registration", "tracker.calibration", "tracker.camera.body", "path"),
     ]
     assert check_files(parse_scene(document)) == keys

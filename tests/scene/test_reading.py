@@ -13,8 +13,10 @@ from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.reading import find_scene, load_scene, parse_scene
 from us_sim.share import shared_path
+from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.settings import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(
@@ -287,6 +289,58 @@ def test_another_kind_of_probe_does_not_inherit_the_dimensions_of_the_base_s(tmp
     scene = load_scene(file)
     assert (probe_of(scene).radius, probe_of(scene).depth) == (0.05, 0.04)
     assert collider_of(scene) == Sphere(0.03)
+
+
+TETRAHEDRON = "$NOD\n4\n1 0 0 0\n2 90 0 0\n3 0 90 0\n4 0 0 90\n$ENDNOD\n"
+TETRAHEDRON += "$ELM\n1\n1 4 1 1 4 1 2 3 4\n$ENDELM\n"
+
+
+def based_on(base, says, folder):
+    file = folder / "mine.yaml"
+    file.write_text(f"name: mine\nbased_on: {base}\n{says}")
+    return load_scene(file)
+
+
+def test_a_file_takes_the_place_of_the_base_s_box_and_a_box_that_of_its_file(tmp_path):
+    (tmp_path / "organ.msh").write_text(TETRAHEDRON)
+    of_file = based_on("upper_arm", "tissue: {mesh: {file: organ.msh, unit: 1 mm}}", tmp_path)
+    assert of_file.tissue.mesh == MeshSettings(file=str(tmp_path / "organ.msh"), unit=1e-3)
+    assert of_file.tissue.materials == load_scene("upper_arm").tissue.materials
+    (tmp_path / "mine.yaml").rename(tmp_path / "organ.yaml")
+    box = "tissue: {mesh: {lower: [0, 0, 0], upper: [1 cm, 1 cm, 1 cm]}}"
+    again = based_on("organ.yaml", box, tmp_path)
+    assert again.tissue.mesh == MeshSettings(lower=(0, 0, 0), upper=(0.01, 0.01, 0.01))
+    finer = based_on("upper_arm", "tissue: {mesh: {nodes: [20, 20, 10]}}", tmp_path)
+    assert finer.tissue.mesh.nodes == (20, 20, 10)
+    assert finer.tissue.mesh.lower == load_scene("upper_arm").tissue.mesh.lower
+
+
+def test_a_volume_and_a_structure_of_a_file_take_the_place_of_the_base_s(tmp_path):
+    for name in ("volume.mha", "vein.stl"):
+        (tmp_path / name).touch()
+    says = "volume: {file: volume.mha, pose: {position: [0, 0, 1 cm]}}\n"
+    says += "structures: {wall: {label: skin}}"
+    of_file = based_on("upper_arm", says, tmp_path)
+    assert of_file.volume.file == str(tmp_path / "volume.mha")
+    assert of_file.volume.phantom is None
+    (tmp_path / "mine.yaml").rename(tmp_path / "base.yaml")
+    says = "volume: {phantom: upper_arm}\nstructures: {wall: {file: vein.stl, unit: 1 mm}}"
+    phantom = based_on("base.yaml", says, tmp_path)
+    assert (phantom.volume.file, phantom.volume.pose) == (None, of_file.volume.pose)
+    assert phantom.structures["wall"].label is None
+    with pytest.raises(SceneError, match="has both `file` and `phantom`"):
+        based_on("upper_arm", "volume: {file: volume.mha, phantom: upper_arm}", tmp_path)
+
+
+def test_null_takes_back_what_the_base_says(tmp_path):
+    says = "tissue: {materials: {vein: null, nerve: {density: 990}}, solver: null}\nimaging: null"
+    scene, arm = based_on("upper_arm", says, tmp_path), load_scene("upper_arm")
+    assert set(arm.tissue.materials) - set(scene.tissue.materials) == {"vein"}
+    assert scene.tissue.materials["nerve"].density == 990
+    assert (arm.tissue.solver, scene.tissue.solver) == ("fem_nonlinear", "fem")
+    assert scene.imaging == Imaging()
+    with pytest.raises(SceneError, match="volume: is missing"):
+        based_on("upper_arm", "volume: null", tmp_path)
 
 
 @pytest.mark.parametrize(

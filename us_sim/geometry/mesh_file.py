@@ -36,7 +36,8 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
         refusal: the error of a file that cannot be read.
 
     Raises:
-        MeshError: it cannot be read, or not within bounded memory, or meshio is not installed.
+        MeshError: it cannot be read, or not within bounded memory, a second file that goes with it
+            is missing, or meshio or what that needs is not installed.
     """
     try:
         import meshio
@@ -67,6 +68,16 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
             return mesh
     except MeshError:
         raise
+    except FileNotFoundError as error:
+        # Formats of two files: TetGen's `.node` and `.ele`, XDMF with HDF5.
+        other = Path(error.filename or "").name or "another file"
+        raise MeshError(
+            f"it goes with {other}, which is not beside it: copy both into one folder"
+        ) from error
+    except ModuleNotFoundError as error:
+        raise MeshError(
+            f"reading it needs {error.name}; install it with `pip install {error.name}`"
+        ) from error
     except (Exception, SystemExit) as error:
         raise MeshError(refusal) from error
 

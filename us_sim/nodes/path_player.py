@@ -44,7 +44,7 @@ class PathPlayer(GuardedNode):
         self._awaited = Awaited(self)
         if not path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
-        self._path = read_path(path, settings.topic)
+        self._path = read_path(path, settings.topic, option="its parameter `topic`")
         self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
         self._next = 0
         self._begun = round(1e9 * settings.begun)  # ns

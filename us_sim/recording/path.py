@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import Bag, read_bag
@@ -82,7 +82,7 @@ class ProbePath:
         return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
 
 
-def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
+def read_path(path: str | Path, topic: str | None = None, *, option: str = "topic") -> ProbePath:
     """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
 
     Poses that are not finite or have no orientation are left out and counted.
@@ -92,6 +92,7 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
         topic: its name, with or without the leading slash; by default the bag's only
             PoseStamped topic, or among several the one named ``tracker/pose``. In a recording, a
             transform (``ProbeToReference``).
+        option: what a person names the topic by, for the sentence on several.
 
     Raises:
         BagError: there is no such bag or topic, several come into question, the topic is of
@@ -101,9 +102,13 @@ def read_path(path: str | Path, topic: str | None = None) -> ProbePath:
     if is_tracker_recording(path):
         from us_sim.recording.plus_recording import read_tracker_recording
 
-        return read_tracker_recording(path).probe_path(topic)
+        recording = read_tracker_recording(path)
+        if topic is None and len(recording.transforms) > 1:
+            names = ", ".join(recording.transforms)
+            raise TrackingError(f"{path}: has several transforms: name one by {option}, of {names}")
+        return recording.probe_path(topic)
     bag = read_bag(path)
-    chosen = _pose_topic(bag, topic)
+    chosen = _pose_topic(bag, topic, option)
     if chosen.message_count == 0:
         raise BagError(f"{bag.path} holds no pose on {chosen.name}; {bag.note or 'it is silent'}")
     return _extract(bag, chosen, list(bag.messages([chosen.name])))
@@ -154,7 +159,7 @@ def _serialized(
     return store.serialize_cdr(message, POSE_STAMPED, little_endian=True)
 
 
-def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
+def _pose_topic(bag: Bag, name: str | None, option: str) -> BagTopic:
     """The topic of that name, or the bag's only one with poses, or a session's tracker poses."""
     if name is not None:
         topic = bag.topic(name)
@@ -170,7 +175,9 @@ def _pose_topic(bag: Bag, name: str | None) -> BagTopic:
             return candidates[0]
     if poses:
         names = ", ".join(sorted(topic.name for topic in poses))
-        raise BagError(f"{bag.path} holds poses on several topics: name one of {names}")
+        raise BagError(
+            f"{bag.path} holds poses on several topics: name one by {option}, of {names}"
+        )
     found = ", ".join(sorted(f"{topic.name} ({topic.type_name})" for topic in bag.topics))
     raise BagError(f"{bag.path} holds no topic of {POSE_STAMPED}; it has {found or 'no topic'}")
 

@@ -164,7 +164,7 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
         count = read_bag(bag).message_count
         process = NodeProcess("session_player", settings)
     else:
-        count = len(read_path(bag, topic or None))
+        count = len(read_path(bag, topic or None, option="--topic"))
         process = NodeProcess("path_player", settings | {"topic": topic})
     group, watch = ProcessGroup(), Watch(SupervisionSettings().silence)
     try:

@@ -45,6 +45,8 @@ __all__ = [
     "volume_of",
 ]
 
+_TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material (`fat: null`)"
+
 
 def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None) -> Volume:
     """The scene's volume in frame ``patient``.
@@ -77,9 +79,10 @@ def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
     """
     from us_sim.recording.path import read_path
 
+    option = "--param path_player.topic=NAME"
     if scene.tracker.source.name == "path":
-        topic = topic or scene.tracker.body
-    path = read_path(file, topic)
+        topic, option = topic or scene.tracker.body, "tracker.body"
+    path = read_path(file, topic, option=option)
     if path.frame_id != scene.tracker.frame:
         raise BagError(
             f"{file}: {path.topic} is in frame '{path.frame_id}', but the scene's tracker is in "
@@ -155,11 +158,11 @@ def tissue_model_of(
 
         require_labels(scene, volume)
     mesh, remarks = _mesh(section)
-    if note is not None:
-        for remark in remarks:
-            note(f"tissue mesh: {remark}")
     fractions = _label_fractions(mesh, volume)
-    fixed = _fixed_nodes(scene, section, mesh, volume, fractions)
+    fixed, held = _fixed_nodes(scene, section, mesh, volume, fractions)
+    if note is not None:
+        for remark in (*remarks, *held):
+            note(f"tissue mesh: {remark}")
     from us_sim.tissue.mesh.node_selection import face_nodes, facing_nodes
 
     touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top")
@@ -207,7 +210,7 @@ def _materials(
         if list(materials) != ["tissue"]:
             raise SceneError(
                 f"{scene.origin}: tissue.materials: this volume has no labels, so it takes one "
-                f"material named `tissue`, not {', '.join(materials)}"
+                f"material named `tissue`, not {', '.join(materials)}{_TAKEN_BACK}"
             )
         return uniform_material(mesh, materials["tissue"])
     by_label = {}
@@ -218,7 +221,7 @@ def _materials(
     if materials:
         raise SceneError(
             f"{scene.origin}: tissue.materials.{next(iter(materials))}: the volume has no such "
-            f"label; it has {', '.join(volume.label_names.values())}"
+            f"label; it has {', '.join(volume.label_names.values())}{_TAKEN_BACK}"
         )
     return average_over_labels(fractions, by_label)
 
@@ -272,20 +275,24 @@ def _fixed_nodes(
     mesh: TetrahedralMesh,
     volume: Volume,
     fractions: LabelFractions | None,
-) -> NDArray[np.bool_]:
-    """Nodes on the named faces, and nodes inside the named labels (the skeleton is rigid)."""
-    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, nodes_in_label
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Nodes on the named faces and inside the named labels (the skeleton is rigid), and remarks."""
+    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, held_remark, nodes_in_label
 
     numbers = {name: label for label, name in volume.label_names.items()}
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
+    remarks = []
     for name in section.fixed:
         if name in FACES:
-            fixed[face_nodes(mesh, name, section.mesh.margin)] = True
+            held = face_nodes(mesh, name, section.mesh.margin)
         elif name in numbers and fractions is not None:
-            fixed[nodes_in_label(mesh, fractions, numbers[name])] = True
+            held = nodes_in_label(mesh, fractions, numbers[name])
         else:
             raise SceneError(
                 f"{scene.origin}: tissue.fixed: `{name}` is neither a face ({', '.join(FACES)}) "
                 f"nor a label of the volume ({', '.join(numbers) or 'it has none'})"
             )
-    return fixed
+        fixed[held] = True
+        remark = held_remark(name, held, mesh)
+        remarks += [remark] if remark else []
+    return fixed, remarks

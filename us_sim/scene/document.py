@@ -3,13 +3,13 @@
 >>> from us_sim.scene.document import merged
 >>> merged({"probe": {"depth": "4 cm", "lines": 128}, "skin": {}},
 ...        {"probe": {"depth": "6 cm"}, "skin": None})
-{'probe': {'depth': '6 cm', 'lines': 128}, 'skin': None}
+{'probe': {'depth': '6 cm', 'lines': 128}}
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
@@ -72,20 +72,28 @@ def merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
     """``below`` with what ``above`` says: mappings key by key, anything else replaced.
 
     Where ``above`` chooses another kind of probe, collider, filter, ..., what only some kinds have
-    goes with the one below.
+    goes with the one below; where it names a file in place of a box, the box goes. ``null`` takes
+    back what ``below`` says.
     """
-    return _merged(below, above, Scene, None)
+    return _merged(below, above, Scene)
 
 
 def _merged(
     below: dict[Any, Any],
     above: dict[Any, Any],
     settings: type[Settings] | None,
-    choice: Choice | None,
+    choice: Choice | None = None,
+    each: Any = None,
 ) -> dict[Any, Any]:
-    """Two mappings merged, of the settings or the choice whose keys they hold."""
+    """Two mappings merged, of the settings or the choice whose keys they hold.
+
+    Args:
+        each: the type of what is under any key, where keys are names that a person chose.
+    """
     gone = _no_longer(below, above, choice) if choice else set()
     rules = rules_of(settings) if settings else {}
+    gone |= _replaced(above, settings.alternatives) if settings else set()
+    gone |= {key for key, value in above.items() if value is None}
     for rule in rules.values():
         if rule.choice and rule.place == "beside":
             gone |= _no_longer(below, above, rule.choice)
@@ -97,12 +105,22 @@ def _merged(
     for key, value in above.items():
         under = result.get(key)
         if isinstance(under, dict) and isinstance(value, dict):
-            kind = _settings_in(kinds_of(settings).get(key)) if settings else None
+            kind = kinds_of(settings).get(key) if settings else each
             rule_of_key = rules.get(key)
             chosen = rule_of_key.choice if rule_of_key and rule_of_key.place == "within" else None
-            value = _merged(under, value, kind, chosen)
-        result[key] = value
+            value = _merged(under, value, _settings_in(kind), chosen, _kind_of_each(kind))
+        if value is not None or key not in below:
+            result[key] = value
     return result
+
+
+def _replaced(above: dict[Any, Any], alternatives: Mapping[str, tuple[str, ...]]) -> set[str]:
+    """The keys in whose place ``above`` names something, if it names one thing."""
+    named = [name for name in alternatives if above.get(name) is not None]
+    if len(named) != 1:
+        return set()
+    others = {key for name, own in alternatives.items() for key in (name, *own)}
+    return others - {named[0], *alternatives[named[0]]}
 
 
 def _changes(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> bool:
@@ -124,6 +142,11 @@ def _settings_in(kind: Any) -> type[Settings] | None:
         if isinstance(option, type) and issubclass(option, Settings):
             return option
     return None
+
+
+def _kind_of_each(kind: Any) -> Any:
+    """The type of the values of a mapping by name; None where a type is no such mapping."""
+    return get_args(kind)[1] if get_origin(kind) in (dict, Mapping) else None
 
 
 def _yaml(path: Path) -> Any:

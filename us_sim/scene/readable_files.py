@@ -13,7 +13,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from us_sim.scene.building import path_of
-from us_sim.scene.scene import Scene
+from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.scene.tracker_building import camera_body_of, source_settings, tracking_of
 
 __all__ = ["check_files"]
@@ -32,10 +32,7 @@ def check_files(scene: Scene) -> list[str]:
         read_placement(Path(scene.volume.file))
         checked.append("volume.file (its header)")
     if scene.tissue is not None and scene.tissue.mesh.file:
-        from us_sim.tissue.mesh.file import read_mesh
-
-        read_mesh(Path(scene.tissue.mesh.file), scene.tissue.mesh.unit)
-        checked.append("tissue.mesh.file")
+        checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
     if scene.skin is not None:
         surfaces["skin.file"] = scene.skin.file
@@ -61,6 +58,18 @@ def check_files(scene: Scene) -> list[str]:
     if scene.path:
         from us_sim.recording.path import read_path
 
-        read_path(Path(scene.path))
+        read_path(Path(scene.path), option="--param path_player.topic=NAME")
         checked.append("path")
     return checked
+
+
+def _mesh_remarks(tissue: TissueSettings) -> list[str]:
+    """What there is to say about the mesh of a file, as far as it says so without the volume."""
+    from us_sim.tissue.mesh.file import read_mesh
+    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, held_remark
+
+    given = tissue.mesh
+    mesh, remarks = read_mesh(Path(given.file or ""), given.unit, given.pose.pose)
+    names = [name for name in tissue.fixed if name in FACES]
+    held = [held_remark(name, face_nodes(mesh, name, given.margin), mesh) for name in names]
+    return [f"{len(mesh.nodes)} nodes", *remarks, *(said for said in held if said)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import Any
 
 from us_sim.errors import SceneError
@@ -67,6 +68,7 @@ class StructureSettings(Settings):
 
     section = "structures"
     error = SceneError
+    alternatives = MappingProxyType({"file": ("unit", "pose"), "label": ()})
 
     label: str | None = setting(
         description="of the volume; not given: the structure's own name", default=None

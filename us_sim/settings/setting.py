@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
 from types import UnionType
 from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin
@@ -105,6 +105,8 @@ class Settings:
     """What is raised for a value that will not do."""
     live: ClassVar[bool] = False
     """Whether all of these settings may change while what they set is running."""
+    alternatives: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Settings of which one takes the place of the others, each with those that belong to it."""
 
     def __post_init__(self) -> None:
         kinds = kinds_of(type(self))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from us_sim.errors import VolumeError
 from us_sim.geometry.placement import Placement
@@ -24,6 +25,7 @@ class VolumeSettings(Settings):
 
     section = "volume"
     error = VolumeError
+    alternatives = MappingProxyType({"file": (), "phantom": ("seed", "voxel_size")})
 
     file: str | None = setting(description="MHA, NRRD or NIfTI", default=None, file=True)
     phantom: str | None = setting(

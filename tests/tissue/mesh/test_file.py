@@ -149,10 +149,33 @@ def test_a_unit_that_cannot_be_meant_is_refused(tmp_path):
     file = tmp_path / "small.msh"
     file.write_text(GMSH)
     assert read_mesh(file, 0.001)[0].volumes.sum() == pytest.approx(4.5e-6)
-    with pytest.raises(MeshError, match="30 m long: give its unit"):
+    with pytest.raises(MeshError, match=r"30 m long, and no body is: say .* `tissue\.mesh\.unit`"):
         read_mesh(file)
     with pytest.raises(MeshError, match="metres_per_unit is 0"):
         read_mesh(file, 0)
+
+
+@pytest.mark.parametrize(
+    ("metres_per_unit", "said"), [(1e-4, "0.003 m long"), (0.05, "1.5 m long")]
+)
+def test_a_size_that_is_hardly_that_of_a_body_is_remarked_on(tmp_path, metres_per_unit, said):
+    file = tmp_path / "small.msh"
+    file.write_text(GMSH)
+    (remark,) = read_mesh(file, metres_per_unit)[1]
+    assert remark.startswith(f"it is {said}, where parts of a body are 1 to 80 cm: ")
+    assert "`tissue.mesh.unit`" in remark
+
+
+@pytest.mark.parametrize("missing", ["node", "ele"])
+def test_the_second_file_of_a_pair_is_named_where_it_is_missing(tmp_path, missing):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    mesh = meshio.Mesh(0.1 * corners, [("tetra", np.array([[0, 1, 2, 3]]))])
+    mesh.write(tmp_path / "organ.node")
+    there = tmp_path / {"node": "organ.ele", "ele": "organ.node"}[missing]
+    assert len(read_mesh(there)[0].nodes) == 4
+    (tmp_path / f"organ.{missing}").unlink()
+    with pytest.raises(MeshError, match=f"it goes with organ.{missing}, which is not beside it"):
+        read_mesh(there)
 
 
 def test_a_missing_meshio_is_named_where_it_is_needed(tmp_path, monkeypatch):

@@ -8,7 +8,13 @@ from us_sim.errors import MeshError
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
 from us_sim.tissue.mesh.file import read_mesh
-from us_sim.tissue.mesh.node_selection import FACES, face_nodes, facing_nodes, nodes_in_label
+from us_sim.tissue.mesh.node_selection import (
+    FACES,
+    face_nodes,
+    facing_nodes,
+    held_remark,
+    nodes_in_label,
+)
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
@@ -35,6 +41,17 @@ def test_faces_are_the_planes_they_are_named_after(face, axis, value):
 def test_sides_are_all_but_top_and_bottom():
     mesh = block_mesh((6, 5, 4))
     assert len(face_nodes(mesh, "sides")) == 4 * (6 * 5 - 4 * 3)
+
+
+def test_it_is_said_how_many_nodes_are_held_where_they_may_be_few():
+    organ, box = unstructured(), block_mesh((6, 5, 4))
+    bottom = face_nodes(organ, "bottom")
+    assert held_remark("bottom", bottom, organ) == "fixed: `bottom` holds 30 of 120 nodes"
+    assert held_remark("bottom", face_nodes(box, "bottom"), box) is None
+    assert "holds 6 of 120 nodes, which is little" in (
+        held_remark("bottom", bottom[:6], organ) or ""
+    )
+    assert "`bone` holds 0 of 120 nodes" in (held_remark("bone", bottom[:0], box) or "")
 
 
 def unstructured(nodes=(6, 5, 4)):

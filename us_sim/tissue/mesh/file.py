@@ -35,8 +35,11 @@ _NO_MESH = (
     "an unstructured grid"
 )
 
-_SIZES = (1e-3, 10.0)
+_SIZES = (1e-3, 2.5)
 """Sizes of bodies, m: a smaller or larger one is in the wrong unit."""
+
+_USUAL_SIZES = (0.01, 0.8)
+"""Sizes of what is pressed with a probe, m: any other is remarked on."""
 
 _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
 """Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces."""
@@ -74,7 +77,14 @@ def read_mesh(
         size = float(np.ptp(mesh.nodes, axis=0).max())
         if not _SIZES[0] <= size <= _SIZES[1]:
             raise MeshError(
-                f"the mesh is {size:.3g} m long: give its unit, such as `unit: 1 mm` in a scene"
+                f"the mesh is {size:.3g} m long, and no body is: say what one unit of the file is, "
+                f"in a scene by `tissue.mesh.unit`, such as `unit: 1 mm`"
+            )
+        if not _USUAL_SIZES[0] <= size <= _USUAL_SIZES[1]:
+            repaired = (
+                *repaired,
+                f"it is {size:.3g} m long, where parts of a body are {100 * _USUAL_SIZES[0]:.0f} "
+                f"to {100 * _USUAL_SIZES[1]:.0f} cm: is `tissue.mesh.unit` right?",
             )
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error

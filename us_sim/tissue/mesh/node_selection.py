@@ -16,7 +16,7 @@ from us_sim.errors import MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["FACES", "face_nodes", "facing_nodes", "nodes_in_label"]
+__all__ = ["FACES", "face_nodes", "facing_nodes", "held_remark", "nodes_in_label"]
 
 FACES = {
     "top": ((2, False),),
@@ -35,8 +35,23 @@ _MARGIN = 0.05
 """Distance from a bounding box's face, over the box's size, up to which nodes count as on the face;
 for meshes that are no box."""
 
+_FEW, _FEW_PART = 10, 0.01
+"""Nodes, also as a part of all, below which what is held is remarked on as little."""
+
 _GRAZING = 0.1
 """The cosine to -z below which a probe that comes along +z would only graze the surface."""
+
+
+def held_remark(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
+    """How many nodes a name in a scene's ``fixed`` holds, for a person.
+
+    Of a mesh from a file, which may touch its bounding box at single nodes, and where they are few.
+    """
+    count, of = len(nodes), len(mesh.nodes)
+    said = f"fixed: `{name}` holds {count} of {of} nodes"
+    if count < max(_FEW, _FEW_PART * of):
+        return f"{said}, which is little; see tissue.fixed and tissue.mesh.margin"
+    return None if mesh.planes is not None else said
 
 
 def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) -> NDArray[np.int32]:
@@ -54,7 +69,7 @@ def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) ->
         MeshError: there is no such face.
     """
     if face not in FACES:
-        raise MeshError(f"a box has no face {face!r}: name one of {', '.join(FACES)}")
+        raise MeshError(f"a box has no face {face!r}: its faces are {', '.join(FACES)}")
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     rounding = 1e-9 * float((high - low).max())
     eligible = np.ones(len(mesh.nodes), dtype=bool)

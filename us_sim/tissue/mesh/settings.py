@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from us_sim.errors import MeshError
 from us_sim.geometry.placement import PLACE, Placement
@@ -20,6 +21,9 @@ class MeshSettings(Settings):
 
     section = "mesh"
     error = MeshError
+    alternatives = MappingProxyType(
+        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes")}
+    )
 
     lower: tuple[float, float, float] | None = setting(
         PLACE, "corner of the box with the least x, y, z", default=None

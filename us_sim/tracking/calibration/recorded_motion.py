@@ -50,7 +50,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
         UsSimError: it cannot be read, or has no such poses.
     """
     if not is_tracker_recording(path):
-        return read_path(path, name)
+        return read_path(path, name, option="--pose")
     recording = read_tracker_recording(path)
     if name is None:
         bodies = [key for key in recording.transforms if not key.startswith("Reference")]
