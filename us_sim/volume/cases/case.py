@@ -11,7 +11,7 @@ values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/``, `
 >>> from us_sim.volume.cases.writing import new_case, write_case_settings
 >>> from us_sim.volume.files.writing import write_volume
 >>> from us_sim.volume.volume import Volume
->>> block = Volume(np.zeros((30, 20, 10), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+>>> block = Volume(np.ones((30, 20, 10), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
 >>> with tempfile.TemporaryDirectory() as root:
 ...     with new_case(f"{root}/block") as folder:
 ...         write_volume(folder / "volume.nrrd", block)

@@ -28,7 +28,8 @@ import yaml
 
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.writing import document_of
-from us_sim.volume.cases.case import CASE, LABELS, read_case
+from us_sim.volume.cases.case import CASE, read_case
+from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.settings import CaseSettings, check_name
 
 __all__ = ["changed_case", "new_case", "write_case_settings"]
@@ -57,7 +58,7 @@ def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
     with _partial(folder) as partial:
         yield partial
-        _check(folder, partial)
+        _finish(folder, partial)
         try:
             os.rename(partial, folder)
         except OSError as error:
@@ -78,7 +79,7 @@ def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         except (OSError, shutil.Error) as error:
             raise CaseError(f"{folder}: cannot be copied: {error}") from error
         yield partial
-        _check(folder, partial)
+        _finish(folder, partial)
         before = partial.with_name(partial.name.replace(".partial-", ".before-"))
         try:
             os.rename(folder, before)
@@ -117,13 +118,18 @@ def _place(folder: str | os.PathLike[str]) -> Path:
     return path
 
 
-def _check(folder: Path, partial: Path) -> None:
-    """Refuse what is no case, in words that name the place it was meant for."""
+def _finish(folder: Path, partial: Path) -> None:
+    """Propose where to start where that is not said; refuse what is no case.
+
+    Errors name the place that it was meant for.
+    """
     try:
         case = read_case(partial)
         case.placement()
-        if (partial / LABELS).exists():
+        if case.has_labels:
             case.check_grids()
+        if case.settings.start is None or case.settings.probe is None:
+            write_case_settings(partial, with_proposal(case.settings, case.volume()))
     except (CaseError, VolumeError) as error:
         raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error
 

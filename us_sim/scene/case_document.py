@@ -1,0 +1,84 @@
+"""From a case to a scene: what a scene file would say to scan it and press on it.
+
+Frame ``patient`` is the probe's where it touches the skin at the case's start: its origin is the
+middle of the probe's face, and +z goes into the body.
+
+>>> import numpy as np
+>>> from us_sim.geometry.placement import Placement
+>>> from us_sim.scene.case_document import patient_from_volume
+>>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
+>>> pose = patient_from_volume(start).pose
+>>> bool(np.allclose(pose.apply(np.array([[0.0, 0.1, -0.03]])), [[0.0, 0.0, 0.03]]))
+True
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.registry import PROBES
+from us_sim.settings.writing import document_of
+from us_sim.volume.cases.case import Case, read_case
+from us_sim.volume.cases.settings import AROUND, CaseSettings
+
+__all__ = ["case_document", "patient_from_volume"]
+
+_BESIDE = 0.013  # m, of tissue beside the probe
+_LEAST_ASIDE = 0.03  # m, along the probe's y: for its slide, and for tissue to give way
+_ASIDE_OVER_DEPTH = 0.25
+_BELOW = 1.05
+"""Depth of the tissue over that of the image: tissue that moves against the volume beside it would
+leave a seam in the image."""
+_THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
+
+
+def case_document(folder: Path) -> dict[str, Any]:
+    """The keys of a scene made from the case in a folder.
+
+    Raises:
+        CaseError, VolumeError: the case cannot be read.
+    """
+    case = read_case(folder)
+    settings = case.settings
+    if settings.start is None or settings.probe is None or settings.probe.collider is None:
+        from us_sim.volume.cases.proposal import with_proposal
+
+        settings = with_proposal(settings, case.volume())
+    assert settings.start is not None
+    assert settings.probe is not None
+    names = [AROUND, *settings.structures] if case.has_labels else [AROUND]
+    held = [name for name in settings.held if case.has_labels or name not in settings.structures]
+    pose = patient_from_volume(settings.start)
+    document: dict[str, Any] = {
+        "name": settings.name,
+        "volume": {"case": str(case.folder), "pose": document_of(pose)},
+        "probe": document_of(settings.probe),
+        "imaging": {"contact": True},
+        "tissue": {
+            "solver": "fem_nonlinear",
+            "mesh": _mesh(case, settings.probe, pose),
+            "fixed": held,
+            "materials": {name: document_of(settings.material_of(name)) for name in names},
+        },
+        "path": "press_and_slide.mcap",
+    }
+    if settings.description:
+        document["description"] = settings.description
+    if case.has_labels and settings.structures:
+        document["structures"] = {
+            name: {"colour": list(settings.colour_of(name))} for name in settings.structures
+        }
+    return document
+
+
+def patient_from_volume(start: Placement) -> Placement:
+    """The pose of the volume's own frame in that of a probe at ``start``."""
+    pose: Pose = start.pose.inverse()
+    return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))

@@ -1,0 +1,159 @@
+"""Where to start and with which probe, for a case that does not say.
+
+Voxels that were never scanned are 0. The region that a spreading probe has scanned widens with
+depth, so its distances along the beams are spread unevenly, with a tail towards the probe: of all
+directions the skewness along the beams is least. A region without such a direction is taken for one
+that a linear array has scanned along the rows of its images, the volume's second axis.
+
+>>> import numpy as np
+>>> from us_sim.volume.cases.proposal import proposed_start
+>>> from us_sim.volume.volume import Volume
+>>> i, j, k = np.indices((61, 31, 61))
+>>> fan = abs(np.hypot(i - 30, k + 20) - 50) < 25  # from 5 mm deep at the apex's side, down
+>>> fan &= abs(np.arctan2(i - 30, k + 20)) < np.radians(28)
+>>> volume = Volume(200 * fan.astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+>>> start = proposed_start(volume)
+>>> bool(start.pose.rotation[2, 2] > 0.99), round(1e3 * start.position[2])
+(True, 5)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from us_sim.errors import CaseError
+from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.choice import Chosen
+from us_sim.settings.registry import COLLIDERS, PROBES
+from us_sim.volume.cases.settings import CaseSettings
+from us_sim.volume.volume import Volume
+
+__all__ = ["proposed_collider", "proposed_probe", "proposed_start", "with_proposal"]
+
+_MOST_POINTS = 200_000
+_FEW_POINTS = 8_000
+_DIRECTIONS = 2000
+_BATCH = 100
+_WIDENS = -0.12
+"""Skewness of the distances along the beams below which the region is said to widen with them: a
+wedge that becomes half as wide again has -0.2, a box 0."""
+_BESIDE = 4e-3  # m, from the middle beam, within which the skin is looked for
+_WIDEST = 0.05  # m, of a linear array's face
+_DEPTHS = (0.01, 0.25)  # m
+
+
+def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
+    """The settings of a case, with a start and a probe where they say none.
+
+    Raises:
+        CaseError: nothing was scanned: all voxels are 0.
+    """
+    start = settings.start or proposed_start(volume)
+    probe = settings.probe or proposed_probe(volume, start)
+    if probe.collider is None:
+        probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
+    return dataclasses.replace(settings, start=start, probe=probe)
+
+
+def proposed_start(volume: Volume) -> Placement:
+    """The pose of a probe in the middle of the scanned region's near side, in the volume's frame.
+
+    Raises:
+        CaseError: nothing was scanned: all voxels are 0.
+    """
+    points = _scanned(volume)
+    middle = points.mean(axis=0)
+    along, _ = _beams(volume, points)
+    aside = points - middle
+    aside -= np.outer(aside @ along, along)
+    across = np.linalg.eigh(aside.T @ aside)[1][:, -1]  # where the region is widest
+    across -= (across @ along) * along
+    across /= np.linalg.norm(across)
+    if across[np.argmax(np.abs(across))] < 0.0:
+        across = -across
+    near = np.linalg.norm(aside, axis=1) <= max(_BESIDE, _spacing(volume))
+    near = near if near.any() else np.ones(len(points), dtype=bool)
+    depth = np.percentile((points[near] - middle) @ along, 1.0)
+    rotation = np.column_stack([across, np.cross(along, across), along])
+    orientation = Rotation.from_matrix(rotation).as_quat()
+    pose = Pose(middle + depth * along, orientation)
+    return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+
+
+def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
+    """A curved array where the scanned region widens with depth, else a linear one; as deep as it.
+
+    Raises:
+        CaseError: nothing was scanned.
+    """
+    points = _scanned(volume)
+    _, widens = _beams(volume, points)
+    placed = (points - start.pose.position) @ start.pose.rotation
+    depth = float(np.clip(np.percentile(placed[:, 2], 99.5), *_DEPTHS))
+    width = 2 * float(np.percentile(np.abs(placed[:, 0]), 99.0))
+    values: dict[str, float]
+    if widens:
+        kind, values = "convex", {"radius": 0.05, "opening_angle": math.radians(60.0)}
+    else:
+        kind, values = "linear", {"aperture": float(np.clip(width, 5e-3, _WIDEST))}
+    array = Chosen(kind, PROBES.settings(kind)(**{**values, "depth": round(depth, 4)}))
+    return ProbeSettings(array=array, image=512, collider=proposed_collider(array))
+
+
+def proposed_collider(array: Chosen) -> Chosen:
+    """The shape of a probe's head around its array, as large as the usual ones are."""
+    given = array.given
+    if array.name == "convex":
+        chord = 2 * given.radius * math.sin(given.opening_angle / 2)
+        size = {"radius": given.radius, "length": chord + 0.011, "width": 0.018, "height": 0.06}
+        return Chosen("convex", COLLIDERS.settings("convex")(**size, rounding=0.006))
+    length = getattr(given, "aperture", 0.02) + 0.006
+    size = {"length": length, "width": 0.014, "height": 0.04, "rounding": 0.004}
+    return Chosen("rounded_box", COLLIDERS.settings("rounded_box")(**size))
+
+
+def _spacing(volume: Volume) -> float:
+    return float(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0).max())
+
+
+def _scanned(volume: Volume) -> NDArray[np.float64]:
+    """(N, 3) m, centres of voxels that are not 0, of a grid coarse enough for a few of them."""
+    step = max(1, math.ceil((volume.intensities.size / _MOST_POINTS) ** (1 / 3)))
+    found = np.argwhere(volume.intensities[::step, ::step, ::step]) * step
+    if not len(found):
+        raise CaseError("all voxels of the volume are 0, so there is nothing to scan")
+    matrix = volume.index_to_patient
+    return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+def _beams(volume: Volume, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """The unit direction (3,) of the beams, and whether the region widens along them."""
+    aside = points - points.mean(axis=0)
+    few = aside[:: max(1, len(aside) // _FEW_POINTS)]
+    directions = _spiral(_DIRECTIONS)
+    skewness = np.empty(_DIRECTIONS)
+    for first in range(0, _DIRECTIONS, _BATCH):
+        distance = few @ directions[first : first + _BATCH].T
+        squared = distance * distance
+        cubed = np.einsum("ij,ij->j", squared, distance) / len(few)
+        skewness[first : first + _BATCH] = cubed / squared.mean(axis=0) ** 1.5
+    best = int(np.argmin(skewness))
+    if skewness[best] < _WIDENS:
+        return directions[best], True
+    rows = volume.index_to_patient[:3, 1]
+    return rows / np.linalg.norm(rows), False
+
+
+def _spiral(count: int) -> NDArray[np.float64]:
+    """(count, 3) unit vectors spread evenly over a sphere (Gonzalez, Math Geosci 42:49, 2010)."""
+    height = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    turn = math.pi * (3.0 - math.sqrt(5.0)) * np.arange(count)
+    ring = np.sqrt(1.0 - height**2)
+    return np.column_stack([ring * np.cos(turn), ring * np.sin(turn), height])
