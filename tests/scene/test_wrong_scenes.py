@@ -200,7 +200,7 @@ def missing_file(place: Place, name: str, rule: Rule) -> Mistake:
     if rule.applies:
         mapping[rule.applies[0]] = rule.applies[1][0]
     document = put(place.document, place.path, mapping) if place.path else place.document | mapping
-    words = ("there is no file", "qqqq.yaml")
+    words = ("there is no", "qqqq.yaml")
     return Mistake("file", document, ".".join((*place.path, name)), words)
 
 

@@ -11,6 +11,7 @@ from us_sim.command.scene_options import (
     add_scene_options,
     add_supervision_options,
     node_parameters,
+    scene_name,
     supervision,
 )
 from us_sim.share import find_bag
@@ -54,7 +55,7 @@ def _demo(args: argparse.Namespace) -> int:
     from us_sim.run.live import demo
 
     return demo(
-        args.scene or ("upper_arm_camera" if args.source == "camera" else "upper_arm"),
+        scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
         args.volume,
         args.out,
         node_parameters(args.param),

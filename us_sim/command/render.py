@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from us_sim.command.scene_options import add_scene_options, node_parameters
+from us_sim.command.scene_options import add_scene_options, node_parameters, scene_name
 from us_sim.share import find_bag
 
 __all__ = ["add_render"]
@@ -15,7 +15,7 @@ __all__ = ["add_render"]
 def add_render(commands: Any) -> None:
     """Add the command to `us-sim`'s."""
     render = commands.add_parser("render", help="one image for every pose of a path, repeatably")
-    render.add_argument("scene", help="scene file, or name of an installed one")
+    render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     render.add_argument(
         "--path", type=find_bag, metavar="BAG", help="bag with the probe path; default: the scene's"
     )
@@ -28,5 +28,5 @@ def _render(args: argparse.Namespace) -> int:
     from us_sim.run.lockstep import render_scene
     from us_sim.scene.reading import load_scene
 
-    scene = load_scene(args.scene, volume=args.volume)
+    scene = load_scene(scene_name(args), volume=args.volume)
     return render_scene(scene, args.path, args.out, node_parameters(args.param))

@@ -12,6 +12,7 @@ from us_sim.command.scene_options import (
     add_scene_options,
     add_supervision_options,
     node_parameters,
+    scene_name,
     supervision,
 )
 from us_sim.command.setting_options import add_setting_options, read_settings
@@ -40,7 +41,7 @@ class _Run(Settings):
 def add_run(commands: Any) -> None:
     """Add the command to `us-sim`'s."""
     run = commands.add_parser("run", help="run the nodes of a scene until Ctrl-C")
-    run.add_argument("scene", help="scene file, or name of an installed one")
+    run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_setting_options(run, _Run)
     add_supervision_options(run)
     run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
@@ -55,7 +56,7 @@ def _run(args: argparse.Namespace) -> int:
     from us_sim.scene.reading import load_scene
 
     asked = read_settings(args, _Run)
-    scene = load_scene(args.scene, volume=args.volume)
+    scene = load_scene(scene_name(args), volume=args.volume)
     parameters = node_parameters(args.param)
     if args.dry_run:
         from us_sim.scene.readable_files import check_files

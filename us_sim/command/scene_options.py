@@ -15,12 +15,16 @@ __all__ = [
     "add_scene_options",
     "add_supervision_options",
     "node_parameters",
+    "scene_name",
     "supervision",
 ]
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Another volume, and parameters of the scene's nodes."""
+    """A case in place of a scene, another volume, and parameters of the scene's nodes."""
+    parser.add_argument(
+        "--case", metavar="NAME", help="case to make the scene from: its name or folder"
+    )
     parser.add_argument(
         "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
     )
@@ -31,6 +35,27 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         metavar="NODE.NAME=VALUE",
         help="set a node's parameter; may be given again",
     )
+
+
+def scene_name(args: argparse.Namespace, default: str | None = None) -> str:
+    """The scene that is asked for, or ``case:`` and the case.
+
+    Raises:
+        UsSimError: both are given, or neither and there is no default.
+    """
+    from us_sim.scene.scene import CASE_PREFIX
+
+    if args.case is not None:
+        if args.scene is not None:
+            raise UsSimError(
+                f"--case {args.case}: the scene {args.scene} is given too; keep one, or write "
+                f"`case: {args.case}` into the scene"
+            )
+        return f"{CASE_PREFIX}{args.case}"
+    name = args.scene or default
+    if name is None:
+        raise UsSimError("name a scene, or a case with --case; `us-sim cases` lists cases")
+    return str(name)
 
 
 def add_network_option(parser: argparse.ArgumentParser) -> None:

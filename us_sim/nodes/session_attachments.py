@@ -14,8 +14,7 @@ import yaml
 from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.attached import versions
-from us_sim.scene.document import read_document
-from us_sim.scene.reading import find_scene, load_scene
+from us_sim.scene.reading import load_scene, scene_document, with_volume
 from us_sim.settings.setting import rules_of
 
 __all__ = ["session_attachments"]
@@ -62,10 +61,9 @@ def _attach_scene(
     attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None
 ) -> dict[Path, str]:
     """Attach a scene and its small files; the checksums of all its files."""
-    document, _ = read_document(find_scene(scene), find_scene)
+    document, _, _ = scene_document(scene)
     if volume:
-        kept = {key: value for key, value in document["volume"].items() if key != "phantom"}
-        document["volume"] = kept | {"file": volume}
+        document = with_volume(document, volume)
     listed: dict[Path, str] = {}
     places = {}
     for path in sorted(set(_files(load_scene(scene, volume=volume)))):

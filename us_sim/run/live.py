@@ -19,6 +19,7 @@ from us_sim.run.supervision import follow
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
+from us_sim.scene.case_tissue import keep_tissue
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -191,7 +192,10 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
 
 
 def prepare_volume(scene: Scene) -> None:
-    """Make a phantom that is not in the cache yet, in view of the person who waits."""
+    """Make a phantom that is not in the cache yet, in view of the person who waits.
+
+    The tissue of a case is made too, and kept in the case.
+    """
     bar: list[Progress] = []
 
     def show(fraction: float, text: str) -> None:
@@ -201,7 +205,7 @@ def prepare_volume(scene: Scene) -> None:
         bar[0].update(100 * fraction, text)
 
     try:
-        volume_of(scene, show)
+        keep_tissue(scene, volume_of(scene, show))
     finally:
         for shown in bar:
             shown.__exit__(None, None, None)

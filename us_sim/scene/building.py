@@ -52,9 +52,13 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
     """The scene's volume in frame ``patient``.
 
     Raises:
-        VolumeError: its file cannot be read.
+        VolumeError, CaseError: its file or its case cannot be read.
     """
-    if scene.volume.file:
+    if scene.volume.case:
+        from us_sim.volume.cases.case import read_case
+
+        volume = read_case(scene.volume.case).volume()
+    elif scene.volume.file:
         from us_sim.volume.files.readers import read_volume
 
         volume = read_volume(Path(scene.volume.file))
@@ -157,8 +161,7 @@ def tissue_model_of(
         from us_sim.scene.structures import require_labels
 
         require_labels(scene, volume)
-    mesh, remarks = _mesh(section)
-    fractions = _label_fractions(mesh, volume)
+    mesh, remarks, fractions = _mesh(scene, section, volume)
     fixed, held = _fixed_nodes(scene, section, mesh, volume, fractions)
     if note is not None:
         for remark in (*remarks, *held):
@@ -245,8 +248,10 @@ def membrane_of(scene: Scene) -> SkinMembrane:
     return SkinMembrane(sheet, collider_of(scene), section)
 
 
-def _mesh(section: TissueSettings) -> tuple[TetrahedralMesh, tuple[str, ...]]:
-    """The mesh, and what there is to say about it."""
+def _mesh(
+    scene: Scene, section: TissueSettings, volume: Volume
+) -> tuple[TetrahedralMesh, tuple[str, ...], LabelFractions | None]:
+    """The mesh, what there is to say about it, and how much of each label is in it."""
     given = section.mesh
     if given.file:
         from us_sim.tissue.mesh.file import read_mesh
@@ -255,7 +260,12 @@ def _mesh(section: TissueSettings) -> tuple[TetrahedralMesh, tuple[str, ...]]:
         parts = int(mesh.parts.max()) + 1
         if parts > 1:
             remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
-        return mesh, remarks
+        return mesh, remarks, _label_fractions(mesh, volume)
+    if isinstance(given.nodes, int):
+        from us_sim.scene.case_tissue import box_tissue, kept_tissue
+
+        tissue = kept_tissue(scene) or box_tissue(scene, volume)
+        return tissue.mesh, (), tissue.label_fractions if volume.labels is not None else None
     from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
     assert given.lower is not None
@@ -266,7 +276,8 @@ def _mesh(section: TissueSettings) -> tuple[TetrahedralMesh, tuple[str, ...]]:
         else uniform_planes(given.lower[i], given.upper[i], given.nodes[i])
         for i, axis in enumerate("xyz")
     ]
-    return box_mesh(*planes), ()
+    mesh = box_mesh(*planes)
+    return mesh, (), _label_fractions(mesh, volume)
 
 
 def _fixed_nodes(

@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 from us_sim.geometry.placement import Placement
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import ProbeSettings
-from us_sim.settings.registry import PROBES
+from us_sim.scene.tissue_box import footprint
+from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.settings.writing import document_of
 from us_sim.volume.cases.case import Case, read_case
 from us_sim.volume.cases.settings import AROUND, CaseSettings
+from us_sim.volume.volume import grid_extent
 
 __all__ = ["case_document", "patient_from_volume"]
 
@@ -67,7 +69,7 @@ def case_document(folder: Path) -> dict[str, Any]:
             "fixed": held,
             "materials": {name: document_of(settings.material_of(name)) for name in names},
         },
-        "path": "press_and_slide.mcap",
+        "path": _path(settings.press),
     }
     if settings.description:
         document["description"] = settings.description
@@ -78,7 +80,38 @@ def case_document(folder: Path) -> dict[str, Any]:
     return document
 
 
+def _path(press: float) -> str:
+    """The path of a press as deep as the case proposes."""
+    if press == CaseSettings.press:
+        return "press_and_slide.mcap"
+    from us_sim.recording.pressing_path import pressing_path
+
+    return str(pressing_path(press))
+
+
 def patient_from_volume(start: Placement) -> Placement:
     """The pose of the volume's own frame in that of a probe at ``start``."""
     pose: Pose = start.pose.inverse()
     return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+
+
+def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
+    """The box of tissue: as wide and deep as the image, as far as the volume goes."""
+    matrix, shape = case.placement()
+    volume = grid_extent(pose.pose.matrix @ matrix, shape)
+    array = probe.array.settings(PROBES)
+    length, width = footprint(probe.collider.settings(COLLIDERS)) if probe.collider else (0.0, 0.0)
+    aside = max(array.width / 2, length + _BESIDE)
+    across = max(_LEAST_ASIDE, _ASIDE_OVER_DEPTH * array.depth, 2 * width)
+    box = np.array([[-aside, -across, 0.0], [aside, across, _BELOW * array.depth]])
+    cut = np.stack([np.maximum(box[0], volume[0]), np.minimum(box[1], volume[1])])
+    cut[0, 2] = 0.0
+    thin = cut[1] - cut[0] < _THINNEST
+    box = np.where(thin, box, cut)
+    document = {"lower": _rounded(box[0]), "upper": _rounded(box[1])}
+    return document | {"nodes": case.settings.nodes}
+
+
+def _rounded(corner: NDArray[np.float64]) -> list[float]:
+    """To a tenth of a millimetre, for a person who reads the scene."""
+    return [round(float(value), 4) for value in corner]

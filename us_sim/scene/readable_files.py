@@ -31,6 +31,14 @@ def check_files(scene: Scene) -> list[str]:
 
         read_placement(Path(scene.volume.file))
         checked.append("volume.file (its header)")
+    if scene.volume.case:
+        from us_sim.volume.cases.case import read_case
+
+        case = read_case(scene.volume.case)
+        case.placement()
+        if case.has_labels:
+            case.check_grids()
+        checked.append("volume.case (its headers)")
     if scene.tissue is not None and scene.tissue.mesh.file:
         checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}

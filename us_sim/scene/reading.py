@@ -12,16 +12,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from us_sim.errors import SceneError
+from us_sim.errors import CaseError, SceneError, UsSimError
 from us_sim.scene.building import probe_of
-from us_sim.scene.document import read_document
-from us_sim.scene.scene import Scene
+from us_sim.scene.document import merged, read_document
+from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.settings.reading import Reader
 from us_sim.settings.spelling import nearest, shown
 from us_sim.share import shared_roots
+from us_sim.volume.cases.roots import find_case
 
-__all__ = ["find_scene", "load_scene", "parse_scene"]
+__all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_volume"]
 
 
 def find_scene(name: str | Path) -> Path:
@@ -48,20 +50,44 @@ def find_scene(name: str | Path) -> Path:
 
 
 def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
-    """Read and validate a scene file; ``volume`` replaces the file it names.
+    """Read and validate a scene file, or make a scene of a case: ``case:NAME``.
+
+    Args:
+        name: of the scene, or its file; or ``case:`` with the name or the folder of a case.
+        volume: a file in place of the scene's.
 
     Raises:
         SceneError: the file or a value in it cannot be used; one sentence with file and key.
     """
+    document, folders, origin = scene_document(name)
+    if volume:
+        if not isinstance(document, dict) or not isinstance(document.get("volume", {}), dict):
+            raise SceneError(f"{origin}: volume: must be a mapping of keys")
+        document = with_volume(document, str(Path(volume).expanduser().resolve()))
+    return parse_scene(document, origin=origin, folders=folders)
+
+
+def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
+    """What a scene file, or ``case:`` and a case, says; folders of its files; where it is from.
+
+    Raises:
+        SceneError: it cannot be found or read.
+    """
+    if str(name).startswith(CASE_PREFIX):
+        case = str(name).removeprefix(CASE_PREFIX)
+        try:
+            folder = find_case(case)
+        except CaseError as error:
+            raise SceneError(str(error)) from error
+        return {"case": str(folder)}, [folder.parent], f"{CASE_PREFIX}{folder}"
     path = find_scene(name)
     document, folders = read_document(path, find_scene)
-    if volume:
-        if not isinstance(document, dict) or not isinstance(document.get("volume"), dict):
-            raise SceneError(f"{path}: volume: must be a mapping of keys")
-        document["volume"] = {
-            key: value for key, value in document["volume"].items() if key != "phantom"
-        } | {"file": str(Path(volume).expanduser().resolve())}
-    return parse_scene(document, origin=str(path), folders=folders)
+    return document, folders, str(path)
+
+
+def with_volume(document: dict[Any, Any], file: str) -> dict[Any, Any]:
+    """The document with another volume in place of its own."""
+    return merged(document, {"volume": {"file": file}})
 
 
 def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Path] = ()) -> Scene:
@@ -76,11 +102,29 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
     def find_file(name: str, key: str) -> str:
         return _existing(name, origin, [*folders, Path.cwd()], key)
 
+    document = _with_case(document, origin, [*folders, Path.cwd()])
     document = _with_named_structures(document, origin)
     Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
     scene = Reader(origin, find_file, SceneError).read(Scene, document).named(origin)
     probe_of(scene)
     return scene
+
+
+def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object:
+    """A document that names a case has all that the case says and it does not say itself."""
+    if not isinstance(document, dict) or document.get("case") is None:
+        return document
+    case = document["case"]
+    if not isinstance(case, str):
+        raise SceneError(f"{origin}: case: must be a text, not {shown(case)}: name a case")
+    if not case.strip():
+        raise SceneError(f"{origin}: case: is empty: give a text, or leave it out")
+    from us_sim.scene.case_document import case_document
+
+    try:
+        return merged(case_document(find_case(case, folders)), document)
+    except UsSimError as error:
+        raise SceneError(f"{origin}: case: {error}") from error
 
 
 def _with_named_structures(document: object, origin: str) -> object:
@@ -102,6 +146,11 @@ def _with_named_structures(document: object, origin: str) -> object:
 
 def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
     """The absolute path of a file named in a scene."""
+    if key in ("case", "volume.case"):
+        try:
+            return str(find_case(name, folders))
+        except CaseError as error:
+            raise SceneError(f"{origin}: {key}: {error}") from error
     path = Path(name).expanduser()
     candidates = [path] if path.is_absolute() else [folder / path for folder in folders]
     if key == "path" and not path.is_absolute():

@@ -26,6 +26,7 @@ from us_sim.tracking.filter.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 
 __all__ = [
+    "CASE_PREFIX",
     "Part",
     "ProbeSettings",
     "Scene",
@@ -33,6 +34,10 @@ __all__ = [
     "TissueSettings",
     "TrackerSettings",
 ]
+
+
+CASE_PREFIX = "case:"
+"""Before the name or the folder of a case, in place of a scene's name."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +199,11 @@ class Scene(Settings):
         description="bag with a probe path, for the demo", default=None, file=True
     )
     description: str = setting(description="for a person", default="")
+    case: str | None = setting(
+        description="case, or its name, from which all is taken that the scene does not say",
+        default=None,
+        file=True,
+    )
     origin: str = "scene"
 
     def check(self) -> None:

@@ -75,7 +75,8 @@ def structures_of(
         volume: of the scene.
         mesh: of the scene's tissue. Structures around labels end where it ends.
         triangles: about so many for all structures around labels together; files are taken as
-            they are.
+            they are. Of a scene that is made from a case, structures that are nowhere in the tissue
+            are left out.
 
     Raises:
         SceneError: the volume has no such label, or no surface can be made of it.
@@ -91,8 +92,14 @@ def structures_of(
         if not given.file
     }
     box = np.stack([mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)])
+    if scene.case:  # it has structures where the probe is not
+        from us_sim.volume.surfaces.label_surface import occurs
+
+        labels = {name: one for name, one in labels.items() if occurs(volume, one, box)}
     spacing = 0.0
     for name, given in scene.structures.items():
+        if not given.file and name not in labels:
+            continue
         colour = colour_of(scene, name)
         try:
             if given.file:

@@ -21,13 +21,18 @@ VOXEL_SIZE = Quantity("length", 2e-4, 5e-3)
 
 @dataclass(frozen=True)
 class VolumeSettings(Settings):
-    """The ultrasound volume: a file, or a procedural phantom made from a seed."""
+    """The ultrasound volume: a file, a case, or a procedural phantom made from a seed."""
 
     section = "volume"
     error = VolumeError
-    alternatives = MappingProxyType({"file": (), "phantom": ("seed", "voxel_size")})
+    alternatives = MappingProxyType({"file": (), "case": (), "phantom": ("seed", "voxel_size")})
 
     file: str | None = setting(description="MHA, NRRD or NIfTI", default=None, file=True)
+    case: str | None = setting(
+        description="case, or its name, in place of a file: its volume and its labels",
+        default=None,
+        file=True,
+    )
     phantom: str | None = setting(
         description="procedural phantom in place of a file", choice=PHANTOMS, default=None
     )
@@ -38,13 +43,16 @@ class VolumeSettings(Settings):
     )
 
     def check(self) -> None:
-        """Refuse both a file and a phantom, or neither."""
-        if self.file and self.phantom:
-            raise self.refused("", "has both `file` and `phantom`; keep one")
-        if not self.file and not self.phantom:
+        """Refuse several of a file, a case and a phantom, or none."""
+        given = [key for key in ("file", "case", "phantom") if getattr(self, key)]
+        if len(given) > 1:
+            raise self.refused("", f"has both `{given[0]}` and `{given[1]}`; keep one")
+        if not given:
             raise self.refused("file", "is missing; name a file there, or give one with --volume")
 
     @property
     def name(self) -> str:
-        """The file's name or the phantom's, for a person."""
+        """The file's name, the case's or the phantom's, for a person."""
+        if self.case:
+            return f"case {Path(self.case).name}"
         return Path(self.file).name if self.file else f"phantom {self.phantom}, seed {self.seed}"

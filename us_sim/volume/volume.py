@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["Volume"]
+__all__ = ["Volume", "grid_extent"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +74,19 @@ class Volume:
     @cached_property
     def extent(self) -> NDArray[np.float64]:
         """(2, 3) m, lower and upper corner of the box in ``patient`` around all voxels' faces."""
-        faces = np.stack([np.full(3, -0.5), np.array(self.shape) - 0.5])
-        corners = np.stack(np.meshgrid(*faces.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        placed = corners @ self.index_to_patient[:3, :3].T + self.index_to_patient[:3, 3]
-        extent = np.stack([placed.min(axis=0), placed.max(axis=0)])
+        extent = grid_extent(self.index_to_patient, self.shape)
         extent.flags.writeable = False
         return extent
+
+
+def grid_extent(
+    index_to_patient: NDArray[np.float64], shape: tuple[int, int, int]
+) -> NDArray[np.float64]:
+    """(2, 3) m, lower and upper corner of the box in ``patient`` around a grid's voxels."""
+    faces = np.stack([np.full(3, -0.5), np.array(shape) - 0.5])
+    corners = np.stack(np.meshgrid(*faces.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    placed = corners @ index_to_patient[:3, :3].T + index_to_patient[:3, 3]
+    return np.stack([placed.min(axis=0), placed.max(axis=0)])
 
 
 def _voxels(array: NDArray[np.uint8], what: str) -> NDArray[np.uint8]:

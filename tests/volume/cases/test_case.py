@@ -29,7 +29,7 @@ def test_a_case_is_read_as_it_was_made(make_case, block):
         7e-3,
         Material(5e3, 0.49),
         {"vein": CaseStructure(6, Material(1e3, 0.1, 1060.0, 800.0), (0.1, 0.2, 0.3))},
-        ("bottom", "sides"),
+        fixed=("bottom", "sides"),
     )
     case = read_case(make_case(settings=made))
     assert case.settings == made

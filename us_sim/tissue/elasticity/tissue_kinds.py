@@ -28,7 +28,7 @@ from collections.abc import Mapping
 
 from us_sim.tissue.elasticity.material import Material
 
-__all__ = ["KINDS", "kind_of"]
+__all__ = ["KINDS", "LAYERS", "kind_of"]
 
 _BLOOD = 1060.0  # kg/m3
 _VENOUS = 1e3  # Pa, 8 mmHg
@@ -57,6 +57,9 @@ KINDS: Mapping[str, Material] = {
     "bone": Material(10e6, 0.3, 1900.0),
 }
 """By name. The first is for whatever has no name that is known."""
+
+LAYERS = ("tissue", "skin", "fat", "muscle")
+"""Kinds that lie in layers and fill what is between organs: they move with what is beside them."""
 
 _WORDS = {
     **{kind: kind for kind in KINDS},

@@ -83,12 +83,14 @@ def _sampled(
     return np.where(inside, labels.reshape(-1)[flat], 0).astype(np.uint8)
 
 
-def _thickness(grid: NDArray[np.uint8], axis: int, edges: NDArray[np.float64]) -> NDArray[np.float64]:
+def _thickness(
+    grid: NDArray[np.uint8], axis: int, edges: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(S,) m, of the thinnest structure at each place along an axis of a label grid."""
     lines = np.moveaxis(grid, axis, 0).reshape(grid.shape[axis], -1)
     ends = np.ones((len(lines) + 1, lines.shape[1]), dtype=bool)
     ends[1:-1] = lines[1:] != lines[:-1]
-    column, row = np.nonzero(ends.T)
+    row = np.nonzero(ends.T)[1]
     starts = np.flatnonzero(row < len(lines))
     length = row[starts + 1] - row[starts]
     runs = np.repeat(length, length).reshape(lines.shape[1], -1).T  # of each point's label

@@ -15,6 +15,10 @@ from us_sim.settings.setting import Settings, setting
 __all__ = ["MeshSettings"]
 
 
+_LEAST_NODES = 64
+_MOST_ALONG = 400
+
+
 @dataclass(frozen=True)
 class MeshSettings(Settings):
     """A box of tetrahedra in ``patient``, or a mesh from a file."""
@@ -31,8 +35,11 @@ class MeshSettings(Settings):
     upper: tuple[float, float, float] | None = setting(
         PLACE, "corner of the box with the largest x, y, z", default=None
     )
-    nodes: tuple[int, int, int] = setting(
-        Quantity("number", 2, 400), "of the box along x, y, z", default=(20, 10, 10)
+    nodes: tuple[int, int, int] | int = setting(
+        Quantity("number", 2, 200_000),
+        "of the box along x, y, z; or how many it has at most, which are put close together under "
+        "the probe and where structures are thin",
+        default=(20, 10, 10),
     )
     planes: dict[str, tuple[float, ...]] = setting(
         PLACE,
@@ -70,6 +77,20 @@ class MeshSettings(Settings):
             )
         if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
             raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
+        if isinstance(self.nodes, int):
+            if self.planes:
+                raise self.refused(
+                    "nodes", "must be three numbers where `planes` say where the nodes are"
+                )
+            if self.nodes < _LEAST_NODES:
+                raise self.refused(
+                    "nodes", f"{self.nodes} make no box: give {_LEAST_NODES} or more"
+                )
+        elif max(self.nodes) > _MOST_ALONG:
+            raise self.refused(
+                f"nodes[{self.nodes.index(max(self.nodes))}]",
+                f"{max(self.nodes)} is outside 2 to {_MOST_ALONG}",
+            )
         for name in self.planes:
             if name not in ("x", "y", "z"):
                 raise self.refused("planes", f"unknown axis `{name}`; axes are x, y and z")
@@ -80,7 +101,7 @@ class MeshSettings(Settings):
                     f"upper[{axis}]",
                     f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
                 )
-            if name in self.planes:
+            if name in self.planes and not isinstance(self.nodes, int):
                 self._check_planes(name, self.planes[name], lower, upper, self.nodes[axis])
 
     def _check_planes(

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,20 +104,27 @@ def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
         kind, values = "convex", {"radius": 0.05, "opening_angle": math.radians(60.0)}
     else:
         kind, values = "linear", {"aperture": float(np.clip(width, 5e-3, _WIDEST))}
-    array = Chosen(kind, PROBES.settings(kind)(**{**values, "depth": round(depth, 4)}))
+    made: Any = PROBES.settings(kind)
+    array = Chosen(kind, made(**values, depth=round(depth, 4)))
     return ProbeSettings(array=array, image=512, collider=proposed_collider(array))
 
 
 def proposed_collider(array: Chosen) -> Chosen:
     """The shape of a probe's head around its array, as large as the usual ones are."""
-    given = array.given
+    given: Any = array.settings(PROBES)
     if array.name == "convex":
         chord = 2 * given.radius * math.sin(given.opening_angle / 2)
         size = {"radius": given.radius, "length": chord + 0.011, "width": 0.018, "height": 0.06}
-        return Chosen("convex", COLLIDERS.settings("convex")(**size, rounding=0.006))
+        return _shape("convex", size | {"rounding": 0.006})
     length = getattr(given, "aperture", 0.02) + 0.006
-    size = {"length": length, "width": 0.014, "height": 0.04, "rounding": 0.004}
-    return Chosen("rounded_box", COLLIDERS.settings("rounded_box")(**size))
+    return _shape(
+        "rounded_box", {"length": length, "width": 0.014, "height": 0.04, "rounding": 0.004}
+    )
+
+
+def _shape(name: str, size: dict[str, float]) -> Chosen:
+    kind: Any = COLLIDERS.settings(name)
+    return Chosen(name, kind(**size))
 
 
 def _spacing(volume: Volume) -> float:

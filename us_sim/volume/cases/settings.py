@@ -96,6 +96,9 @@ class CaseSettings(Settings):
     structures: Mapping[str, CaseStructure] = setting(
         description="labels of `labels.nrrd`, by name", default_factory=dict
     )
+    nodes: int = setting(
+        Quantity("number", 64, 200_000), "that the mesh of its tissue has at most", default=3000
+    )
     fixed: tuple[str, ...] = setting(
         description="faces (bottom, sides, ...) and structures that are held; not given: the "
         "bottom, and structures of bone",

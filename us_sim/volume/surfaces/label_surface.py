@@ -23,7 +23,7 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.volume.volume import Volume
 
-__all__ = ["label_surface", "spacing_for"]
+__all__ = ["label_surface", "occurs", "spacing_for"]
 
 _SMOOTHING = 0.7
 """Standard deviation of the smoothing, in grid steps: the least that hides the voxels' stairs."""
@@ -114,6 +114,15 @@ def spacing_for(
         for axis, (one, other) in enumerate(itertools.combinations(sides[::-1], 2)):
             faces += one * other * np.count_nonzero(np.diff(mask, axis=axis))
     return float(np.sqrt(_TRIANGLES_PER_FACE * faces / max(triangles, 1)))
+
+
+def occurs(volume: Volume, label: int, within: NDArray[np.float64]) -> bool:
+    """Whether a label has a voxel in a box, (2, 3) m in ``patient``."""
+    try:
+        _voxels_of(volume, label, within)
+    except VolumeError:
+        return False
+    return True
 
 
 def _enclosed(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> float:

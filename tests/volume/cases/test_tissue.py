@@ -1,0 +1,78 @@
+"""The kept tissue: what was written is read, and nothing else is."""
+
+import zipfile
+
+import numpy as np
+import pytest
+
+from us_sim.errors import CaseError
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
+
+
+@pytest.fixture
+def tissue():
+    mesh = box_mesh([0.0, 0.01, 0.03], [0.0, 0.01], [0.0, 0.02])
+    fractions = np.linspace(0.1, 0.9, len(mesh.tetrahedra))
+    fractions = np.column_stack([fractions, 1 - fractions])
+    return CaseTissue(mesh, np.array([0, 6], np.uint8), fractions, {"nodes": 12, "labels": "ab"})
+
+
+def test_tissue_is_read_as_it_was_written(tmp_path, tissue):
+    write_tissue(tmp_path / "tissue.npz", tissue)
+    again = read_tissue(tmp_path / "tissue.npz")
+    np.testing.assert_array_equal(again.mesh.nodes, tissue.mesh.nodes)
+    np.testing.assert_array_equal(again.mesh.tetrahedra, tissue.mesh.tetrahedra)
+    np.testing.assert_array_equal(again.mesh.planes[0], [0.0, 0.01, 0.03])
+    np.testing.assert_allclose(again.fractions, tissue.fractions, atol=1e-7)
+    np.testing.assert_allclose(again.fractions.sum(axis=1), 1.0, rtol=1e-14)
+    assert again.made_from == tissue.made_from
+    assert [path.name for path in tmp_path.iterdir()] == ["tissue.npz"]
+
+
+def test_what_is_no_tissue_is_refused_in_a_sentence(tmp_path, tissue):
+    path = tmp_path / "tissue.npz"
+    with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+    np.savez(path, nodes=np.zeros((4, 3)))
+    with pytest.raises(CaseError, match="no tissue that us_sim wrote"):
+        read_tissue(path)
+    write_tissue(path, tissue)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+
+
+def test_arrays_that_do_not_go_together_are_refused(tmp_path, tissue):
+    path = tmp_path / "tissue.npz"
+    write_tissue(path, tissue)
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    for wrong in ({"fractions": np.ones((1, 2))}, {"fractions": 2 * arrays["fractions"]}):
+        np.savez(path, **{**arrays, **wrong})
+        with pytest.raises(CaseError, match="do not go together"):
+            read_tissue(path)
+    np.savez(path, **{**arrays, "tetrahedra": arrays["tetrahedra"] + 100})
+    with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+    np.savez(path, **{**arrays, "made_from": np.array(["x"], dtype=object)}, allow_pickle=True)
+    with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+
+
+def test_gigabytes_in_a_small_file_are_refused_before_they_are_unpacked(tmp_path):
+    path = tmp_path / "tissue.npz"
+    zeros = bytes(1 << 24)
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("nodes.npy", "w") as entry,
+    ):
+        for _ in range(33):
+            entry.write(zeros)
+    assert path.stat().st_size < 1 << 22
+    with pytest.raises(CaseError, match="are read at most"):
+        read_tissue(path)

@@ -1,0 +1,123 @@
+"""The tissue of a case: ``tissue.npz``, its mesh and how much of each label is in each tetrahedron.
+
+It says what it was made from, and is made anew when that has changed.
+
+>>> import tempfile
+>>> from pathlib import Path
+>>> import numpy as np
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
+>>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.02])
+>>> made = CaseTissue(mesh, np.array([0], np.uint8), np.ones((5, 1)), {"nodes": 8})
+>>> with tempfile.TemporaryDirectory() as folder:
+...     write_tissue(Path(folder, "tissue.npz"), made)
+...     again = read_tissue(Path(folder, "tissue.npz"))
+>>> again.made_from, len(again.mesh.tetrahedra)
+({'nodes': 8}, 5)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import CaseError, MeshError
+from us_sim.tissue.elasticity.materials import LabelFractions
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["CaseTissue", "read_tissue", "write_tissue"]
+
+_LARGEST = 1 << 29
+"""Bytes of the arrays together: a million nodes take less."""
+
+_ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
+_PLANES = ("planes_x", "planes_y", "planes_z")
+
+
+@dataclass(frozen=True, eq=False)
+class CaseTissue:
+    """A mesh in frame ``patient``, and what is in it."""
+
+    mesh: TetrahedralMesh
+    labels: NDArray[np.uint8]  # (L,) those that occur in it, ascending
+    fractions: NDArray[np.float64]  # (M, L) of each tetrahedron's volume
+    made_from: Mapping[str, Any]  # settings and checksums, as JSON holds them
+
+    @property
+    def label_fractions(self) -> LabelFractions:
+        """How much of each tetrahedron each label fills."""
+        return LabelFractions(self.labels, self.fractions)
+
+
+def write_tissue(path: Path, tissue: CaseTissue) -> None:
+    """Write ``tissue.npz``; what is there is replaced by the whole file.
+
+    Raises:
+        CaseError: it cannot be written.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "nodes": tissue.mesh.nodes,
+        "tetrahedra": tissue.mesh.tetrahedra,
+        "labels": tissue.labels,
+        "fractions": tissue.fractions.astype(np.float32),
+        "made_from": np.array(json.dumps(tissue.made_from, sort_keys=True)),
+    }
+    if tissue.mesh.planes is not None:
+        arrays |= dict(zip(_PLANES, tissue.mesh.planes, strict=True))
+    try:
+        number, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
+    except OSError as error:
+        raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        with os.fdopen(number, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, path)
+    except OSError as error:
+        raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def read_tissue(path: Path) -> CaseTissue:
+    """What `write_tissue` wrote.
+
+    Raises:
+        CaseError: it cannot be read, or holds something else.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            claimed = sum(entry.file_size for entry in archive.infolist())
+        if claimed > _LARGEST:
+            raise CaseError(
+                f"{path}: says it holds {claimed} bytes of arrays; {_LARGEST} are read at most"
+            )
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        nodes, tetrahedra, labels, fractions, made_from = (arrays[name] for name in _ARRAYS)
+        planes = None
+        if _PLANES[0] in arrays:
+            planes = tuple(arrays[name].astype(np.float64) for name in _PLANES)
+        mesh = TetrahedralMesh(nodes.astype(np.float64), tetrahedra.astype(np.int32), planes)
+        said = json.loads(str(made_from))
+        fractions = fractions.astype(np.float64)
+        fits = fractions.shape == (len(tetrahedra), len(labels)) and isinstance(said, dict)
+        if not fits or not np.allclose(fractions.sum(axis=1), 1.0, atol=1e-3):
+            raise CaseError(f"{path}: its arrays do not go together; remove it")
+        fractions /= fractions.sum(axis=1, keepdims=True)
+        return CaseTissue(mesh, labels.astype(np.uint8), fractions, said)
+    except (OSError, EOFError, KeyError, ValueError, TypeError, MeshError) as error:
+        raise CaseError(f"{path}: is no tissue that us_sim wrote ({error}); remove it") from error
+    except zipfile.BadZipFile as error:
+        raise CaseError(f"{path}: is damaged ({error}); remove it") from error
