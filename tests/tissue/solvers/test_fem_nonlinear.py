@@ -23,6 +23,7 @@ from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers import fem_nonlinear
 from us_sim.tissue.solvers.fem import Fem
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 
@@ -449,6 +450,38 @@ def test_a_frame_whose_time_is_up_is_gone_on_with_in_the_next_and_ends_the_same(
     # A step that has begun is made to its end: 12 iterations and a line search.
     assert np.median(times) < 0.05
     np.testing.assert_allclose(deformation.nodes, expected.nodes, atol=2e-5)
+
+
+def steps_of_a_frame(monkeypatch, *, live: float | None, **settings) -> tuple[int, float]:
+    """Newton steps, each of which takes one second, and the residual after a hard push."""
+    nodes = (20, 10, 10)
+    model = block(nodes, Sphere(0.05), materials=made_of(0.49, nodes))
+    solver = FemNonlinear(model, FemNonlinearSettings(**settings))
+    solver.frame_limit = live
+    now = 0.0
+    step = solver._newton.step
+
+    def slow_step(*args):
+        nonlocal now
+        now += 1.0
+        return step(*args)
+
+    monkeypatch.setattr(solver._newton, "step", slow_step)
+    monkeypatch.setattr(fem_nonlinear.time, "perf_counter", lambda: now)
+    residual = solver.deform(at(x=0.004, z=0.01)).residual
+    monkeypatch.undo()
+    return round(now), residual
+
+
+def test_a_live_frame_that_is_far_from_balance_may_take_three_times_its_time(monkeypatch):
+    unhurried, _ = steps_of_a_frame(monkeypatch, live=None)
+    budget = unhurried // 2
+    strict, left = steps_of_a_frame(monkeypatch, live=None, frame_budget=budget - 0.5)
+    assert left > 0.03  # so that there is something to go on with
+    assert strict == budget
+    longer, rest = steps_of_a_frame(monkeypatch, live=budget - 0.5)
+    assert strict < longer <= 3 * budget
+    assert rest <= 0.03
 
 
 def test_a_single_tetrahedron_with_one_free_corner():

@@ -78,6 +78,10 @@ longer one being a leap."""
 _APPROACHING = 0.7
 """Part of a frame's time after which no stride is begun any more."""
 
+_OVERTIME, _ROUGH = 3.0, 0.03
+"""How many times the time that a live simulation leaves a frame may take, and the residual above
+which it may: tissue that is left behind is harder to balance than poses that were missed."""
+
 _LOOSE, _STEPS = 0.2, 5
 """Residual with which a stride ends, and the most steps that it may take."""
 
@@ -97,7 +101,8 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on; not given: what a "
-        "live simulation leaves, and in lockstep any, lest results depend on the machine",
+        "live simulation leaves, three times that while forces are far from balance, and in "
+        "lockstep any, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(
@@ -278,7 +283,8 @@ class FemNonlinear(TissueSolver):
             taken = newton.step(min(left, newton.patience), enough, start)
             stuck = not taken and newton.is_stuck
             left -= newton.used
-            if budget is not None and (now := time.perf_counter()) - began > budget:
+            now = time.perf_counter()
+            if budget is not None and now - began > budget * self._overtime():
                 if now - stepping > budget and settings.frame_budget is not None:
                     actions.append(
                         f"frame_budget is {1e3 * budget:.3g} ms, but one step takes "
@@ -295,6 +301,11 @@ class FemNonlinear(TissueSolver):
     def _reference(self) -> float:
         """N, what unbalanced forces are measured by."""
         return self._newton.load or self._heaviest
+
+    def _overtime(self) -> float:
+        """How many times its time a frame may take as it is now."""
+        rough = self._newton.imbalance > _ROUGH * self._reference()
+        return _OVERTIME if rough and self.settings.frame_budget is None else 1.0
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
