@@ -127,6 +127,8 @@ def test_the_report_and_its_rows_are_written(tmp_path, monkeypatch, capsys):
     few += [Case(SINGLE, "640x480", 0.4, 30.0, name) for name in CONDITIONS if name != "plain"]
     monkeypatch.setattr(tracking, "cases", lambda _: few)
     monkeypatch.setattr(tracking, "_QUICK_SEQUENCES", {"640x480": 1, "1920x1080": 1})
+    small = [("APRILTAG_36h11", 24.0, 5), ("4X4_50", 32.0, 5)]
+    monkeypatch.setattr(tracking, "small_marker_trials", lambda _: small)
     out = tmp_path / "report"
     assert main(["evaluate", "tracking", "--quick", "--out", str(out)]) == 0
     assert "single 40 mm marker" in capsys.readouterr().out
@@ -139,6 +141,13 @@ def test_the_report_and_its_rows_are_written(tmp_path, monkeypatch, capsys):
         assert f"]({picture.name})" in text
     assert len(list(out.glob("*.png"))) == 5
     assert len((out / "filters.csv").read_text().splitlines()) == 8
+    with (out / "small_markers.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["dictionary"], row["edge_px"], row["views"]) for row in rows] == [
+        (name, f"{edge:g}", str(views)) for name, edge, views in small
+    ]
+    assert all(0 < int(row["kept"]) == int(row["found_by_opencv"]) for row in rows)
+    assert "kept of" in text
     assert main(["evaluate", "tracking", "--quick", "--out", str(out)]) == 1
     assert "exists already" in capsys.readouterr().err
 

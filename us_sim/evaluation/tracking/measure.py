@@ -17,6 +17,7 @@ from us_sim.evaluation.tracking.filters import filter_point, filter_trials
 from us_sim.evaluation.tracking.pictures import draw_views
 from us_sim.evaluation.tracking.points import Bench, Point
 from us_sim.evaluation.tracking.report import table, write_report
+from us_sim.evaluation.tracking.small_markers import small_marker_point, small_marker_trials
 
 __all__ = ["evaluate_tracking"]
 
@@ -26,7 +27,7 @@ _MORE = 3  # times as many sequences of the cases that the targets are about
 
 
 def evaluate_tracking(out: Path, quick: bool) -> int:
-    """Write tracking.csv, filters.csv, the pictures and tracking.md, as `us_sim.evaluation` says.
+    """Write the CSV files, the pictures and tracking.md, as `us_sim.evaluation` says.
 
     A quick run has fewer distances, angles and views.
     """
@@ -34,12 +35,15 @@ def evaluate_tracking(out: Path, quick: bool) -> int:
     bench = Bench()
     bench.warm_up()
     points = [_point(bench, case, quick) for case in steps("views", cases(quick), "cases")]
+    trials = list(small_marker_trials(quick))
+    small = [small_marker_point(*trial) for trial in steps("small markers", trials, "sizes")]
     filters = [filter_point(*trial) for trial in steps("filters", filter_trials(quick), "settings")]
     folder.write_rows("tracking", points)
+    folder.write_rows("small_markers", small)
     folder.write_rows("filters", filters)
     draw_views(folder.picture("views"))
-    write_report(folder, points, filters)
-    return folder.finish(table(points), failures(points))
+    write_report(folder, points, small, filters)
+    return folder.finish(table(points, small), failures(points))
 
 
 def _point(bench: Bench, case: Case, quick: bool) -> Point:

@@ -19,44 +19,51 @@ from us_sim.evaluation.tracking.plots import (
     plot_views,
 )
 from us_sim.evaluation.tracking.points import Point, View, those, views_of
-from us_sim.evaluation.tracking.targets import targets
+from us_sim.evaluation.tracking.small_markers import SmallMarkerPoint
+from us_sim.evaluation.tracking.targets import small_marker_targets, targets
 
 __all__ = ["table", "write_report"]
 
 _OF_VIEWS = ("views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
 
 
-def table(points: Sequence[Point]) -> str:
+def table(points: Sequence[Point], small: Sequence[SmallMarkerPoint]) -> str:
     """What the command prints: every measure that is asked for, and what was seen."""
-    return target_table(targets(points))
+    return target_table([*targets(points), *small_marker_targets(small)])
 
 
 def write_report(
-    folder: ReportFolder, points: Sequence[Point], filters: Sequence[FilterPoint]
+    folder: ReportFolder,
+    points: Sequence[Point],
+    small: Sequence[SmallMarkerPoint],
+    filters: Sequence[FilterPoint],
 ) -> None:
     """Draw the plots and write tracking.md."""
     plot_views(points, folder.picture("error"))
     plot_run_time(points, folder.picture("run_time"))
     plot_conditions(points, folder.picture("conditions"))
     plot_filters(filters, folder.picture("filters"))
-    folder.write_report(_parts(folder, points, filters), failures(points))
+    folder.write_report(_parts(folder, points, small, filters), failures(points))
 
 
 def _parts(
-    folder: ReportFolder, points: Sequence[Point], filters: Sequence[FilterPoint]
+    folder: ReportFolder,
+    points: Sequence[Point],
+    small: Sequence[SmallMarkerPoint],
+    filters: Sequence[FilterPoint],
 ) -> list[str]:
     count = sum(len(point.views) for point in points)
     libraries = ("numpy", "numba", "opencv-python-headless", "opencv-python")
     return [
         "# Tracking: error against run time",
-        folder.opening(*libraries, tables=("tracking", "filters")),
+        folder.opening(*libraries, tables=("tracking", "small_markers", "filters")),
         f"{count:,} images of bodies of markers are rendered as cameras see them: every pixel that "
         "an edge crosses is the mean of 64 rays through a distorting lens; then come the lens's "
         "blur, a lamp beside the camera, and the sensor's noise and grey levels, before a room "
         "with things in it that have edges. What is compared is the known pose with what "
         "`probe_tracker`'s camera source measures.",
         "## What is asked",
-        table(points),
+        table(points, small),
         "Times are processor time of one thread, OpenCV's included. Other programs on the machine "
         "lengthen the wall clock (`ms_median` in the CSV), and processor time a little.",
         "## Bodies and conditions",
@@ -78,6 +85,13 @@ def _parts(
         "![Conditions](tracking_conditions.png)",
         _conditions(points),
         "A single marker that a hand touches is not found, and says so; a body of several is.",
+        "## Small markers",
+        _small(small),
+        "One marker before the same room, tilted by up to 60°, under blur of 0.5 to 1.2 pixels "
+        "and noise of 1 to 4 grey levels; sizes are those of an edge that faces the camera. The "
+        "error is that of a marker's worst corner. What OpenCV finds and the whole pattern "
+        "explains is kept; where an edge of up to 48 pixels tells nothing by itself, corners come "
+        "from the pattern.",
         "## What the covariance says",
         _covariance(points),
         "Within is the fraction of errors inside the ellipsoid that the reported covariance says "
@@ -148,6 +162,25 @@ def _conditions(points: Sequence[Point]) -> str:
         for condition in CONDITIONS
     ]
     return markdown_table(("body", "condition", *_OF_VIEWS), rows)
+
+
+def _small(points: Sequence[SmallMarkerPoint]) -> str:
+    head = ("dictionary", "edge, px", "views", "found by OpenCV", "kept", "corner, px", "95 %")
+    rows = [
+        (
+            p.dictionary,
+            f"{p.edge_px:g}",
+            f"{p.views}",
+            f"{p.found_by_opencv}",
+            f"{p.kept}",
+            f"{p.median_px:.2f}",
+            f"{p.p95_px:.2f}",
+            f"{p.worst_px:.2f}",
+            f"{p.opencv_p95_px:.2f}",
+        )
+        for p in points
+    ]
+    return markdown_table((*head, "largest", "95 % of OpenCV's own"), rows)
 
 
 def _covariance(points: Sequence[Point]) -> str:

@@ -9,8 +9,9 @@ import numpy as np
 from us_sim.evaluation.target import Target
 from us_sim.evaluation.tracking.cases import LARGE, RIGID_BODY, SINGLE, SMALL
 from us_sim.evaluation.tracking.points import Point, View, views_of
+from us_sim.evaluation.tracking.small_markers import SmallMarkerPoint
 
-__all__ = ["targets"]
+__all__ = ["small_marker_targets", "targets"]
 
 _BODY = {"marker": RIGID_BODY, "condition": "plain", "distance": 0.4}
 
@@ -49,6 +50,13 @@ def targets(points: Sequence[Point]) -> list[Target]:
             100 * sum(view.flipped for view in found) / len(found) if found else np.nan,
         ),
     ]
+
+
+def small_marker_targets(points: Sequence[SmallMarkerPoint]) -> list[Target]:
+    """That no small marker is lost that OpenCV finds."""
+    found, kept = (sum(getattr(p, name) for p in points) for name in ("found_by_opencv", "kept"))
+    said = f"markers of 14 to 44 pixels: kept of {found} that OpenCV finds"
+    return [Target(said, "all", f"{kept}", kept == found if found else None)]
 
 
 def _ms(points: Sequence[Point], image_size: str) -> float:

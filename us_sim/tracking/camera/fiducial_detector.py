@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from us_sim.tracking.camera.chessboard_corners import refined_crossing
 from us_sim.tracking.camera.marker_edges import refined_corners
+from us_sim.tracking.camera.marker_pattern import fitted_corners, pattern
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody
 
@@ -30,6 +31,7 @@ __all__ = ["Detection", "FiducialDetector", "detect_corners"]
 
 _SPREAD = 0.25  # of the longer extent of points: the shorter one, at least
 _SMALLEST = 0.03  # of the image's larger side: the length of a marker's outline
+_SMALL = 48.0  # pixels, of the longest edge up to which all of a marker's pattern is fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ class Detection:
     chessboard_ids: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     chessboard_corners: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
     doubled: tuple[int, ...] = ()  # markers of which the image has more than one: not used
-    unclear: tuple[int, ...] = ()  # markers of which an edge is covered, cut or blurred: not used
+    unclear: tuple[int, ...] = ()  # markers of which a part is covered, cut or blurred: not used
 
     def correspondences(
         self, body: RigidBody
@@ -92,7 +94,6 @@ class FiducialDetector:
         self.body = body
         self._parameters = cv2.aruco.DetectorParameters()
         self._detector = cv2.aruco.ArucoDetector(dictionary(body.dictionary), self._parameters)
-        self._cells = dictionary(body.dictionary).markerSize + 2
         self._chessboard_detector = None
         if body.chessboard is not None:
             beside = cv2.aruco.CharucoParameters()
@@ -139,7 +140,10 @@ class FiducialDetector:
         order = np.argsort(numbers)
         numbers, places = numbers[order], places[order]
         crossings = self._crossings(image, numbers, places)
-        refined = [_refine(image, each, self._cells) for each in places]
+        refined = [
+            _refine(image, each, pattern(self.body.dictionary, number))
+            for each, number in zip(places, numbers.tolist(), strict=True)
+        ]
         sure = [i for i, each in enumerate(refined) if each is not None]
         kept = np.array([refined[i] for i in sure], dtype=np.float64).reshape(-1, 4, 2)
         unclear = tuple(np.delete(numbers, sure).tolist())
@@ -202,11 +206,17 @@ class FiducialDetector:
 
 
 def _refine(
-    image: NDArray[np.uint8], corners: NDArray[np.float32], cells: int
+    image: NDArray[np.uint8], corners: NDArray[np.float32], cells: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
-    """Corners (4, 2) of one marker where its edges really meet; None where those are not seen."""
-    edge = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
-    half = int(np.clip(edge / 20, 1, 5))
+    """Corners (4, 2) of one marker where its edges really meet; None where those are not seen.
+
+    Where a small marker's edges tell nothing, its whole pattern does.
+    """
+    edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    half = int(np.clip(edges.min() / 20, 1, 5))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
     near = cv2.cornerSubPix(image, corners.copy(), (half, half), (-1, -1), stop)
-    return refined_corners(image, np.array(near, dtype=np.float64), cells)
+    refined = refined_corners(image, np.array(near, dtype=np.float64), len(cells) - 2)
+    if refined is None and edges.max() <= _SMALL:
+        refined = fitted_corners(image, np.array(corners, dtype=np.float64), cells)
+    return refined

@@ -1,0 +1,102 @@
+"""Small markers: none that OpenCV finds is lost, and what is no such marker is refused."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.evaluation.tracking.small_markers import small_marker_point
+from us_sim.tracking.camera.marker_edges import refined_corners
+from us_sim.tracking.camera.marker_pattern import fitted_corners, pattern
+
+CORNERS = np.array([[22.3, 20.6], [47.1, 23.2], [44.9, 46.0], [19.8, 43.7]])
+CELLS = pattern("APRILTAG_36h11", 5)
+
+
+def view(corners=CORNERS, cells=CELLS, *, blur=0.7, noise=2.0, shape=(64, 70)):
+    """The marker at its corners on white, drawn with 36 rays a pixel."""
+    count = len(cells)
+    square = np.array([[1, 1], [count - 1, 1], [count - 1, count - 1], [1, count - 1]], np.float32)
+    back = cv2.getPerspectiveTransform(corners.astype(np.float32), square)
+    offsets = (np.arange(6) - 2.5) / 6
+    rows = (np.arange(shape[0])[:, None] + offsets).ravel()
+    columns = (np.arange(shape[1])[:, None] + offsets).ravel()
+    x, y = np.meshgrid(columns, rows)
+    places = np.stack([x, y, np.ones_like(x)], axis=-1) @ back.T
+    u, v = (np.floor(places[..., k] / places[..., 2]).astype(int) for k in range(2))
+    inside = (u >= 0) & (v >= 0) & (u < count) & (v < count)
+    white = np.where(inside, cells[v.clip(0, count - 1), u.clip(0, count - 1)], 1)
+    fine = white.reshape(shape[0], 6, shape[1], 6).mean(axis=(1, 3))
+    light = 30.0 + 180.0 * cv2.GaussianBlur(fine, (0, 0), blur)
+    light += noise * np.random.default_rng(1).standard_normal(shape)
+    return np.clip(light.round(), 0, 255).astype(np.uint8)
+
+
+def error(found, true=CORNERS):
+    return float(np.linalg.norm(found - true, axis=1).max())
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.floats(0.5, 1.4),
+    st.floats(0.0, 5.0),
+    st.lists(st.floats(-1.2, 1.2), min_size=8, max_size=8),
+)
+def test_corners_are_found_from_two_pixels_away(blur, noise, rough):
+    start = CORNERS + np.reshape(rough, (4, 2))
+    assert error(fitted_corners(view(blur=blur, noise=noise), start, CELLS)) < 0.25
+
+
+def test_a_slope_of_the_light_moves_no_corner():
+    lit = view() * np.linspace(0.4, 1.0, 70)
+    assert error(fitted_corners(lit.astype(np.uint8), CORNERS + 0.7, CELLS)) < 0.15
+
+
+@pytest.mark.parametrize(("name", "edge"), [("APRILTAG_36h11", 18.0), ("APRILTAG_36h11", 26.0)])
+def test_no_small_marker_that_opencv_finds_is_lost(name, edge):
+    point = small_marker_point(name, edge, 30)
+    assert point.found_by_opencv >= 8
+    assert point.kept == point.found_by_opencv
+    assert point.worst_px < 0.7
+    assert point.p95_px < 0.5 * point.opencv_p95_px
+
+
+def test_edges_of_two_pixels_a_cell_tell_less_than_the_pattern():
+    small = CORNERS[0] + 0.58 * (CORNERS - CORNERS[0])
+    seen = view(small, blur=0.9)
+    edges = refined_corners(seen, small, len(CELLS) - 2)
+    assert edges is None or error(edges, small) > 0.4
+    assert error(fitted_corners(seen, small + 0.8, CELLS), small) < 0.2
+
+
+@pytest.mark.parametrize("covered", [0.15, 0.25, 0.4, 0.6])
+@pytest.mark.parametrize("grey", [30, 120, 220])
+def test_under_a_hand_corners_are_right_or_refused(covered, grey):
+    seen = view()
+    seen[:, int(47 - 27 * covered) :] = grey
+    found = fitted_corners(seen, CORNERS + 0.4, CELLS)
+    assert found is None or error(found) < 1.0
+    if covered >= 0.4:
+        assert found is None
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        view(cells=pattern("APRILTAG_36h11", 6)),
+        view(cells=np.rot90(CELLS)),
+        view(cells=1 - CELLS),
+        np.full((64, 70), 128, np.uint8),
+        np.random.default_rng(0).integers(0, 255, (64, 70), np.uint8),
+    ],
+    ids=["another number", "turned", "inverted", "nothing", "noise"],
+)
+def test_what_is_no_such_marker_is_refused(seen):
+    assert fitted_corners(seen, CORNERS, CELLS) is None
+
+
+@pytest.mark.parametrize("rows", [8, 30, 41])
+def test_a_marker_that_the_image_cuts_is_refused(rows):
+    assert fitted_corners(view()[-rows:], CORNERS - [0, 64 - rows], CELLS) is None
+    assert fitted_corners(view()[:, :2], CORNERS, CELLS) is None
