@@ -1,9 +1,9 @@
 """How many small markers are kept of those that OpenCV finds, and how exact their corners are.
 
 >>> from us_sim.evaluation.tracking.small_markers import small_marker_point
->>> point = small_marker_point("APRILTAG_36h11", 20.0, 3)
->>> point.views, point.found_by_opencv == point.kept, point.median_px < 0.2
-(3, True, True)
+>>> point = small_marker_point("APRILTAG_36h11", 32.0, 4)
+>>> point.views, point.kept == point.found_by_opencv > 0, point.median_px < 0.2
+(4, True, True)
 """
 
 from __future__ import annotations
