@@ -65,6 +65,7 @@ def _parser() -> ChosenParser:
     from us_sim.command.evaluate import add_evaluate
     from us_sim.command.play import add_play
     from us_sim.command.print_marker import add_print_marker
+    from us_sim.command.reconstruct import add_reconstruct
     from us_sim.command.reference import add_reference
     from us_sim.command.render import add_render
     from us_sim.command.run import add_run
@@ -76,7 +77,14 @@ def _parser() -> ChosenParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (add_demo, add_run, add_render, add_play, add_bag):
         add(commands)
-    for add in (add_calibrate, add_print_marker, add_evaluate, add_reference, add_compile):
+    for add in (
+        add_calibrate,
+        add_reconstruct,
+        add_print_marker,
+        add_evaluate,
+        add_reference,
+        add_compile,
+    ):
         add(commands)
     return parser
 

@@ -262,7 +262,7 @@ def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
 
 
 def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored_voxels, "_free_memory", lambda: 200.0)
+    monkeypatch.setattr(stored_voxels, "free_memory", lambda: 200.0)
     with pytest.raises(VolumeError, match=r"take 0\.0 GB of memory where 0\.0 GB are free"):
         read_volume(_metaimage(tmp_path / "a.mha"))
 

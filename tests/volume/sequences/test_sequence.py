@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import VolumeError
+from us_sim.volume.sequences.frame_transforms import in_metres
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of
 from us_sim.volume.sequences.transform_name import split_transform_name
@@ -133,7 +134,7 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
     sequence = read_sequence(path)
     calibration = np.diag([0.08, 0.08, 0.08, 1.0])
     calibration[:3, 3] = (15.4, 49.6, -8.6)  # mm
-    sweep = sweep_of(sequence, calibration={"ImageToProbe": calibration})
+    sweep = sweep_of(sequence, calibration={"ImageToProbe": in_metres("ImageToProbe", calibration)})
     assert [name for name, _ in sweep.chain.steps] == [
         "ImageToProbe",
         "ProbeToTracker",

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from us_sim.errors import VolumeError
 
-__all__ = ["LARGEST_VOLUME", "StoredVoxels", "check_claim"]
+__all__ = ["LARGEST_VOLUME", "StoredVoxels", "check_claim", "free_memory"]
 
 LARGEST_VOLUME = 1 << 29
 """Numbers in the largest image that is read: 1024 × 1024 × 512."""
@@ -112,7 +112,7 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
             f"the part that is needed, or resample it"
         )
     # The library's copy, and that in grey values.
-    needed, free = numbers * (value + 1), _free_memory()
+    needed, free = numbers * (value + 1), free_memory()
     if needed > free:
         raise VolumeError(
             f"{path}: says it holds {shown} numbers, which take {needed / 1e9:.1f} GB of memory "
@@ -120,7 +120,7 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
         )
 
 
-def _free_memory() -> float:
+def free_memory() -> float:
     """Bytes of memory that programs may still take, as Linux estimates it; elsewhere no limit."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sequences.frame_transforms import FrameTransforms, along, in_metres
+from us_sim.volume.sequences.frame_transforms import FrameTransforms, along
 from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
 from us_sim.volume.sequences.transform_chain import TransformChain, shortest_chain
 
@@ -104,8 +104,8 @@ def sweep_of(
         sequence: with images.
         image: the frame of the images' pixels.
         reference: the frame in which they are placed.
-        calibration: transforms (4, 4), mm, that hold for every frame, by name; they go before
-            those of the sequence that have the same name.
+        calibration: transforms (4, 4), m (pixels of images), that hold for every frame, by name;
+            they go before those of the sequence that have the same name.
 
     Raises:
         VolumeError: the images cannot be read, no chain leads from one frame to the other, or no
@@ -115,8 +115,7 @@ def sweep_of(
     count = len(sequence)
     known = dict(sequence.transforms)
     for name, matrix in (calibration or {}).items():
-        fixed = np.broadcast_to(in_metres(name, matrix), (count, 4, 4))
-        known[name] = FrameTransforms(fixed, ("",) * count)
+        known[name] = FrameTransforms(np.broadcast_to(matrix, (count, 4, 4)), ("",) * count)
     chain = shortest_chain(known, image, reference)
     if chain is None:
         recorded = ", ".join(sorted(known)) or "none"

@@ -1,0 +1,92 @@
+"""`us-sim reconstruct`: what it writes and says, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from sweep_file import write_sweep
+
+from us_sim.command.main import main
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.files.readers import read_volume
+
+PIXEL = 1e-3
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    rng = np.random.Generator(np.random.PCG64(3))
+    block = rng.integers(40, 200, (12, 10, 14), dtype=np.uint8)  # frames, rows, columns
+    matrices = np.tile(np.diag([PIXEL, PIXEL, PIXEL, 1.0]), (12, 1, 1))
+    matrices[:, 2, 3] = PIXEL * np.arange(12)
+    matrices[:, 0, 3] = 0.02
+    more = {"Seq_Frame0003_ImageStatus": "INVALID"}
+    return write_sweep(tmp_path / "doe_jane.igs.mha", block, matrices, **more), block
+
+
+def test_a_sweep_becomes_a_volume_and_a_picture(sweep, tmp_path, capsys):
+    path, block = sweep
+    out = tmp_path / "volume.nrrd"
+    assert main(["reconstruct", str(path), "--out", str(out), "--spacing", "1 mm"]) == 0
+    said = capsys.readouterr().out
+    volume = read_volume(out)
+    assert volume.shape == (14, 10, 12)
+    np.testing.assert_array_equal(volume.intensities[:, :, 5], block[5].T)
+    between = (block[2].astype(int) + block[4] + 1) // 2  # the hole that frame 3 leaves
+    np.testing.assert_array_equal(volume.intensities[:, :, 3], between.T)
+    np.testing.assert_allclose(volume.index_to_patient[:3, 3], [0.02, 0, 0], atol=1e-9)
+    assert "14 × 10 × 12 voxels of 1 mm (100 % covered, 140 of them filled holes)" in said
+    assert "from 11 frames" in said
+    assert "left out are 1 with ImageStatus is not OK" in said
+    with Image.open(out.with_suffix(".png")) as picture:
+        assert picture.width > 800
+
+
+def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, tmp_path):
+    path, _ = sweep
+    out = tmp_path / "arm"
+    options = ["--spacing", "1 mm", "--leave-one-out", "1", "--clip", "0", "0", "9", "9"]
+    assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
+    case = read_case(out)
+    assert case.volume().shape == (10, 10, 12)
+    (step,) = case.steps
+    assert step.what == "reconstructed"
+    assert (step.counts["frames"], step.counts["frames left out"]) == (11, 1)
+    assert -1.0 <= step.counts["correlation worst"] <= step.counts["correlation median"] <= 1.0
+    written = json.dumps([str(step.settings), str(step.counts)])
+    written += "".join(file.read_text("latin-1") for file in out.glob("*.yaml"))
+    assert "doe" not in written
+    assert str(tmp_path) not in written
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--reference", "Table"], "from Image to Table; the known ones are ImageToReference"),
+        (["--spacing", "0.5"], "did you mean '0.5 cm'"),
+        (["--spacing", "0.01 mm"], "give --spacing"),
+        (["--compounding", "sum"], "'sum' is not one of mean, median"),
+        (["--fan-origin", "3", "4"], "--fan-radius: is missing"),
+        (["--time-offset", "9 s"], "no image has a pose 9000 ms after its time"),
+        (["--calibration", "nowhere.xml"], "nowhere.xml: cannot be read"),
+        (["--undo-pressure", "liver_sweep"], "volume.file: is missing"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence_and_leaves_nothing(
+    sweep, tmp_path, capsys, options, message
+):
+    path, _ = sweep
+    before = sorted(tmp_path.iterdir())
+    out = tmp_path / "made"
+    assert main(["reconstruct", str(path), "--out", str(out), *options]) == 1
+    (said,) = capsys.readouterr().err.strip().splitlines()
+    assert message in said
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_nothing_is_written_over(sweep, tmp_path, capsys):
+    path, _ = sweep
+    (tmp_path / "volume.png").write_text("mine")
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "volume.nrrd")]) == 1
+    assert "volume.png: exists already" in capsys.readouterr().err

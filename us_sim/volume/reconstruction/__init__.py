@@ -1,0 +1,1 @@
+"""Freehand reconstruction: volumes from images of a moving probe."""

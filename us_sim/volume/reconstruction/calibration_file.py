@@ -1,0 +1,153 @@
+"""Where the image lies on the probe, from a file: Plus' configuration, or `us-sim calibrate probe`.
+
+Plus' XML may hold several transforms (``<Transform From="Image" To="Probe" Matrix=.../>``, mm),
+and which part of an image is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
+
+>>> import pathlib, tempfile
+>>> from us_sim.volume.reconstruction.calibration_file import read_calibration
+>>> text = '''<PlusConfiguration><CoordinateDefinitions>
+... <Transform From="Image" To="Probe" Matrix="0.1 0 0 5  0 0.1 0 0  0 0 0.1 0  0 0 0 1"/>
+... </CoordinateDefinitions>
+... <VolumeReconstruction ClipRectangleOrigin="10 20" ClipRectangleSize="300 200"/>
+... </PlusConfiguration>'''
+>>> with tempfile.TemporaryDirectory() as folder:
+...     path = pathlib.Path(folder, "plus.xml")
+...     _ = path.write_text(text)
+...     calibration = read_calibration(path, "Probe")
+>>> calibration.transforms["ImageToProbe"][0].tolist(), calibration.part.clip
+([0.0001, 0.0, 0.0, 0.005], (10.0, 20.0, 300.0, 200.0))
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import UsSimError, VolumeError
+from us_sim.settings.text_file import read_bytes
+from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.volume.reconstruction.settings import ImagePart
+from us_sim.volume.sequences.frame_transforms import in_metres
+from us_sim.volume.sequences.sequence_header import frame_matrix
+
+__all__ = ["SweepCalibration", "read_calibration"]
+
+_PART = {
+    "ClipRectangleOrigin": 2,
+    "ClipRectangleSize": 2,
+    "FanOriginPixel": 2,
+    "FanAnglesDeg": 2,
+    "FanRadiusStartPixel": 1,
+    "FanRadiusStopPixel": 1,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SweepCalibration:
+    """What a calibration file says of a sweep."""
+
+    transforms: Mapping[str, NDArray[np.float64]]  # (4, 4) m (pixels of images), by name
+    part: ImagePart  # of an image that is tissue
+
+
+def read_calibration(path: Path, probe: str) -> SweepCalibration:
+    """The fixed transforms of a sweep.
+
+    Args:
+        path: a configuration of Plus (.xml), or what `us-sim calibrate probe` wrote (.yaml).
+        probe: the frame of the tracked body that the image lies on, for the latter, which does
+            not say its name.
+
+    Raises:
+        VolumeError: the file cannot be read, or holds no calibration.
+    """
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if path.suffix.lower() == ".xml":
+        return _plus(path, data)
+    return SweepCalibration({f"ImageTo{probe}": _image_to_body(path, data)}, ImagePart())
+
+
+def _plus(path: Path, data: bytes) -> SweepCalibration:
+    # Entities that expand without end are a known attack; no configuration needs any.
+    if b"<!ENTITY" in data:
+        raise VolumeError(f"{path}: defines entities, which is not allowed; remove them")
+    try:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise VolumeError(f"{path}: is not XML: {error}") from error
+    transforms = {}
+    for element in root.iter("Transform"):
+        start, end = element.get("From", ""), element.get("To", "")
+        if not start or not end or element.get("Matrix") is None:
+            continue
+        name = f"{start[0].upper()}{start[1:]}To{end[0].upper()}{end[1:]}"
+        try:
+            matrix = frame_matrix({name: element.get("Matrix", "")}, name)
+        except ValueError as reason:
+            raise VolumeError(f"{path}: the transform {name} is {reason}; correct it") from reason
+        transforms[name] = in_metres(name, matrix)
+    if not transforms:
+        raise VolumeError(
+            f"{path}: holds no <Transform From=... To=... Matrix=...>; give a configuration of "
+            f"Plus with the image's calibration"
+        )
+    try:
+        return SweepCalibration(transforms, _part(path, root.find(".//VolumeReconstruction")))
+    except UsSimError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise VolumeError(f"{path}: VolumeReconstruction: {error}") from error
+
+
+def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
+    said: dict[str, list[float]] = {}
+    for key, count in _PART.items():
+        text = None if element is None else element.get(key)
+        if text is None:
+            continue
+        try:
+            said[key] = [float(word) for word in text.split()]
+        except ValueError:
+            said[key] = []
+        if len(said[key]) != count:
+            raise VolumeError(
+                f"{path}: VolumeReconstruction: {key} is {text[:60]!r} where {count} number"
+                f"{'s belong' if count > 1 else ' belongs'}; correct it"
+            )
+    given = {}
+    size = said.get("ClipRectangleSize", [0.0])
+    if min(size) > 0.0 and "ClipRectangleOrigin" in said:
+        given["clip"] = [*said["ClipRectangleOrigin"], *size]
+    angles = said.get("FanAnglesDeg", [0.0])
+    if any(angles):  # Plus, too, takes two angles of 0 for no fan
+        given["fan_angles"] = [f"{angle!r} deg" for angle in sorted(angles)]  # type: ignore[misc]
+        given["fan_origin"] = said.get("FanOriginPixel", [0.0, 0.0])
+        start, stop = said.get("FanRadiusStartPixel", [0.0]), said.get("FanRadiusStopPixel", [1e5])
+        given["fan_radius"] = [*start, *stop]
+    return ImagePart(**given)  # type: ignore[arg-type]
+
+
+def _image_to_body(path: Path, data: bytes) -> NDArray[np.float64]:
+    """(4, 4) m, from (column, row, 0, 1)."""
+    try:
+        document = load_yaml(data.decode("utf-8"))
+    except (UnicodeDecodeError, YamlError) as error:
+        raise VolumeError(f"{path}: is neither XML nor YAML that can be read: {error}") from error
+    rows = document.get("image_to_body") if isinstance(document, dict) else None
+    try:
+        text = " ".join(str(float(number)) for row in rows or () for number in row)
+        matrix = frame_matrix({"image_to_body": text}, "image_to_body")
+    except (TypeError, ValueError) as error:
+        raise VolumeError(
+            f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
+            f"body, as `us-sim calibrate probe` writes it"
+        ) from error
+    return matrix

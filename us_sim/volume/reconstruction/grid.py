@@ -1,0 +1,159 @@
+"""The grid of voxels that a sweep's images are inserted into.
+
+>>> import numpy as np
+>>> from us_sim.volume.reconstruction.grid import grid_around
+>>> corners = np.array([[0.0, 0.0, 0.0], [0.010, 0.004, 0.0], [0.0, 0.0, 0.006]])  # m
+>>> grid = grid_around(corners, 0.001)
+>>> grid.shape, grid.index_to_reference[0].tolist()
+((11, 5, 7), [0.001, 0.0, 0.0, 0.0])
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.stored_voxels import LARGEST_VOLUME, free_memory
+
+__all__ = ["Grid", "axes_of_smallest_box", "check_memory", "grid_around", "proposed_spacing"]
+
+_PROPOSED = 1 << 27  # voxels, where nobody asks for more
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cubic voxels in rows; the centre of voxel (i, j, k) lies at that whole index."""
+
+    index_to_reference: NDArray[np.float64]  # (4, 4), m
+    shape: tuple[int, int, int]
+
+    @property
+    def voxels(self) -> int:
+        """How many there are."""
+        return math.prod(self.shape)
+
+    @property
+    def spacing(self) -> float:
+        """m, from a voxel to the next."""
+        return float(np.linalg.norm(self.index_to_reference[:3, 0]))
+
+    @property
+    def reference_to_index(self) -> NDArray[np.float64]:
+        """(4, 4) from m to indices."""
+        return np.asarray(np.linalg.inv(self.index_to_reference), dtype=np.float64)
+
+
+def grid_around(
+    points: NDArray[np.float64], spacing: float, axes: NDArray[np.float64] | None = None
+) -> Grid:
+    """The grid whose first and last voxels hold the outermost points.
+
+    Args:
+        points: (N, 3) m.
+        spacing: m, of the voxels.
+        axes: (3, 3) orthonormal, the grid's axes as columns; those of the points' frame without it.
+
+    Raises:
+        VolumeError: it would have more voxels than are read from a file, or just one layer of them.
+    """
+    axes = np.eye(3) if axes is None else axes
+    along = points @ axes
+    low, high = along.min(axis=0), along.max(axis=0)
+    # As Plus counts them, so that its grids come out: the last voxel may end before the last point.
+    counts = np.floor((high - low) / spacing + 0.5) + 1.0
+    if math.prod(counts) > LARGEST_VOLUME:
+        asked, size = 1e3 * spacing, 1e3 * (high - low)
+        possible = 1e3 * (math.prod(high - low) / LARGEST_VOLUME) ** (1 / 3)
+        raise VolumeError(
+            f"voxels of {asked:g} mm in the {' × '.join(f'{s:.0f}' for s in size)} mm that the "
+            f"sweep covers are {math.prod(counts):.3g}, where {LARGEST_VOLUME} are possible: give "
+            f"--spacing '{1.05 * possible:.2g} mm' or more"
+        )
+    if min(counts) < 2:
+        raise VolumeError(
+            f"voxels of {1e3 * spacing:g} mm are larger than the "
+            f"{1e3 * (high - low).min():.3g} mm that the sweep covers along an axis: give a "
+            f"smaller --spacing, or a sweep that moves"
+        )
+    matrix = np.eye(4)
+    matrix[:3, :3] = axes * spacing
+    matrix[:3, 3] = axes @ low
+    i, j, k = (int(count) for count in counts)
+    return Grid(matrix, (i, j, k))
+
+
+def proposed_spacing(
+    points: NDArray[np.float64], pixel: float, axes: NDArray[np.float64] | None = None
+) -> float:
+    """m: a pixel's size, or as much more as 134 million voxels around the points need."""
+    along = points if axes is None else points @ axes
+    size = np.maximum(np.ptp(along, axis=0), pixel)
+    needed = (math.prod(size) / _PROPOSED) ** (1 / 3)
+    return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5
+
+
+def axes_of_smallest_box(
+    points: NDArray[np.float64], image_to_reference: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(3, 3) axes, as columns, along which the box around the points is smallest.
+
+    Tried are the points' own frame, the images' mean orientation and the points' principal axes;
+    the axes are named so that each is nearest to that of the frame.
+
+    Args:
+        points: (N, 3) m.
+        image_to_reference: (K, 4, 4) m, of the images.
+    """
+    boxes = [np.eye(3), _mean_rotation(image_to_reference), _principal_axes(points)]
+    sizes = [float(np.prod(np.maximum(np.ptp(points @ box, axis=0), 1e-6))) for box in boxes]
+    return _like_the_frames(boxes[int(np.argmin(sizes))])
+
+
+def check_memory(needed: float, what: str) -> None:
+    """Refuse what takes more than the free memory.
+
+    Raises:
+        VolumeError: it does.
+    """
+    free = free_memory()
+    if needed > free:
+        raise VolumeError(
+            f"{what} takes {needed / 1e9:.2f} GB of memory where {free / 1e9:.2f} GB are free: "
+            f"give a larger --spacing, or end other programs"
+        )
+
+
+def _mean_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation nearest to the mean of the images' axes."""
+    steps = matrices[:, :3, :2] / np.linalg.norm(matrices[:, :3, :2], axis=1, keepdims=True)
+    across, down = steps.mean(axis=0).T
+    axes = np.column_stack([across, down, np.cross(across, down)])
+    left, _, right = np.linalg.svd(axes)
+    return np.asarray(left @ right, dtype=np.float64)
+
+
+def _principal_axes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    return np.asarray(axes.T, dtype=np.float64)
+
+
+def _like_the_frames(axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same axes in the order and directions that turn the frame's least, right-handed."""
+    turned = max(_orders(axes), key=lambda ordered: float(np.trace(ordered)))
+    return np.ascontiguousarray(turned)
+
+
+def _orders(axes: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    orders: Iterable[tuple[int, int, int]] = (
+        (0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)
+    )  # fmt: skip
+    for order in orders:
+        for signs in np.ndindex(2, 2, 2):
+            ordered = axes[:, order] * (1.0 - 2.0 * np.array(signs))
+            if np.linalg.det(ordered) > 0:
+                yield ordered

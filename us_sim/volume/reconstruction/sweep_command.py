@@ -1,0 +1,215 @@
+"""`us-sim reconstruct`: a sweep's file in, a volume or a case out, and how well it predicts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from us_sim.errors import VolumeError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.volume.cases.provenance import Source, Step, add_step, settings_said
+from us_sim.volume.cases.settings import CaseSettings
+from us_sim.volume.cases.writing import new_case, write_case_settings
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
+from us_sim.volume.reconstruction.leave_one_out import Prediction, leave_one_out
+from us_sim.volume.reconstruction.picture import draw_slices
+from us_sim.volume.reconstruction.reconstruction import (
+    Plan,
+    Progress,
+    Reconstruction,
+    Rest,
+    plan,
+    reconstruct,
+)
+from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sweep import Sweep, sweep_of
+from us_sim.volume.sequences.time_shift import shifted
+
+__all__ = ["SweepSettings", "reconstruct_sweep"]
+
+_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
+_FRAME = "frame"
+
+
+@dataclass(frozen=True)
+class SweepSettings(Settings):
+    """Which sweep, where it goes, and how its images are placed."""
+
+    error = VolumeError
+
+    sweep: Path = setting(description="tracked images: .igs.mha, .mha, .igs.nrrd or .seq.nrrd")
+    out: Path = setting(
+        description="file that ends in .nrrd, .mha, .nii or .nii.gz, or else folder of a new case",
+        kw_only=True,
+    )
+    calibration: Path | None = setting(
+        description="where the image lies on the probe: Plus' XML, or YAML of `us-sim calibrate "
+        "probe`",
+        default=None,
+    )
+    image: str = setting(description="name of the images' frame", default="Image")
+    probe: str = setting(description="name of the tracked body's frame", default="Probe")
+    reference: str = setting(description="name of the frame to reconstruct in", default="Reference")
+    time_offset: float = setting(
+        Quantity("time", -10.0, 10.0),
+        "to add to the images' times to find their poses",
+        default=0.0,
+    )
+    smallest_box: bool = setting(
+        description="turn the volume's axes so that it has few voxels", default=False
+    )
+    leave_one_out: int = setting(
+        Quantity("number", 0, 1000),
+        "predict so many frames from the others, and say how like they are",
+        default=0,
+    )
+
+    def check(self) -> None:
+        """Refuse a place that cannot be written to, which is worth knowing before the work."""
+        if self.out.exists():
+            raise self.refused("out", f"{self.out}: exists already; choose another name")
+        if not self.out.absolute().parent.is_dir():
+            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+        if self.is_volume and self.picture.exists():
+            raise self.refused("out", f"{self.picture}: exists already; choose another name")
+
+    @property
+    def is_volume(self) -> bool:
+        """Whether a volume's file is written, and not a case."""
+        return self.out.name.lower().endswith(_VOLUMES)
+
+    @property
+    def picture(self) -> Path:
+        """The picture beside the file."""
+        stem = next((end for end in _VOLUMES[::-1] if self.out.name.lower().endswith(end)), "")
+        return self.out.with_name(self.out.name[: len(self.out.name) - len(stem)] + ".png")
+
+
+def reconstruct_sweep(
+    settings: SweepSettings,
+    compounding: Compounding,
+    part: ImagePart,
+    *,
+    rest_of: Callable[[Sweep, ImagePart], Rest] | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Reconstruct a sweep and write what came of it; returns a sentence with the result.
+
+    Args:
+        settings: which sweep.
+        compounding: how.
+        part: of each image; where it says nothing, the calibration's.
+        rest_of: makes what undoes the tissue's deformation, of the placed sweep.
+        progress: is told how far it is.
+
+    Raises:
+        UsSimError: the files cannot be read, or nothing can be made of them.
+    """
+    calibration = SweepCalibration({}, ImagePart())
+    if settings.calibration is not None:
+        calibration = read_calibration(settings.calibration, settings.probe)
+    part = part if part != ImagePart() else calibration.part
+    sweep = sweep_of(
+        read_sequence(settings.sweep),
+        image=settings.image,
+        reference=settings.reference,
+        calibration=calibration.transforms,
+    )
+    if settings.time_offset:
+        sweep = shifted(sweep, settings.time_offset)
+    rest = None if rest_of is None else rest_of(sweep, part)
+    planned = plan(sweep, compounding, part, smallest_box=settings.smallest_box, rest=rest)
+    made = reconstruct(planned, progress=progress)
+    prediction = None
+    if settings.leave_one_out:
+        prediction = leave_one_out(planned, settings.leave_one_out, progress)
+    picture = _write(settings, planned, made, prediction)
+    return _said(settings, planned, made, prediction, picture)
+
+
+def _write(
+    settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
+) -> Path:
+    """Write the volume or case; the picture's path."""
+    title = f"{' × '.join(map(str, made.volume.shape))} voxels of {_spacing(planned)} mm"
+    if settings.is_volume:
+        write_volume(settings.out, made.volume)
+        draw_slices(settings.picture, made.volume, made.covered, title)
+        return settings.picture
+    with new_case(settings.out) as folder:
+        write_volume(folder / "volume.nrrd", made.volume)
+        write_case_settings(folder, CaseSettings(name=settings.out.name))
+        add_step(folder, _step(settings, planned, made, prediction))
+        draw_slices(folder / "volume.png", made.volume, made.covered, title)
+    return settings.out / "volume.png"
+
+
+def _step(
+    settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
+) -> Step:
+    """What was done, without names of files."""
+    sources = [Source.of(settings.sweep, "tracked sequence")]
+    if settings.calibration is not None:
+        sources.append(Source.of(settings.calibration, "probe calibration"))
+    said = settings_said(dataclasses.replace(planned.compounding, spacing=planned.grid.spacing))
+    counts: dict[str, int | float] = {
+        "frames": made.frames,
+        "frames left out": sum(planned.sweep.left_out.values()),
+        "voxels hit": made.hit,
+        "voxels filled": made.filled,
+    }
+    if prediction is not None:
+        counts["frames predicted"] = len(prediction.frames)
+        counts["correlation median"] = round(prediction.median, 4)
+        counts["correlation worst"] = round(prediction.worst, 4)
+    more = {
+        "method": planned.compounding.method,
+        "compounding": planned.compounding.compounding,
+        "hole_radius": planned.hole_radius,
+        "time_offset": settings.time_offset,
+        "pressure undone": planned.rest is not None,
+        "pixels used": int(planned.used.sum()),
+    }
+    return Step("reconstructed", {**said, **more}, counts, tuple(sources))
+
+
+def _said(
+    settings: SweepSettings,
+    planned: Plan,
+    made: Reconstruction,
+    prediction: Prediction | None,
+    picture: Path,
+) -> str:
+    share = 100.0 * made.covered.mean()
+    compounding = planned.compounding
+    sentences = [
+        f"{settings.out}: {' × '.join(map(str, made.volume.shape))} voxels of "
+        f"{_spacing(planned)} mm ({share:.0f} % covered, {made.filled} of them filled holes) from "
+        f"{made.frames} frames by {compounding.method} insertion and {compounding.compounding} "
+        f"compounding"
+    ]
+    left_out = planned.sweep.left_out
+    if left_out:
+        why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
+        sentences.append(f"left out are {why}")
+    if planned.sweep.sequence.are_colours:
+        sentences.append("its colour images were made grey")
+    if prediction is not None:
+        worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
+        sentences.append(
+            f"{len(prediction.frames)} frames predicted from the others correlate with what was "
+            f"seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at worst "
+            f"({_FRAME} {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
+        )
+    return "; ".join([*sentences, f"slices in {picture}"])
+
+
+def _spacing(planned: Plan) -> str:
+    return f"{1e3 * planned.grid.spacing:.4g}"
