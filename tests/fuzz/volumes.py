@@ -13,6 +13,7 @@ import SimpleITK as sitk
 from tests.fuzz.target import target
 from us_sim.recording.path import read_path
 from us_sim.volume.files.readers import read_volume
+from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.sequences.sweep import read_sweep
 
 VOXELS = np.arange(6 * 5 * 4, dtype=np.int16).reshape(6, 5, 4)
@@ -103,6 +104,21 @@ def sweep(path: Path) -> None:
 
 
 target("sweep-nrrd", ".igs.nrrd", nrrd_sequence_seeds)(sweep)
+
+
+CALIBRATION = """<PlusConfiguration version="2.1"><CoordinateDefinitions>
+<Transform From="Image" To="Probe" Error="1.6"
+  Matrix="-0.001 0.078 -0.008 15.3 -0.083 0.003 0.015 49.5 0.015 0.007 0.080 -8.6 0 0 0 1"/>
+</CoordinateDefinitions><VolumeReconstruction ClipRectangleOrigin="192 16"
+ ClipRectangleSize="420 580" FanAnglesDeg="-45 45" FanOriginPixel="380 20"
+ FanRadiusStartPixel="120" FanRadiusStopPixel="360"/></PlusConfiguration>"""
+
+
+@target("sweep-calibration", ".xml", lambda _: [CALIBRATION.encode()])
+def sweep_calibration(path: Path) -> None:
+    """Where the image lies on the probe, and which part of it is tissue."""
+    found = read_calibration(path, "Probe")
+    assert all(np.isfinite(matrix).all() for matrix in found.transforms.values())
 
 
 @target("tracker", ".igs.mha", sequence_seeds)
