@@ -62,6 +62,12 @@ def _run(args: argparse.Namespace) -> int:
         from us_sim.scene.readable_files import check_files
 
         checked = check_files(scene)
+        path = args.path or (Path(scene.path) if scene.path else None)
+        if path is not None and not scene.volume.phantom:
+            from us_sim.scene.building import volume_of
+            from us_sim.scene.image_in_volume import check_path_in_volume
+
+            check_path_in_volume(scene, path, volume_of(scene))
         print(dry_run(scene, parameters, record=asked.record, path=args.path))
         if checked:
             print(f"readable  {', '.join(checked)}")

@@ -20,6 +20,7 @@ from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.case_tissue import keep_tissue
+from us_sim.scene.image_in_volume import check_path_in_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -76,7 +77,7 @@ def run(
     """
     keep_on_this_host(network=network)
     plan = plan_of(scene, parameters, record=record, path=path, duration=duration)
-    prepare_volume(scene)
+    prepare_volume(scene, path)
     outcome = follow(plan, None, supervision)
     for file in outcome.files:
         print(f"recorded to {file}")
@@ -133,7 +134,7 @@ def demo(
     video = _prepared_video(scene, file) if source == "camera" else None
     played = file if video is None else None
     plan = plan_of(scene, parameters, record=recording, path=played, video=video)
-    prepare_volume(scene)
+    prepare_volume(scene, played)
     started = time.monotonic()
     outcome = follow(plan, out / "nodes.log", supervision)
     try:
@@ -191,10 +192,13 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
     return 0
 
 
-def prepare_volume(scene: Scene) -> None:
+def prepare_volume(scene: Scene, path: Path | None = None) -> None:
     """Make a phantom that is not in the cache yet, in view of the person who waits.
 
     The tissue of a case is made too, and kept in the case.
+
+    Raises:
+        SceneError: no image along the path that will be played shows any of the volume.
     """
     bar: list[Progress] = []
 
@@ -205,7 +209,10 @@ def prepare_volume(scene: Scene) -> None:
         bar[0].update(100 * fraction, text)
 
     try:
-        keep_tissue(scene, volume_of(scene, show))
+        volume = volume_of(scene, show)
+        if path is not None:
+            check_path_in_volume(scene, path, volume)
+        keep_tissue(scene, volume)
     finally:
         for shown in bar:
             shown.__exit__(None, None, None)

@@ -47,7 +47,7 @@ def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Paramet
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    prepare_volume(scene)
+    prepare_volume(scene, path)
     with Progress("rendering", len(path_of(scene, path)), "images") as bar:
         count = render(scene, path, out, lambda done, _: bar.update(done), parameters)
     print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
