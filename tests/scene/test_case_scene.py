@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from us_sim.errors import SceneError, UsSimError
-from us_sim.geometry.placement import Placement
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.recording.path import read_path
@@ -18,7 +17,7 @@ from us_sim.scene.case_tissue import keep_tissue, kept_tissue
 from us_sim.scene.reading import load_scene
 from us_sim.scene.structures import colour_of, structures_of
 from us_sim.settings.reading import Reader
-from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.tissue import read_tissue
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_labels, write_volume
@@ -48,7 +47,7 @@ def cases(tmp_path_factory) -> Path:
     settings = CaseSettings(
         "block",
         probe=Reader("probe").read(ProbeSettings, probe),
-        start=Placement((0.0, 0.0, 0.0), TURN),
+        start=CaseStart((0.0, 0.0, 0.0), TURN),
         structures=structures,
         press=7e-3,
         nodes=1000,

@@ -59,6 +59,7 @@ def _parser() -> ChosenParser:
     from us_sim import __version__
     from us_sim.command.bag import add_bag
     from us_sim.command.calibrate import add_calibrate
+    from us_sim.command.cases import add_cases
     from us_sim.command.chosen_parser import ChosenParser
     from us_sim.command.compile import add_compile
     from us_sim.command.demo import add_demo
@@ -75,7 +76,7 @@ def _parser() -> ChosenParser:
     )
     parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (add_demo, add_run, add_render, add_play, add_bag):
+    for add in (add_demo, add_run, add_render, add_play, add_bag, add_cases):
         add(commands)
     for add in (
         add_calibrate,

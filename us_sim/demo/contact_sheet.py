@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
+from us_sim.scene.structures import colour_of
+from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
 __all__ = ["contact_sheet"]
-
-COLOURS = {"vein": "tab:blue", "artery": "tab:red"}
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
@@ -34,11 +38,15 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     first = min(session.poses)
+    numbers, scanner = session.scanner_of_vessels(scene)
     images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
         axes = figure.add_subplot(grid[divmod(i, 3)])
         extent = (left, right, bottom, top)
         axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
+        if scanner is not None and stamp in session.nodes:
+            found = scanner.labels(session.poses[stamp], session.nodes[stamp])
+            _outline(axes, found, {numbers[name]: _colour(scene, name) for name in numbers}, extent)
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
@@ -46,7 +54,9 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
     if areas is not None:
-        _plot_areas(figure.add_subplot(grid[2, :]), areas, [(s - first) * 1e-9 for _, s in moments])
+        colours = {name: _colour(scene, name) for name in areas.area}
+        times = [(stamp - first) * 1e-9 for _, stamp in moments]
+        _plot_areas(figure.add_subplot(grid[2, :]), areas, times, colours)
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
     figure.savefig(file, dpi=80)
 
@@ -91,10 +101,36 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
     )
 
 
-def _plot_areas(axes, areas: LumenAreas, moments: list[float]) -> None:  # type: ignore[no-untyped-def]
+def _outline(
+    axes: Any,
+    labels: NDArray[np.uint8],
+    colours: Mapping[int, Colour],
+    extent: tuple[float, float, float, float],
+) -> None:
+    """Draw the outlines of labels (rows, columns) over an image whose extent is in mm."""
+    left, right, bottom, top = extent
+    scale = np.array([right - left, bottom - top]) / labels.shape[::-1]
+    for label, colour in colours.items():
+        for outline in label_outlines(labels, label):
+            x, y = ((outline + 0.5) * scale + (left, top)).T
+            axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def _colour(scene: Scene, name: str) -> Colour:
+    """Of a label: its structure's where it is one."""
+    for structure, given in scene.structures.items():
+        if (given.label or structure) == name:
+            return colour_of(scene, structure)
+    return anatomical_colour(name)
+
+
+def _plot_areas(
+    axes: Any, areas: LumenAreas, moments: list[float], colours: Mapping[str, Colour]
+) -> None:
     for name, area in areas.area.items():
         percent = area / area[areas.rest] * 100
-        axes.plot(areas.time, percent, color=COLOURS[name], label=f"{name} lumen", lw=2)
+        axes.plot(areas.time, percent, color=colours[name], label=f"{name} lumen", lw=2)
     axes.set(xlabel="time, s", ylabel="area, % of rest")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)

@@ -17,11 +17,14 @@ from us_sim.nodes.conversions import pixels_from, pose_from, tetrahedra_from, ve
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
+from us_sim.slicing.b_mode import BMode
+from us_sim.tissue.elasticity.tissue_kinds import kind_of
 from us_sim.volume.measure import label_area
 
 __all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
 
 VESSELS = ("vein", "artery")
+"""Kinds of tissue whose cross-sections are measured."""
 PLAYED = ("/tracker/pose", "/camera/camera_info")
 """What comes in, of a path and of a camera."""
 STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
@@ -107,15 +110,17 @@ class Session:
     ) -> LumenAreas | None:
         """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
 
-        ``progress`` is called with the fraction that is done.
+        A vessel that the first image does not cut has none.
+
+        Args:
+            scene: that was recorded.
+            samples: images.
+            progress: called with the fraction that is done.
         """
-        volume = volume_of(scene)
-        numbers = {name: label for label, name in volume.label_names.items()}
-        vessels = [name for name in VESSELS if name in numbers]
-        if volume.labels is None or not vessels or self.rest is None or self.tetrahedra is None:
+        numbers, scanner = self.scanner_of_vessels(scene)
+        if scanner is None:
             return None
-        scanner = scanner_of(scene, volume)
-        scanner.carry(self.rest, self.tetrahedra)
+        vessels = list(numbers)
         stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
         if not stamps:
             raise BagError(
@@ -132,12 +137,33 @@ class Session:
                 area[name].append(label_area(labels, numbers[name], pixel))
             if progress is not None:
                 progress(done / len(chosen))
+        area = {name: values for name, values in area.items() if values[0] > 0.0}
+        if not area:
+            return None
         first = min(self.poses)
         return LumenAreas(
             time=np.array([(stamp - first) * 1e-9 for stamp in chosen]),
             depth=np.array([self.poses[stamp].position[2] for stamp in chosen]),
             area={name: np.array(values) for name, values in area.items()},
         )
+
+    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, int], BMode | None]:
+        """Labels of vessels by their names, veins first, and the scanner that finds them.
+
+        There is no scanner without labels of vessels, or without tissue.
+        """
+        volume = volume_of(scene)
+        numbers = {
+            name: label
+            for kind in VESSELS
+            for label, name in volume.label_names.items()
+            if kind_of(name) == kind
+        }
+        if volume.labels is None or not numbers or self.rest is None or self.tetrahedra is None:
+            return {}, None
+        scanner = scanner_of(scene, volume)
+        scanner.carry(self.rest, self.tetrahedra)
+        return numbers, scanner
 
     def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
         """Everything as one JSON-like mapping; times in ms, areas in mm²."""

@@ -38,6 +38,8 @@ _ASIDE_OVER_DEPTH = 0.25
 _BELOW = 1.05
 """Depth of the tissue over that of the image: tissue that moves against the volume beside it would
 leave a seam in the image."""
+_PRESS_OVER_DEPTH = 1 / 3
+_DEEPEST_PRESS = 0.022  # m, of a firm press on an abdomen
 _THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
 
 
@@ -69,7 +71,7 @@ def case_document(folder: Path) -> dict[str, Any]:
             "fixed": held,
             "materials": {name: document_of(settings.material_of(name)) for name in names},
         },
-        "path": _path(settings.press),
+        "path": _path(settings),
     }
     if settings.description:
         document["description"] = settings.description
@@ -80,10 +82,13 @@ def case_document(folder: Path) -> dict[str, Any]:
     return document
 
 
-def _path(press: float) -> str:
+def _path(settings: CaseSettings) -> str:
     """The path of a press as deep as the case proposes."""
-    if press == CaseSettings.press:
-        return "press_and_slide.mcap"
+    assert settings.probe is not None
+    press = settings.press
+    if press is None:
+        depth = settings.probe.array.settings(PROBES).depth
+        press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
     from us_sim.recording.pressing_path import pressing_path
 
     return str(pressing_path(press))

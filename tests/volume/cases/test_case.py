@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from us_sim.errors import CaseError, VolumeError
-from us_sim.geometry.placement import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.tissue.elasticity.material import Material
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.files.writing import write_labels, write_volume
 from us_sim.volume.volume import Volume
 
@@ -25,7 +24,7 @@ def test_a_case_is_read_as_it_was_made(make_case, block):
         "forearm",
         "A block: 60 × 40 × 50 mm",
         Reader("probe").read(ProbeSettings, probe),
-        Placement((0.01, 0, 0), (0.0, 1.0, 0.0, 0.0)),
+        CaseStart((0.01, 0, 0), (0.0, 1.0, 0.0, 0.0)),
         7e-3,
         Material(5e3, 0.49),
         {"vein": CaseStructure(6, Material(1e3, 0.1, 1060.0, 800.0), (0.1, 0.2, 0.3))},

@@ -1,9 +1,11 @@
 """Where to start and with which probe, for a case that does not say.
 
 Voxels that were never scanned are 0. The region that a spreading probe has scanned widens with
-depth, so its distances along the beams are spread unevenly, with a tail towards the probe: of all
-directions the skewness along the beams is least. A region without such a direction is taken for one
-that a linear array has scanned along the rows of its images, the volume's second axis.
+depth, so its distances along the beams are spread unevenly, with a tail towards the probe: the
+skewness along the beams is least of all directions, or of those about a corner of the region; of
+several corners the probe is at the one where echoes are brightest. A region without such a
+direction is taken for one that a linear array has scanned along the rows of its images, the
+volume's second axis.
 
 >>> import numpy as np
 >>> from us_sim.volume.cases.proposal import proposed_start
@@ -11,7 +13,7 @@ that a linear array has scanned along the rows of its images, the volume's secon
 >>> i, j, k = np.indices((61, 31, 61))
 >>> fan = abs(np.hypot(i - 30, k + 20) - 50) < 25  # from 5 mm deep at the apex's side, down
 >>> fan &= abs(np.arctan2(i - 30, k + 20)) < np.radians(28)
->>> volume = Volume(200 * fan.astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+>>> volume = Volume((fan * (200 - k)).astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
 >>> start = proposed_start(volume)
 >>> bool(start.pose.rotation[2, 2] > 0.99), round(1e3 * start.position[2])
 (True, 5)
@@ -33,7 +35,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import COLLIDERS, PROBES
-from us_sim.volume.cases.settings import CaseSettings
+from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
+from us_sim.volume.cases.settings import CaseSettings, CaseStart
 from us_sim.volume.volume import Volume
 
 __all__ = ["proposed_collider", "proposed_probe", "proposed_start", "with_proposal"]
@@ -45,7 +48,19 @@ _BATCH = 100
 _WIDENS = -0.12
 """Skewness of the distances along the beams below which the region is said to widen with them: a
 wedge that becomes half as wide again has -0.2, a box 0."""
+_LIKELY = 0.7
+"""Of the least skewness: directions with less of it than this are tried. A fan of 60 degrees has
+three such corners, and echoes are brightest near one of them."""
+_SAME_CORNER = 0.9  # cosine
 _BESIDE = 4e-3  # m, from the middle beam, within which the skin is looked for
+_FARTHEST = 0.04  # m, along its elevation, that the probe is moved to see structures
+_OFFSET = 2e-3  # m
+_SLID, _SHOWN = (
+    4e-3,
+    6e-3,
+)  # m: the press slides 8 mm along y; its middle, and half of what it shows
+_BETTER = 1.02
+_FLAT = 0.015  # m, that the skin may be nearer or farther there
 _WIDEST = 0.05  # m, of a linear array's face
 _DEPTHS = (0.01, 0.25)  # m
 
@@ -53,17 +68,24 @@ _DEPTHS = (0.01, 0.25)  # m
 def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
     """The settings of a case, with a start and a probe where they say none.
 
+    A start that was proposed is proposed anew. Where the volume has labels, the probe is moved
+    along its elevation, on the skin, to where its image shows most of the structures.
+
     Raises:
         CaseError: nothing was scanned: all voxels are 0.
     """
-    start = settings.start or proposed_start(volume)
-    probe = settings.probe or proposed_probe(volume, start)
+    start, probe = settings.start, settings.probe
+    if start is None or start.proposed:
+        start = proposed_start(volume)
+        probe = probe or proposed_probe(volume, start)
+        start = _at_structures(settings, volume, start, probe)
+    probe = probe or proposed_probe(volume, start)
     if probe.collider is None:
         probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
     return dataclasses.replace(settings, start=start, probe=probe)
 
 
-def proposed_start(volume: Volume) -> Placement:
+def proposed_start(volume: Volume) -> CaseStart:
     """The pose of a probe in the middle of the scanned region's near side, in the volume's frame.
 
     Raises:
@@ -85,7 +107,51 @@ def proposed_start(volume: Volume) -> Placement:
     rotation = np.column_stack([across, np.cross(along, across), along])
     orientation = Rotation.from_matrix(rotation).as_quat()
     pose = Pose(middle + depth * along, orientation)
-    return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+    return _start(pose)
+
+
+def _start(pose: Pose) -> CaseStart:
+    x, y, z = (round(float(value), 5) for value in pose.position)
+    a, b, c, d = (round(float(value), 6) for value in pose.orientation)
+    return CaseStart((x, y, z), (a, b, c, d), proposed=True)
+
+
+def _at_structures(
+    settings: CaseSettings, volume: Volume, start: CaseStart, probe: ProbeSettings
+) -> CaseStart:
+    """The start, moved along the probe's y to where most of the structures is in the image."""
+    counted = [
+        structure.label
+        for name, structure in settings.structures.items()
+        if kind_of(name) not in (*LAYERS, "bone")
+    ]
+    if volume.labels is None or not counted:
+        return start
+    array: Any = probe.array.settings(PROBES)
+    pose = start.pose
+    seen = _placed(volume, np.isin(volume.labels, counted), pose)
+    widest = array.width / 2 * np.clip(seen[:, 2] / array.depth, 0.3, 1.0)
+    seen = seen[(np.abs(seen[:, 0]) < widest) & (seen[:, 2] > 0.0) & (seen[:, 2] < array.depth)]
+    scanned = _placed(volume, volume.intensities > 0, pose)
+    beam = scanned[np.abs(scanned[:, 0]) < max(_BESIDE, _spacing(volume))]
+    best, moved = 0.0, pose
+    for offset in np.arange(-_FARTHEST, _FARTHEST + _OFFSET / 2, _OFFSET):
+        shown = float((np.abs(seen[:, 1] - offset - _SLID) < _SHOWN).sum())
+        depths = beam[np.abs(beam[:, 1] - offset) < max(_BESIDE, _spacing(volume)), 2]
+        if len(depths) == 0 or shown <= best * _BETTER:
+            continue
+        skin = float(np.percentile(depths, 1.0))
+        if abs(skin) < _FLAT:
+            best, moved = shown, pose @ Pose(np.array([0.0, offset, skin]))
+    return _start(moved)
+
+
+def _placed(volume: Volume, mask: NDArray[np.bool_], pose: Pose) -> NDArray[np.float64]:
+    """(N, 3) m, in the frame of a probe, voxels of a mask, as few as make a million of them all."""
+    step = max(1, math.ceil((mask.size / _MOST_POINTS / 5) ** (1 / 3)))
+    matrix = pose.inverse().matrix @ volume.index_to_patient
+    found = np.argwhere(mask[::step, ::step, ::step]) * step
+    return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
@@ -133,18 +199,34 @@ def _spacing(volume: Volume) -> float:
 
 def _scanned(volume: Volume) -> NDArray[np.float64]:
     """(N, 3) m, centres of voxels that are not 0, of a grid coarse enough for a few of them."""
-    step = max(1, math.ceil((volume.intensities.size / _MOST_POINTS) ** (1 / 3)))
-    found = np.argwhere(volume.intensities[::step, ::step, ::step]) * step
+    coarse, step = _coarse(volume)
+    found = np.argwhere(coarse) * step
     if not len(found):
         raise CaseError("all voxels of the volume are 0, so there is nothing to scan")
     matrix = volume.index_to_patient
     return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
 
 
+def _coarse(volume: Volume) -> tuple[NDArray[np.uint8], int]:
+    """Every so many voxels along each axis, and how many."""
+    step = max(1, math.ceil((volume.intensities.size / _MOST_POINTS) ** (1 / 3)))
+    return volume.intensities[::step, ::step, ::step], step
+
+
+def _brightness(volume: Volume) -> NDArray[np.float64]:
+    """(N,) of the points that `_scanned` gives."""
+    coarse, _ = _coarse(volume)
+    return coarse[coarse > 0].astype(np.float64)
+
+
 def _beams(volume: Volume, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     """The unit direction (3,) of the beams, and whether the region widens along them."""
     aside = points - points.mean(axis=0)
-    few = aside[:: max(1, len(aside) // _FEW_POINTS)]
+    brightness = _brightness(volume)
+    brighter = brightness @ aside / brightness.sum()  # m, from the middle to the brighter side
+    few = aside
+    if len(aside) > _FEW_POINTS:  # at random, since every so many would lie on a few planes
+        few = aside[np.random.default_rng(0).choice(len(aside), _FEW_POINTS, replace=False)]
     directions = _spiral(_DIRECTIONS)
     skewness = np.empty(_DIRECTIONS)
     for first in range(0, _DIRECTIONS, _BATCH):
@@ -152,7 +234,10 @@ def _beams(volume: Volume, points: NDArray[np.float64]) -> tuple[NDArray[np.floa
         squared = distance * distance
         cubed = np.einsum("ij,ij->j", squared, distance) / len(few)
         skewness[first : first + _BATCH] = cubed / squared.mean(axis=0) ** 1.5
-    best = int(np.argmin(skewness))
+    likely = skewness <= _LIKELY * skewness.min()
+    side = np.argmin(np.where(likely, skewness + directions @ brighter / aside.std(), np.inf))
+    near = directions @ directions[side] > _SAME_CORNER
+    best = int(np.argmin(np.where(near, skewness, np.inf)))
     if skewness[best] < _WIDENS:
         return directions[best], True
     rows = volume.index_to_patient[:3, 1]

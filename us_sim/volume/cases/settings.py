@@ -5,8 +5,8 @@
 >>> case = Reader("case.yaml").read(CaseSettings, {
 ...     "name": "liver", "region": "abdomen", "structures": {"portal vein": {"label": 1}},
 ...     "start": {"position": ["49 mm", "92 mm", "127 mm"], "orientation": [0, 1, 0, 0]}})
->>> case.material_of("portal vein").lumen_pressure, case.press
-(1000.0, 0.012)
+>>> case.material_of("portal vein").lumen_pressure
+1000.0
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
-__all__ = ["AROUND", "CaseSettings", "CaseStructure", "check_name"]
+__all__ = ["AROUND", "CaseSettings", "CaseStart", "CaseStructure", "check_name"]
 
 AROUND = "tissue"
 """Name of what is in no structure: label 0, or all of a volume without labels."""
@@ -69,6 +69,20 @@ class CaseStructure(Settings):
 
 
 @dataclass(frozen=True)
+class CaseStart(Placement):
+    """Where a press begins."""
+
+    section = "start"
+    error = CaseError
+
+    proposed: bool = setting(
+        description="whether us_sim has found it; then it moves to where structures are once there "
+        "are some",
+        default=False,
+    )
+
+
+@dataclass(frozen=True)
 class CaseSettings(Settings):
     """A case: the keys of its ``case.yaml``."""
 
@@ -80,13 +94,15 @@ class CaseSettings(Settings):
     probe: ProbeSettings | None = setting(
         description="transducer that it is best scanned with", default=None
     )
-    start: Placement | None = setting(
+    start: CaseStart | None = setting(
         description="pose of the probe where it touches the skin, in the volume's own frame; not "
         "given: found from the volume",
         default=None,
     )
-    press: float = setting(
-        Quantity("length", 0.0, 0.1), "how deep the proposed path presses", default=12e-3
+    press: float | None = setting(
+        Quantity("length", 0.0, 0.1),
+        "how deep the proposed path presses; not given: a third of the image, 22 mm at most",
+        default=None,
     )
     around: Material | str = setting(
         description="elastic constants, or a kind of tissue, of what is in no structure",

@@ -128,7 +128,8 @@ def _finish(folder: Path, partial: Path) -> None:
         case.placement()
         if case.has_labels:
             case.check_grids()
-        if case.settings.start is None or case.settings.probe is None:
+        start = case.settings.start
+        if start is None or start.proposed or case.settings.probe is None:
             write_case_settings(partial, with_proposal(case.settings, case.volume()))
     except (CaseError, VolumeError) as error:
         raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error

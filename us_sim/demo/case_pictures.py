@@ -1,0 +1,73 @@
+"""One picture of several cases: what the probe sees in each where it starts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.progress import Progress
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import CASE_PREFIX, Scene
+from us_sim.scene.structures import colour_of
+from us_sim.slicing.drawing.label_outlines import label_outlines
+
+__all__ = ["picture_cases"]
+
+_COLUMNS = 4
+_INCHES = 3.2  # of a picture's side
+
+
+def picture_cases(folders: Sequence[Path], file: Path) -> None:
+    """Write the picture of the cases in these folders, as PNG.
+
+    Raises:
+        UsSimError: a case cannot be read, or the file cannot be written.
+    """
+    columns = min(_COLUMNS, len(folders))
+    rows = math.ceil(len(folders) / columns)
+    figure = Figure(figsize=(_INCHES * columns, (_INCHES + 0.4) * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    with Progress("drawing", len(folders), "cases") as bar:
+        for number, folder in enumerate(folders):
+            axes = figure.add_subplot(rows, columns, number + 1)
+            _draw(axes, load_scene(f"{CASE_PREFIX}{folder}"), folder.name)
+            bar.update(number + 1)
+    try:
+        figure.savefig(file, dpi=100)
+    except OSError as error:
+        raise UsSimError(f"--picture {file}: cannot be written: {error.strerror}") from error
+
+
+def _draw(axes: Any, scene: Scene, name: str) -> None:
+    """What the probe sees at the start, with the outlines of structures."""
+    touching = dataclasses.replace(scene.imaging, contact=False)
+    scene = dataclasses.replace(scene, imaging=touching)
+    volume = volume_of(scene)
+    scanner = scanner_of(scene, volume)
+    width, height = 1e3 * scanner.probe.width, 1e3 * scanner.probe.height
+    top = 1e3 * float(scanner.probe.image_to_probe[2, 3]) - height / scanner.probe.rows / 2
+    extent = (-width / 2, width / 2, top + height, top)
+    axes.imshow(scanner.image(Pose()), cmap="gray", vmin=0, vmax=255, extent=extent)
+    if volume.labels is not None:
+        labels = scanner.labels(Pose())
+        numbers = {label: number for number, label in volume.label_names.items()}
+        scale = np.array([width, height]) / (scanner.probe.columns, scanner.probe.rows)
+        for structure, given in scene.structures.items():
+            for outline in label_outlines(labels, numbers[given.label or structure]):
+                x, y = ((outline + 0.5) * scale + (-width / 2, top)).T
+                axes.plot(
+                    np.append(x, x[0]), np.append(y, y[0]), color=colour_of(scene, structure), lw=1
+                )
+    axes.set_title(name, fontsize=10)
+    axes.set_xlabel("mm", fontsize=8)
+    axes.tick_params(labelsize=7)
