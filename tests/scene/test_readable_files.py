@@ -86,6 +86,7 @@ def test_what_could_be_read_is_said(document, tmp_path, capsys):
     ]
     assert check_files(parse_scene(document)) == keys
     file = tmp_path / "scene.yaml"
+    document["volume"]["pose"] = {"position": ["-3 mm", "-2 mm", "15 mm"]}  # into the image
     file.write_text(yaml.safe_dump(document), encoding="utf-8")
     assert main(["run", str(file), "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"readable  {', '.join(keys)}"

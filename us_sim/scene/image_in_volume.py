@@ -34,7 +34,7 @@ __all__ = ["check_path_in_volume", "part_inside"]
 _POSES = 60  # of a path that are looked at
 _POINTS = 32  # along each side of an image
 
-_LITTLE = 0.02
+_LITTLE = 0.002
 """Part of the best image of a path that is of the volume, below which the path is refused."""
 
 
