@@ -79,7 +79,8 @@ def check_path_in_volume(scene: Scene, file: Path, volume: Volume) -> None:
         BagError: the path cannot be read.
     """
     poses, probe = _sampled(scene, path_of(scene, file)), probe_of(scene)
-    shown = part_inside(probe, poses, volume.patient_to_index, volume.shape, volume.intensities)
+    scanned = volume.intensities if volume.intensities.any() else None  # black at any pose
+    shown = part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)
     if shown.max() >= _LITTLE:
         return
     inside = part_inside(probe, poses, volume.patient_to_index, volume.shape)
