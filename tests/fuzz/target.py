@@ -9,7 +9,9 @@ from pathlib import Path
 
 __all__ = ["MODULES", "TARGETS", "Target", "add_targets", "target"]
 
-MODULES = tuple(f"tests.fuzz.{room}" for room in ("bags", "volumes", "meshes", "scenes"))
+MODULES = tuple(
+    f"tests.fuzz.{room}" for room in ("bags", "volumes", "segmentations", "meshes", "scenes")
+)
 """Where the targets are."""
 
 

@@ -70,6 +70,7 @@ def _parser() -> ChosenParser:
     from us_sim.command.reference import add_reference
     from us_sim.command.render import add_render
     from us_sim.command.run import add_run
+    from us_sim.command.segment import add_segment
 
     parser = ChosenParser(
         prog="us-sim", description="Interactive simulation of compression ultrasonography."
@@ -81,6 +82,7 @@ def _parser() -> ChosenParser:
     for add in (
         add_calibrate,
         add_reconstruct,
+        add_segment,
         add_print_marker,
         add_evaluate,
         add_reference,

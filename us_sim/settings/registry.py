@@ -14,6 +14,7 @@ __all__ = [
     "FILTERS",
     "PHANTOMS",
     "PROBES",
+    "SEGMENTATIONS",
     "SLICERS",
     "SOLVERS",
     "TRACKERS",
@@ -41,6 +42,21 @@ SLICERS = Choice(
 
 PHANTOMS = Choice(
     "phantom", key="phantom", error=VolumeError, upper_arm="us_sim.volume.phantom.phantom:upper_arm"
+)
+
+_SEGMENTATION = "us_sim.volume.segmentation"
+SEGMENTATIONS = Choice(
+    "segmentation method",
+    key="method",
+    error=VolumeError,
+    needs=True,
+    growing=f"{_SEGMENTATION}.growing:SeededGrowing",
+    confidence=f"{_SEGMENTATION}.growing:ConfidenceConnected",
+    threshold=f"{_SEGMENTATION}.growing:Threshold",
+    watershed=f"{_SEGMENTATION}.watershed:Watershed",
+    vesselness=f"{_SEGMENTATION}.vesselness:Vesselness",
+    dark_vessels=f"{_SEGMENTATION}.dark_vessels:DarkVessels",
+    covered=f"{_SEGMENTATION}.covered:Covered",
 )
 
 PROBES = Choice(

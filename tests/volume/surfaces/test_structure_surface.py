@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import VolumeError
 from us_sim.volume.phantom.phantom import cached_phantom
-from us_sim.volume.surfaces.structure_surface import SurfaceSettings, structure_surface
+from us_sim.volume.surfaces.settings import SurfaceSettings
+from us_sim.volume.surfaces.structure_surface import structure_surface
 from us_sim.volume.surfaces.voxel_surface import voxel_surface
 from us_sim.volume.volume import Volume
 

@@ -7,7 +7,8 @@ import pytest
 from us_sim.errors import VolumeError
 from us_sim.skin.surface import read_surface
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.surface_files import SURFACE_FORMATS, write_surface
+from us_sim.volume.surfaces.settings import SURFACE_FORMATS
+from us_sim.volume.surfaces.surface_files import write_surface
 
 CORNERS = np.array([[0.01, 0.02, 0.03], [0.05, 0, 0], [0, 0.061, 0], [0, 0, 0.0723]])
 SURFACE = ClosedSurface(CORNERS, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))

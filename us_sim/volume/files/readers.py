@@ -27,7 +27,7 @@ from us_sim.volume.files.frame_sequence import holds_sequence
 from us_sim.volume.files.stored_size import check_stored_size
 from us_sim.volume.volume import Volume
 
-__all__ = ["read_placement", "read_volume"]
+__all__ = ["open_image", "read_placement", "read_volume", "stored_voxels_of"]
 
 # Not what else SimpleITK reads: a damaged DICOM file ends the process that reads it.
 _READERS = {
@@ -59,14 +59,8 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
             origin or direction that places no volume.
     """
     path = Path(path)
-    header, index_to_patient = _header(path)
-    try:
-        image = header.Execute()
-    except RuntimeError as error:
-        raise VolumeError(
-            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
-            f"this machine's memory; copy or export it again"
-        ) from error
+    header, index_to_patient = open_image(path)
+    image = stored_voxels_of(path, header)
     stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
     return Volume(_grey_values(path, stored), index_to_patient)
 
@@ -77,11 +71,36 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels.
     """
-    return _header(Path(path))[1]
+    return open_image(Path(path))[1]
 
 
-def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
-    """The reader of a file, its header read, and the placement of the volume."""
+def stored_voxels_of(path: Path, header: sitk.ImageFileReader) -> sitk.Image:
+    """The image of a file that `open_image` has opened.
+
+    Raises:
+        VolumeError: its data cannot be read.
+    """
+    try:
+        return header.Execute()
+    except RuntimeError as error:
+        raise VolumeError(
+            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
+            f"this machine's memory; copy or export it again"
+        ) from error
+
+
+def open_image(
+    path: Path, *, layers: bool = False
+) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
+    """The reader of a file, its header read, and the placement of its voxels, (4, 4) m.
+
+    Args:
+        path: of the file.
+        layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
+
+    Raises:
+        VolumeError: as `read_volume`, except for faults of the voxels.
+    """
     if not os.path.exists(path):
         raise VolumeError(f"{path}: there is no such file")
     if not os.path.isfile(path):
@@ -101,16 +120,16 @@ def _header(path: Path) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
         raise VolumeError(
             f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume"
         ) from error
-    placement = _placement(path, header)
+    placement = _placement(path, header, layers=layers)
     value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
-    if stored.expected != math.prod(header.GetSize()) * value:
+    if stored.expected != math.prod(header.GetSize()) * header.GetNumberOfComponents() * value:
         raise VolumeError(
             f"{path}: its header says more than one thing about its size; export it again"
         )
     return header, placement
 
 
-def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
+def _placement(path: Path, header: sitk.ImageFileReader, *, layers: bool) -> NDArray[np.float64]:
     """(4, 4) m, from the header alone, so that nothing unusable is read."""
     dimension, size = header.GetDimension(), header.GetSize()
     if dimension != 3:
@@ -121,7 +140,7 @@ def _placement(path: Path, header: sitk.ImageFileReader) -> NDArray[np.float64]:
             f"each axis"
         )
     pixel = sitk.GetPixelIDValueAsString(header.GetPixelID())
-    if header.GetNumberOfComponents() != 1 or "complex" in pixel:
+    if (header.GetNumberOfComponents() != 1 and not layers) or "complex" in pixel:
         raise VolumeError(
             f"{path}: holds {header.GetNumberOfComponents()} numbers per voxel ({pixel}); "
             f"convert it to one grey value"

@@ -68,9 +68,9 @@ def write_labels(
 ) -> None:
     """The labels of a volume as an image file, compressed; a file of that name is replaced.
 
-    A name that ends in .seg.nrrd makes a segmentation of 3D Slicer, with each label's name and
-    colour (slicer.readthedocs.io, "Segmentation labelmap file format"); label 0 is no segment
-    there. In other files there are numbers only.
+    NRRD files hold each label's name and colour as segmentations of 3D Slicer do
+    (slicer.readthedocs.io, "Segmentation labelmap file format"), which opens one as such where the
+    name ends in .seg.nrrd; label 0 is no segment there. In other files there are numbers only.
 
     Args:
         path: ends in .seg.nrrd, .nrrd, .mha, .nii or .nii.gz.
@@ -84,7 +84,7 @@ def write_labels(
     if volume.labels is None:
         raise VolumeError(f"{path}: the volume has no labels to write: segment it")
     fields = {}
-    if path.name.lower().endswith(".seg.nrrd"):
+    if path.name.lower().endswith(".nrrd"):
         fields = _segments(volume.labels, volume.label_names, dict(colours or {}))
     _write(path, _image(path, volume.labels, volume), fields, packed=True)
 

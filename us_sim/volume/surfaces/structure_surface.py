@@ -18,41 +18,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from us_sim.errors import VolumeError
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import Settings, setting
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.decimation import decimated
+from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.surfaces.smoothing import smoothed, with_volume
 from us_sim.volume.surfaces.voxel_surface import structure_name, voxel_surface
 from us_sim.volume.volume import Volume
 
-__all__ = ["StructureSurface", "SurfaceSettings", "structure_surface"]
+__all__ = ["StructureSurface", "structure_surface"]
 
 _WAVELENGTH = 6.0
 """Voxels; the stairs of a surface that lies aslant are at most so long nearly everywhere."""
 
 _FARTHEST = 0.5
 """Voxels by which the surface is moved to keep its volume."""
-
-
-@dataclass(frozen=True)
-class SurfaceSettings(Settings):
-    """How surfaces are made of labels."""
-
-    section = "surfaces"
-    error = VolumeError
-
-    smoothing: float | None = setting(
-        Quantity("length", 0.0, 0.1),
-        "bumps of a surface that are shorter than this are taken away, 0 for none; six voxels "
-        "where not given",
-        default=None,
-    )
-    decimation: float = setting(
-        Quantity("length", 0.0, 0.05),
-        "triangles are joined as long as the surface stays within this distance, 0 for not",
-        default=0.0,
-    )
 
 
 @dataclass(frozen=True, eq=False)

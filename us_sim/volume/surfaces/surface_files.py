@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
+from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
-__all__ = ["SURFACE_FORMATS", "write_surface"]
+__all__ = ["write_surface"]
 
 _MILLIMETRES = 1e3
 _SAID = "us_sim; millimetres; SPACE=LPS"
@@ -131,6 +132,3 @@ def _array(kind: str, values: NDArray[np.generic], name: str, components: int = 
 
 
 _WRITERS = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".obj": _obj}
-
-SURFACE_FORMATS = tuple(suffix[1:] for suffix in _WRITERS)
-"""What surfaces may be written as."""

@@ -1,0 +1,156 @@
+"""`us-sim segment` on a case and on a volume file: all of it, or nothing."""
+
+import numpy as np
+import pytest
+import yaml
+
+from us_sim.command.main import main
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.cases.writing import new_case, write_case_settings
+from us_sim.volume.files.labels import read_labels
+from us_sim.volume.files.readers import read_volume
+from us_sim.volume.files.writing import write_labels, write_volume
+from us_sim.volume.volume import Volume
+
+SEEDS = """structures:
+  vein: {method: growing, upper: 40, seeds_mm: [[0, 0, 19]]}
+  body: {method: covered, priority: -1}
+"""
+
+
+def block():
+    """60 × 40 × 50 mm of speckle around a dark tube along y."""
+    grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
+    grid[:3, 3] = [-0.03, -0.02, 0.0]
+    grey = np.random.default_rng(1).integers(60, 120, (30, 20, 25), dtype=np.uint8)
+    labels = np.zeros_like(grey)
+    labels[13:17, :, 8:11] = 6
+    grey[labels == 6] = 10
+    return Volume(grey, grid, labels, {6: "vein"})
+
+
+@pytest.fixture
+def case(tmp_path):
+    """The block's, unlabelled, with a structure's material and a tissue of before."""
+    structures = {"vein": CaseStructure(3, material="artery"), "bone": CaseStructure(1)}
+    with new_case(tmp_path / "arm") as folder:
+        write_volume(folder / "volume.nrrd", block())
+        settings = CaseSettings("arm", structures=structures, fixed=("bottom", "bone"))
+        write_case_settings(folder, settings)
+        (folder / "tissue.npz").write_bytes(b"of other labels")
+    return tmp_path / "arm"
+
+
+@pytest.fixture
+def seeds(tmp_path):
+    """The file of seeds."""
+    (tmp_path / "seeds.yaml").write_text(SEEDS)
+    return str(tmp_path / "seeds.yaml")
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
+    assert (
+        main(["segment", str(case), "--seeds", seeds, "--formats", "stl", "vtp", "--report"]) == 0
+    )
+    said = capsys.readouterr().out
+    opened = read_case(case)
+    volume = opened.volume()
+    assert volume.label_names == {0: "tissue", 1: "vein", 2: "body"}
+    np.testing.assert_array_equal(volume.labels == 1, block().labels == 6)
+    assert sorted(path.name for path in (case / "surfaces").iterdir()) == [
+        *("body.stl", "body.vtp", "vein.stl", "vein.vtp")
+    ]
+    assert (case / "segmentation.png").read_bytes()[:4] == b"\x89PNG"
+    assert "![" in (case / "segmentation.md").read_text()
+    vein = 4 * 20 * 3 * 8e-3  # ml
+    assert f"{vein:.3f} ml" in said
+    assert "tissue.npz was made of other labels" in said
+    assert not (case / "tissue.npz").exists()
+    assert opened.settings.structures["vein"].material == "artery"
+    assert opened.settings.fixed == ("bottom",)
+    found, surfaced = opened.steps
+    assert found.settings["vein"]["method"] == "growing"
+    assert found.counts["voxels of vein"] == 240
+    assert surfaced.counts["triangles of vein"] > 100
+    labels = read_labels(case / "labels.nrrd", volume)
+    assert labels.names == {1: "vein", 2: "body"}
+
+
+def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, capsys):
+    file = tmp_path / "doe_jane.seg.nrrd"
+    write_labels(file, block(), {6: (0.125, 0.25, 0.5)})
+    assert main(["segment", str(case), "--labels", str(file), "--names", "6=brachial vein"]) == 0
+    assert "brachial vein" in capsys.readouterr().out
+    document = yaml.safe_load((case / "case.yaml").read_text())
+    assert document["structures"] == {"brachial vein": {"label": 6, "colour": [0.125, 0.25, 0.5]}}
+    for path, content in contents(case).items():
+        assert b"doe" not in content, path
+    assert main(["segment", str(case)]) == 0  # surfaces of the labels that are there
+    assert [path.name for path in (case / "surfaces").iterdir()] == ["brachial vein.stl"]
+
+
+def test_a_volume_file_is_segmented_into_a_folder(seeds, tmp_path, capsys):
+    write_volume(tmp_path / "volume.mha", block())
+    out = tmp_path / "made"
+    words = ["segment", str(tmp_path / "volume.mha"), "--seeds", seeds, "--out", str(out)]
+    assert main([*words, "--decimation", "0.5 mm"]) == 0
+    volume = read_volume(tmp_path / "volume.mha")
+    assert read_labels(out / "labels.seg.nrrd", volume).voxels["vein"] == 240
+    assert {path.name for path in out.iterdir()} == {
+        *("labels.seg.nrrd", "segmentation.png", "surfaces")
+    }
+    capsys.readouterr()
+    assert main(words) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "no labels yet: give --labels, --seeds, or --vessels dark"),
+        (["--seeds", "SEEDS", "--vessels", "dark"], "two sources of labels"),
+        (["--seeds", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
+        (["--seeds", "SEEDS", "--out", "there"], "changed in its place"),
+        (["--seeds", "SEEDS", "--resample"], "--resample: is for --labels only"),
+        (["--labels", "SEEDS"], "cannot be read as an image"),
+        (["--labels", "SEEDS", "--names", "x"], "write LABEL=NAME"),
+        (["--labels", "SEEDS", "--names", "3=Doe 1961"], "identity"),
+        (["--vessels", "bright"], "is not one of dark"),
+        (["--seeds", "SEEDS", "--smoothing", "3 kg"], "--smoothing: '3 kg' is not a length"),
+        (["--seeds", "SEEDS", "--formats", "doc"], "--formats: 'doc' is not one of stl"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(
+    case, seeds, capsys, words, sentence
+):
+    (case / "case.yaml").write_text("name: arm\n")
+    before = contents(case.parent)
+    assert main(["segment", str(case), *(seeds if w == "SEEDS" else w for w in words)]) == 1
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1 + error.count("\r")
+    assert contents(case.parent) == before
+
+
+def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, capsys):
+    before = contents(case.parent)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("us_sim.volume.segmentation.picture.draw_segmentation", full)
+    assert main(["segment", str(case), "--seeds", seeds]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert contents(case.parent) == before
+
+
+def test_what_is_no_case_and_no_volume_is_said(tmp_path, seeds, capsys):
+    assert main(["segment", str(tmp_path), "--seeds", seeds]) == 1
+    assert "has no case.yaml" in capsys.readouterr().err
+    assert main(["segment", str(tmp_path / "a.mha"), "--seeds", seeds, "--out", "x"]) == 1
+    assert "there is no such file" in capsys.readouterr().err

@@ -1,0 +1,267 @@
+"""Labels of other programs: names, colours, layers, grids; and what is no labels."""
+
+import re
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.label_grid import on_grid
+from us_sim.volume.files.labels import read_labels
+from us_sim.volume.files.writing import write_labels
+from us_sim.volume.structure_terms import is_anatomical, problem_with
+from us_sim.volume.volume import Volume
+
+SHAPE = (8, 7, 6)
+STEPS = (0.5e-3, 1e-3, 2e-3)
+
+
+def placed(turn=0.0, mirrored=False):
+    c, s = np.cos(turn), np.sin(turn)
+    affine = np.eye(4)
+    axes = np.array([[c, -s, 0], [s, c, 0], [0, 0, -1.0 if mirrored else 1.0]])
+    affine[:3, :3] = axes * STEPS
+    affine[:3, 3] = (0.01, -0.02, 0.1)
+    return affine
+
+
+VOLUME = Volume(np.zeros(SHAPE, np.uint8), placed(0.4))
+
+
+def image_of(array, affine=VOLUME.index_to_patient):
+    """An image of (i, j, k) or (i, j, k, layer) values there, in millimetres."""
+    axes = (2, 1, 0) if array.ndim == 3 else (2, 1, 0, 3)
+    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(axes)), array.ndim == 4)
+    matrix = affine[:3, :3] * 1e3
+    spacing = np.linalg.norm(matrix, axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((matrix / spacing).ravel().tolist())
+    image.SetOrigin((affine[:3, 3] * 1e3).tolist())
+    return image
+
+
+def written(path, array, fields=None, affine=VOLUME.index_to_patient):
+    image = image_of(array, affine)
+    for key, value in (fields or {}).items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path), True)
+    return path
+
+
+def segments(*entries):
+    """The fields of segments: each a name, its value, its layer, and further fields."""
+    fields = {"Segmentation_MasterRepresentation": "Binary labelmap"}
+    for n, (name, value, layer, *more) in enumerate(entries):
+        fields |= {f"Segment{n}_ID": f"Segment_{n}", f"Segment{n}_Name": name}
+        fields |= {f"Segment{n}_LabelValue": str(value), f"Segment{n}_Layer": str(layer)}
+        fields |= {f"Segment{n}_{key}": text for key, text in (more[0] if more else {}).items()}
+    return fields
+
+
+def block(*spans, value=1, shape=SHAPE):
+    array = np.zeros(shape, np.uint8)
+    array[tuple(slice(*span) for span in spans)] = value
+    return array
+
+
+@pytest.mark.parametrize("suffix", [".seg.nrrd", ".nrrd", ".mha", ".nii.gz"])
+def test_what_is_written_is_read_again(tmp_path, suffix):
+    labels = block((1, 4), (2, 5), (0, 3), value=5)
+    labels[5:7, 1:3, 2:4] = 7
+    volume = Volume(np.zeros(SHAPE, np.uint8), placed(0.4), labels, {5: "artery", 7: "nerve"})
+    write_labels(tmp_path / f"labels{suffix}", volume, {7: (0.125, 0.5, 0.25)})
+    read = read_labels(tmp_path / f"labels{suffix}", volume)
+    np.testing.assert_array_equal(read.labels, labels)
+    if suffix.endswith(".nrrd"):
+        assert read.names == {5: "artery", 7: "nerve"}
+        assert read.colours[7] == (0.125, 0.5, 0.25)
+        assert read.colours[5] == (0.85, 0.15, 0.15)
+    else:
+        assert read.names == {5: "structure 5", 7: "structure 7"}
+
+
+def test_segments_in_layers_that_overlap_are_the_last_ones_and_that_is_said(tmp_path):
+    layers = np.stack(
+        [block((0, 4), (0, 4), (0, 4)), block((2, 6), (0, 4), (0, 4), value=3)], axis=-1
+    )
+    layers[6, 6, 5, 0] = 2
+    fields = segments(("artery", 1, 0, {"Color": "1 0 0"}), ("vessel wall", 3, 1), ("bone", 2, 0))
+    read = read_labels(written(tmp_path / "a.seg.nrrd", layers, fields), VOLUME)
+    assert read.names == {1: "artery", 2: "bone", 3: "vessel wall"}
+    assert read.voxels == {"artery": 32, "vessel wall": 64, "bone": 1}
+    assert read.colours[1] == (1.0, 0.0, 0.0)
+    assert "artery and vessel wall overlap in 32 voxels, which are vessel wall now" in read.remarks
+
+
+def test_segments_of_old_slicer_have_a_layer_each_and_the_value_1(tmp_path):
+    layers = np.stack([block((0, 2), (0, 2), (0, 2)), block((4, 6), (4, 6), (4, 6))], axis=-1)
+    fields = {"Segment0_Name": "vein", "Segment1_Name": "Bone"}
+    read = read_labels(written(tmp_path / "old.seg.nrrd", layers, fields), VOLUME)
+    assert read.names == {1: "vein", 2: "bone"}
+    assert read.labels[0, 0, 0] == 1
+    assert read.labels[5, 5, 5] == 2
+
+
+def test_a_segment_ends_at_its_extent_and_one_without_voxels_is_left_out(tmp_path):
+    fields = segments(("vein", 1, 0, {"Extent": "0 1 0 6 0 5"}), ("nerve", 2, 0))
+    array = block((0, 4), (0, 2), (0, 2))
+    read = read_labels(written(tmp_path / "a.seg.nrrd", array, fields), VOLUME)
+    assert read.voxels == {"vein": 2 * 2 * 2}
+    assert any("nerve: no voxel" in remark for remark in read.remarks)
+
+
+def test_a_cropped_file_and_turned_axes_are_put_where_they_belong(tmp_path):
+    affine = VOLUME.index_to_patient.copy()
+    affine[:3, 3] += affine[:3, :3] @ [2, 1, 3]
+    fields = segments(("vein", 1, 0)) | {"Segmentation_ReferenceImageExtentOffset": "2 1 3"}
+    path = written(tmp_path / "part.seg.nrrd", np.ones((3, 2, 2), np.uint8), fields, affine)
+    read = read_labels(path, VOLUME)
+    np.testing.assert_array_equal(np.argwhere(read.labels).min(axis=0), [2, 1, 3])
+    assert read.voxels == {"vein": 12}
+    affine[:3, 3] += affine[:3, :3] @ [0, 0, 2]
+    read = read_labels(written(path, np.ones((3, 2, 2), np.uint8), fields, affine), VOLUME)
+    assert "6 of 12 labelled voxels lie outside the volume" in read.remarks[0]
+
+
+@given(
+    order=st.permutations(range(3)),
+    signs=st.tuples(*[st.sampled_from((-1, 1))] * 3),
+    shift=st.tuples(*[st.integers(-2, 4)] * 3),
+    seed=st.integers(0, 2**16),
+)
+@settings(max_examples=30, deadline=None)
+def test_every_labelled_voxel_keeps_its_place_in_the_patient(order, signs, shift, seed):
+    labels = np.random.default_rng(seed).integers(0, 4, (3, 4, 5)).astype(np.uint8)
+    turn = np.zeros((4, 4))
+    turn[order, range(3)] = signs
+    turn[:3, 3], turn[3, 3] = shift, 1.0
+    labels[1, 2, 2] = 2
+    affine = VOLUME.index_to_patient @ turn
+    try:
+        made, _ = on_grid(labels, affine, (6, 6, 6), VOLUME.index_to_patient)
+    except VolumeError:
+        made = np.zeros((6, 6, 6), np.uint8)
+    expected = np.zeros((6, 6, 6), np.uint8)
+    for index in np.ndindex(labels.shape):
+        at = np.rint(turn @ [*index, 1.0])[:3].astype(int)
+        if (at >= 0).all() and (at < 6).all():
+            expected[tuple(at)] = labels[index]
+    np.testing.assert_array_equal(made, expected)
+
+
+def test_another_grid_is_refused_or_resampled_as_itk_does(tmp_path):
+    affine = placed(0.4)
+    affine[:3, :3] *= 0.8
+    array = block((1, 7), (1, 6), (1, 5), value=9)
+    path = written(tmp_path / "fine.nrrd", array, None, affine)
+    with pytest.raises(VolumeError, match=r"on another grid .*--resample"):
+        read_labels(path, VOLUME)
+    read = read_labels(path, VOLUME, resample=True)
+    reference = sitk.Resample(
+        image_of(array, affine), image_of(VOLUME.intensities), interpolator=sitk.sitkNearestNeighbor
+    )
+    np.testing.assert_array_equal(read.labels, sitk.GetArrayFromImage(reference).transpose(2, 1, 0))
+    assert "resampled" in read.remarks[0]
+
+
+def test_names_that_are_no_anatomy_are_not_kept(tmp_path):
+    fields = segments(("Mueller_Hans 12.03.1961", 1, 0), ("Portal-Vein_2", 2, 0))
+    array = block((0, 2), (0, 2), (0, 2)) + block((3, 5), (3, 5), (3, 5), value=2)
+    path = written(tmp_path / "a.seg.nrrd", array, fields)
+    read = read_labels(path, VOLUME)
+    assert read.names == {1: "structure 1", 2: "portal vein 2"}
+    said = " ".join(read.remarks)
+    assert "labels 1 are not kept" in said
+    assert "Mueller" not in said
+    assert read_labels(path, VOLUME, names={1: "cyst"}).names[1] == "cyst"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# ctbl\n1 unnamed 0 0 0 0\n6 portal_vein 0 0 255 255\n",
+        '0 0 0 0 0 0 0 "Clear Label"\n6 0 0 255 1 1 1 "Portal vein"\n',
+        "label,name\n6,portal vein\n",
+    ],
+)
+def test_tables_of_labels_name_them(tmp_path, text):
+    (tmp_path / "table.txt").write_text(text)
+    path = written(tmp_path / "a.nii.gz", block((1, 3), (1, 3), (1, 3), value=6))
+    read = read_labels(path, VOLUME, table=tmp_path / "table.txt")
+    assert read.names == {6: "portal vein"}
+    assert read.colours[6] == ((0.25, 0.4, 0.85) if text.startswith("label") else (0.0, 0.0, 1.0))
+
+
+def test_labels_beyond_255_are_numbered_anew(tmp_path):
+    array = block((0, 2), (0, 2), (0, 2)).astype(np.int16) * 1000 + block((4, 6), (0, 2), (0, 2))
+    read = read_labels(written(tmp_path / "a.mha", array), VOLUME)
+    assert read.voxels == {"structure 1": 8, "structure 2": 8}
+    assert "numbered anew" in read.remarks[0]
+
+
+GRADIENT = np.arange(np.prod(SHAPE), dtype=np.int16).reshape(SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "fields", "sentence"),
+    [
+        ("a.nrrd", np.zeros(SHAPE, np.uint8), {}, "none of its voxels has a label"),
+        ("a.mha", GRADIENT + 1, {}, "336 different values"),
+        ("a.mha", -GRADIENT, {}, "down to -335"),
+        ("a.mha", GRADIENT / np.float32(3), {}, "fractions"),
+        ("a.nrrd", np.ones((*SHAPE, 2), np.uint8), {}, "2 numbers per voxel"),
+        ("a.seg.nrrd", np.ones(SHAPE, np.uint8), segments(("vein", 1, 4)), "layer 4 of 1"),
+        ("a.seg.nrrd", np.ones(SHAPE, np.uint8), segments(("vein", "x", 0)), "LabelValue is 'x'"),
+        (
+            "a.seg.nrrd",
+            np.ones(SHAPE, np.uint8),
+            segments(("vein", 1, 0, {"Extent": "0 1"})),
+            "six whole numbers",
+        ),
+        (
+            "a.seg.nrrd",
+            np.ones(SHAPE, np.uint8),
+            {"Segmentation_MasterRepresentation": "Fractional labelmap"},
+            "Fractional labelmap",
+        ),
+    ],
+)
+def test_what_is_no_labels_is_refused(tmp_path, name, array, fields, sentence):
+    path = written(tmp_path / name, array, fields)
+    with pytest.raises(VolumeError, match=sentence) as refused:
+        read_labels(path, VOLUME)
+    assert str(refused.value).startswith(str(path))
+
+
+def test_labels_of_another_place_and_broken_tables_are_refused(tmp_path):
+    affine = VOLUME.index_to_patient.copy()
+    affine[:3, 3] += affine[:3, :3] @ [100, 0, 0]
+    path = written(tmp_path / "a.nrrd", np.ones((2, 2, 2), np.uint8), None, affine)
+    with pytest.raises(VolumeError, match="wholly outside"):
+        read_labels(path, VOLUME)
+    table = tmp_path / "table.txt"
+    path = written(tmp_path / "b.nrrd", np.ones(SHAPE, np.uint8))
+    for text, sentence in (("1 vein", "line 1"), ("", "no labels"), ("1,a\n1,b", "twice")):
+        table.write_text(text)
+        with pytest.raises(VolumeError, match=sentence):
+            read_labels(path, VOLUME, table=table)
+
+
+def test_names_are_told_apart():
+    for name in ("Artery", "left_kidney", "liver segment IVb", "rib 11", "L5 vertebra"):
+        assert is_anatomical(name), name
+    for name in ("Hans", "vein 1234", "liver of Jane", "", "12", "19610312", "vein/../x"):
+        assert not is_anatomical(name), name
+    for name in ("lesion B", "gall bladder-2", "Läsion"):
+        assert problem_with(name) is None, name
+    for name in ("../x", "a" * 90, "case 1961", "12/03", "12 03", " vein", "x@y"):
+        assert problem_with(name), name
+
+
+def test_no_name_of_a_patient_is_in_the_sentences(tmp_path):
+    fields = segments(("Doe Jane", 1, 0), ("Roe Jim", 1, 0))
+    read = read_labels(written(tmp_path / "a.seg.nrrd", np.ones(SHAPE, np.uint8), fields), VOLUME)
+    assert not re.search("Doe|Roe|Jane|Jim", f"{read.names} {read.remarks}")

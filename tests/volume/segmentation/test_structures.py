@@ -1,0 +1,211 @@
+"""Structures from seeds in volumes whose answer is known, against ITK, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from us_sim.errors import VolumeError
+from us_sim.settings.reading import Reader
+from us_sim.settings.registry import SEGMENTATIONS
+from us_sim.volume.segmentation.settings import SegmentationSettings, read_seeds
+from us_sim.volume.segmentation.structures import segment
+from us_sim.volume.volume import Volume
+
+STEPS = np.array([0.5e-3, 0.5e-3, 1e-3])
+SHAPE = (60, 60, 30)
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, -1]])  # about z, and mirrored
+RADII = np.linalg.norm(
+    (np.indices(SHAPE).transpose(1, 2, 3, 0) - (30, 30, 15)) * STEPS * 1e3, axis=-1
+)
+
+
+def grid():
+    affine = np.eye(4)
+    affine[:3, :3] = TURN * STEPS
+    affine[:3, 3] = (0.05, -0.03, 0.2)
+    return affine
+
+
+def point(*index):
+    """Where a voxel is, mm."""
+    return (1e3 * (grid() @ [*index, 1.0])[:3]).tolist()
+
+
+@pytest.fixture(scope="module")
+def two_tubes():
+    """A dark tube along k that touches a second one, in bright speckle with an edge of no data."""
+    speckle = np.random.default_rng(2).normal(100, 12, SHAPE)
+    i, j, _ = np.indices(SHAPE)
+    tube = np.hypot(i - 20, j - 30) < 8
+    other = np.hypot(i - 42, j - 30) < 8
+    bridge = (abs(j - 30) < 2) & (i > 20) & (i < 42)
+    grey = np.where(tube | other | bridge, np.random.default_rng(3).normal(15, 4, SHAPE), speckle)
+    grey[:, :4] = 0
+    return Volume(np.clip(grey, 0, 255).astype(np.uint8), grid()), tube, other
+
+
+def read(document):
+    return Reader("seeds.yaml", None, VolumeError).read(SegmentationSettings, document)
+
+
+def found(volume, **structures):
+    return segment(volume, read({"structures": structures}))
+
+
+def overlap(one, other):
+    """Dice's coefficient."""
+    return 2 * np.count_nonzero(one & other) / (np.count_nonzero(one) + np.count_nonzero(other))
+
+
+def test_growing_takes_what_hangs_together_and_opening_parts_it(two_tubes):
+    volume, tube, other = two_tubes
+    dark = {"method": "growing", "upper": 50, "seeds_mm": [point(20, 30, 15)]}
+    leaked = found(volume, vein=dark).labels == 1
+    reference, _ = ndimage.label(volume.intensities <= 50, np.ones((3, 3, 3)))
+    assert leaked[42, 30, 15]
+    assert overlap(leaked, reference == reference[20, 30, 15]) > 0.99
+    alone = found(volume, vein=dark | {"open": "1.5 mm"}).labels == 1
+    assert not alone[42, 30, 15]
+    assert overlap(alone, tube) > 0.95
+    assert overlap(alone, other) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("keys", "least"),
+    [
+        ({"method": "growing", "upper": 55, "reach": "30 mm", "open": "1.5 mm"}, 0.95),
+        ({"method": "threshold", "upper": 55, "open": "1.5 mm"}, 0.95),
+        ({"method": "confidence", "multiplier": 6, "iterations": 2, "open": "1.5 mm"}, 0.85),
+        ({"method": "watershed", "edge": "0.7 mm", "marker": "2 mm", "border": False}, 0.9),
+        ({"method": "vesselness", "thinnest": "6 mm", "thickest": "10 mm", "least": 0.3}, 0.6),
+    ],
+)
+def test_every_method_finds_the_tube(two_tubes, keys, least):
+    volume, tube, _ = two_tubes
+    assert keys["method"] in SEGMENTATIONS
+    outside = [point(30, 10, 15), point(30, 52, 15), point(42, 30, 15), point(5, 30, 15)]
+    more = {"outside_mm": outside} if keys["method"] == "watershed" else {}
+    vein = keys | more | {"seeds_voxel": [[20, 30, 15]], "smooth": "0.5 mm"}
+    assert overlap(found(volume, vein=vein).labels == 1, tube) > least
+
+
+def test_covered_is_all_that_has_data(two_tubes):
+    volume, *_ = two_tubes
+    body = found(volume, body={"method": "covered"}).labels == 1
+    expected = np.ones(SHAPE, bool)
+    expected[:, :4] = False
+    assert overlap(body, expected) > 0.999
+
+
+def test_of_structures_that_overlap_the_one_of_higher_priority_stays(two_tubes):
+    volume, tube, other = two_tubes
+    all_dark = {"method": "threshold", "upper": 50}
+    left = {"method": "growing", "upper": 50, "seeds_voxel": [[20, 30, 15]], "open": "1.5 mm"}
+    made = found(volume, fluid=all_dark, vein=left | {"priority": 1})
+    assert made.names == {1: "fluid", 2: "vein"}
+    assert overlap(made.labels == 2, tube) > 0.95
+    assert (made.labels[other] == 1).mean() > 0.98
+    assert any("of fluid are in vein and stay there" in remark for remark in made.remarks)
+    with pytest.raises(VolumeError, match=r"vein: all of it is in structures"):
+        found(volume, fluid=all_dark, vein=left)
+
+
+def test_reach_and_box_end_a_structure(two_tubes):
+    volume, *_ = two_tubes
+    dark = {"method": "growing", "upper": 50, "seeds_voxel": [[20, 30, 15]]}
+    near = found(volume, vein=dark | {"reach": "6 mm"}).labels == 1
+    assert near.any()
+    away = (np.argwhere(near) - (20, 30, 15)) * STEPS
+    assert np.linalg.norm(away, axis=1).max() <= 0.006
+    low = np.minimum(point(10, 20, 10), point(30, 40, 20)).tolist()
+    high = np.maximum(point(10, 20, 10), point(30, 40, 20)).tolist()
+    boxed = np.argwhere(found(volume, vein=dark | {"within_mm": [low, high]}).labels)
+    assert boxed.min(axis=0)[2] == 10
+    assert boxed.max(axis=0)[2] == 20
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "median", "diffusion"])
+def test_every_smoothing_calms_speckle(two_tubes, kind):
+    volume, tube, _ = two_tubes
+    bright = {"method": "threshold", "lower": 85, "upper": 115, "keep": "all", "fill": False}
+    plain = found(volume, muscle=bright).voxels["muscle"]
+    smooth = found(volume, muscle=bright | {"smooth": "1 mm", "smoothing": kind}).voxels["muscle"]
+    assert smooth > plain
+    expected = np.ones(SHAPE, bool)
+    expected[:, :4] = False
+    assert smooth < np.count_nonzero(expected & ~tube)
+
+
+@given(
+    seed=st.tuples(st.integers(0, 59), st.integers(4, 59), st.integers(0, 29)),
+    reach=st.floats(2e-3, 8e-3),
+)
+@settings(max_examples=10, deadline=None)
+def test_a_seed_is_in_its_structure_whatever_is_looked_at(two_tubes, seed, reach):
+    volume, *_ = two_tubes
+    value = int(volume.intensities[seed])
+    keys = {"method": "growing", "lower": value, "upper": min(value + 100, 255)}
+    made = found(volume, part=keys | {"seeds_mm": [point(*seed)], "reach": reach})
+    assert made.labels[seed] == 1
+
+
+DARK = {"method": "growing", "upper": 50}
+
+
+@pytest.mark.parametrize(
+    ("vein", "sentence"),
+    [
+        (DARK, "growing needs seeds"),
+        (DARK | {"seeds_mm": [[0, 0, 0]]}, r"vein\.seeds_mm\[0\].*outside the volume.*spans"),
+        (DARK | {"seeds_voxel": [[99, 0, 0]]}, r"vein\.seeds_voxel\[0\].*60 × 60 × 30"),
+        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 has the grey value .*outside 0 to 50"),
+        (DARK | {"seeds_voxel": [[20, 30, 15]], "open": "9 mm"}, "nothing is left of it"),
+        (DARK | {"seeds_voxel": [[20, 30, 15]], "upper": 5, "lower": 9}, "swap them"),
+        (DARK | {"reach": "3 mm"}, "there are none"),
+        (DARK | {"keep": "seeded"}, "there are no seeds"),
+        (DARK | {"multiplier": 2}, "multiplier is for confidence"),
+        ({"method": "grwoing"}, "did you mean 'growing'"),
+        ({"method": "watershed", "border": False, "seeds_voxel": [[20, 30, 15]]}, "outside"),
+        (DARK | {"seeds_voxel": [[20, 30, 15]], "within_mm": [[0, 0, 0], [1, 1, 1]]}, "nowhere"),
+        (DARK | {"seeds_mm": [[1, 2]]}, "needs 3 values"),
+    ],
+)
+def test_what_cannot_be_found_is_one_sentence(two_tubes, vein, sentence):
+    with pytest.raises(VolumeError, match=sentence):
+        found(two_tubes[0], vein=vein)
+
+
+def test_more_than_the_memory_holds_is_refused_before_anything(two_tubes, monkeypatch):
+    module = "us_sim.volume.segmentation.structures.free_memory"
+    monkeypatch.setattr(module, lambda: 1e5)
+    with pytest.raises(VolumeError, match="give it a `reach`"):
+        found(two_tubes[0], vein=DARK | {"seeds_voxel": [[20, 30, 15]]})
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("structures: {}", "are 0"),
+        ("structures: {'Doe/12.3.1961': {upper: 3}}", "the name must"),
+        ("structures: {vein 1961: {upper: 3}}", "identity"),
+        ("structures: [vein]", "must be a mapping"),
+        ("a: [", "is not YAML"),
+        ("structures: {vein: {smooth: 3}}", "did you mean '3 mm'"),
+    ],
+)
+def test_a_file_of_seeds_that_will_not_do_is_refused(tmp_path, text, sentence):
+    path = tmp_path / "seeds.yaml"
+    path.write_text(text)
+    with pytest.raises(VolumeError, match=sentence) as refused:
+        read_seeds(path)
+    assert str(path) in str(refused.value)
+
+
+def test_the_seeds_that_come_with_the_package_can_be_read():
+    folder = Path(__file__).resolve().parents[3] / "config" / "seeds"
+    names = {path.name: set(read_seeds(path).structures) for path in folder.iterdir()}
+    assert names["liver_sweep.yaml"] == {"vena cava", "portal vein"}

@@ -1,0 +1,123 @@
+"""What the header of a 3D Slicer segmentation (``.seg.nrrd``) says of its segments.
+
+Several segments share a layer as long as they do not overlap; in a layer each has a number. Files
+of Slicer before 5 have a layer for each segment, in which it is 1
+(slicer.readthedocs.io, "Segmentations", "Segmentation file (.seg.nrrd) file format").
+
+>>> from us_sim.volume.files.segments import segments_of
+>>> segments_of({"Segment0_Name": "artery", "Segment0_Color": "1 0 0", "Segment0_LabelValue": "5"})
+[Segment(name='artery', value=5, layer=0, colour=(1.0, 0.0, 0.0), extent=None)]
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from us_sim.errors import VolumeError
+from us_sim.settings.spelling import shown
+from us_sim.volume.anatomical_colours import Colour
+
+__all__ = ["Segment", "check_representation", "segments_of"]
+
+_FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
+_MOST = 255
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One segment of a file."""
+
+    name: str
+    value: int  # of its voxels
+    layer: int
+    colour: Colour | None  # red, green, blue, 0 to 1
+    extent: tuple[int, ...] | None  # first and last index along i, j and k within which it is
+
+
+def segments_of(pairs: Mapping[str, str]) -> list[Segment]:
+    """The segments that the keys and values of a header tell of, in their order; often none.
+
+    Raises:
+        VolumeError: there are more than 255, or a value of one is none; the sentence does not say
+            of which file.
+    """
+    found: dict[int, dict[str, str]] = {}
+    for key, value in pairs.items():
+        if match := _FIELD.fullmatch(key):
+            found.setdefault(int(match[1]), {})[match[2]] = value
+    if len(found) > _MOST:
+        raise VolumeError(f"has {len(found)} segments; {_MOST} are read at most")
+    shared = any("LabelValue" in fields for fields in found.values())
+    return [_segment(number, at, found[number], shared) for at, number in enumerate(sorted(found))]
+
+
+def check_representation(pairs: Mapping[str, str]) -> None:
+    """Refuse a segmentation that is stored as something else than voxels in or out.
+
+    Raises:
+        VolumeError: it is.
+    """
+    for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
+        said = pairs.get(key, "Binary labelmap")
+        if said.lower() != "binary labelmap":
+            raise VolumeError(
+                f"holds segments as {shown(said)}; save it with `Binary labelmap` as the source "
+                f"representation"
+            )
+
+
+def _segment(number: int, at: int, fields: Mapping[str, str], shared: bool) -> Segment:
+    layer = _whole(number, fields, "Layer", 0 if shared else at, least=0)
+    return Segment(
+        _utf8(fields.get("Name", "")) or f"structure {number + 1}",
+        _whole(number, fields, "LabelValue", 1, least=1),
+        layer,
+        _colour(fields.get("Color", "")),
+        _extent(number, fields.get("Extent")),
+    )
+
+
+def _whole(number: int, fields: Mapping[str, str], key: str, default: int, least: int) -> int:
+    text = fields.get(key)
+    if text is None:
+        return default
+    if not re.fullmatch(r"\d{1,9}", text) or int(text) < least:
+        raise VolumeError(
+            f"its Segment{number}_{key} is {shown(text)} where a whole number from {least} on "
+            f"belongs; save it again"
+        )
+    return int(text)
+
+
+def _colour(text: str) -> Colour | None:
+    """A colour; where it is none, the structure's name suggests one."""
+    try:
+        red, green, blue = (float(word) for word in text.split())
+    except ValueError:
+        return None
+    if not all(math.isfinite(part) and 0.0 <= part <= 1.0 for part in (red, green, blue)):
+        return None
+    return red, green, blue
+
+
+def _extent(number: int, text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    words = text.split()
+    if len(words) != 6 or not all(re.fullmatch(r"-?\d{1,9}", word) for word in words):
+        raise VolumeError(
+            f"its Segment{number}_Extent is {shown(text)} where six whole numbers belong; save it "
+            f"again"
+        )
+    return tuple(map(int, words))
+
+
+def _utf8(text: str) -> str:
+    """A text whose bytes were taken for Latin-1, as those of all NRRD headers are here."""
+    with contextlib.suppress(UnicodeError):
+        text = text.encode("latin-1").decode("utf-8")
+    return "".join(c if c.isprintable() else " " for c in text).strip()

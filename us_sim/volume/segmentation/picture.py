@@ -1,0 +1,130 @@
+"""A picture of a segmentation: slices with outlines, and the surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+
+from us_sim.volume.label_map import LabelMap
+from us_sim.volume.surfaces.closed_surface import ClosedSurface
+from us_sim.volume.surfaces.voxel_surface import voxel_surface
+from us_sim.volume.volume import Volume
+
+__all__ = ["draw_segmentation"]
+
+_AXES = ("i", "j", "k")
+_SLICES = 3  # along each axis
+_MOST_TRIANGLES = 20_000  # of all surfaces; matplotlib draws them in a second or two
+_LINES: tuple[Any, ...] = ("solid", "dashed", "dotted", "dashdot")
+"""In turn, since several structures may have one colour."""
+_LIGHT = np.array([0.4, -0.5, 0.77])
+
+
+def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
+    """Write the picture as PNG.
+
+    Each row has slices through the middle and both sides of the structures along one axis of the
+    grid, in millimetres from the grid's first voxel.
+    """
+    figure = Figure(figsize=(17, 11))
+    FigureCanvasAgg(figure)
+    # Its places are given: to find them out takes matplotlib as long as all the drawing.
+    grid = figure.add_gridspec(
+        3, 2 + _SLICES, left=0.03, right=0.97, bottom=0.05, top=0.96, wspace=0.16, hspace=0.22
+    )
+    for axis in range(3):
+        for column, index in enumerate(_indices(found.labels, axis)):
+            _slice(figure.add_subplot(grid[axis, column]), volume, found, axis, index)
+    _surfaces(figure.add_subplot(grid[:2, _SLICES:], projection="3d"), volume, found)
+    voxel = abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
+    keys = [
+        Patch(
+            edgecolor=found.colours[label],
+            facecolor="none",
+            linewidth=2.0,
+            linestyle=_LINES[number % len(_LINES)],
+            label=f"{name}: {found.voxels[name] * voxel * 1e6:.3g} ml",
+        )
+        for number, (label, name) in enumerate(found.names.items())
+    ]
+    beside = figure.add_subplot(grid[2, _SLICES:])
+    beside.axis("off")
+    beside.legend(handles=keys, loc="upper left", fontsize=11, frameon=False, ncols=1)
+    figure.savefig(file, dpi=80)
+
+
+def _indices(labels: NDArray[np.uint8], axis: int) -> list[int]:
+    """Slices along an axis: at parts of a quarter, half and three quarters of what is labelled."""
+    others = tuple(other for other in range(3) if other != axis)
+    covered = np.cumsum(np.count_nonzero(labels, axis=others))
+    parts = (np.arange(_SLICES) + 0.5) / _SLICES * covered[-1]
+    return [int(index) for index in np.searchsorted(covered, parts)]
+
+
+def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -> None:
+    """One slice, brightened by a square root, as vessels are in the dark."""
+    sides = np.delete(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0), axis) * 1e3
+    grey = np.take(volume.intensities, index, axis=axis).T
+    rows, columns = grey.shape
+    extent = (-0.5 * sides[0], (columns - 0.5) * sides[0], (rows - 0.5) * sides[1], -0.5 * sides[1])
+    panel.imshow(np.sqrt(grey / 255.0), cmap="gray", vmin=0.0, vmax=1.0, extent=extent)
+    shown = np.take(found.labels, index, axis=axis).T
+    x, y = np.arange(columns) * sides[0], np.arange(rows) * sides[1]
+    for label in found.names:
+        if (shown == label).any():
+            line = _LINES[list(found.names).index(label) % len(_LINES)]
+            colour = [found.colours[label]]
+            panel.contour(x, y, shown == label, [0.5], colors=colour, linestyles=line)
+    names = [name for other, name in enumerate(_AXES) if other != axis]
+    panel.set_title(f"{_AXES[axis]} = {index}", fontsize=10)
+    panel.set_xlabel(f"{names[0]}, mm", fontsize=8)
+    panel.set_ylabel(f"{names[1]}, mm", fontsize=8)
+    panel.tick_params(labelsize=7)
+
+
+def _surfaces(panel: Any, volume: Volume, found: LabelMap) -> None:
+    """The surfaces on a grid so coarse that they have few triangles."""
+    shown = _coarse_surfaces(volume, found)
+    for label, surface in shown:
+        normals = surface.crosses
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        shade = (0.45 + 0.55 * np.clip(normals @ _LIGHT, 0.0, 1.0))[:, None]
+        corners = 1e3 * surface.vertices[surface.triangles]
+        panel.add_collection3d(Poly3DCollection(corners, facecolors=shade * found.colours[label]))
+    points = 1e3 * np.concatenate([surface.vertices for _, surface in shown])
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach = (high - low).max() / 2.0
+    middle = (high + low) / 2.0
+    panel.set_xlim(middle[0] - reach, middle[0] + reach)
+    panel.set_ylim(middle[1] + reach, middle[1] - reach)
+    panel.set_zlim(middle[2] - reach, middle[2] + reach)
+    panel.set_box_aspect((1, 1, 1))
+    for name, set_label in zip(
+        "LPS", (panel.set_xlabel, panel.set_ylabel, panel.set_zlabel), strict=True
+    ):
+        set_label(f"{name}, mm", fontsize=8)
+    panel.tick_params(labelsize=7)
+
+
+def _coarse_surfaces(volume: Volume, found: LabelMap) -> Sequence[tuple[int, ClosedSurface]]:
+    for step in range(1, 64):
+        placement = volume.index_to_patient.copy()
+        placement[:3, :3] *= step
+        labels = np.ascontiguousarray(found.labels[::step, ::step, ::step])
+        coarse = Volume(labels, placement, labels, found.names)
+        there = [label for label in found.names if (labels == label).any()]
+        # Six faces a voxel at most; a quick look before surfaces are made.
+        if np.count_nonzero(labels) ** (2 / 3) * 12 > 8 * _MOST_TRIANGLES:
+            continue
+        shown = [(label, voxel_surface(coarse, label)[0]) for label in there]
+        if sum(len(surface.triangles) for _, surface in shown) <= _MOST_TRIANGLES:
+            return shown
+    return shown

@@ -1,0 +1,155 @@
+"""What a file of seeds says: the structures of a volume, where each is, and how it is found.
+
+>>> from us_sim.settings.reading import Reader
+>>> from us_sim.volume.segmentation.settings import SegmentationSettings
+>>> document = {"structures": {"vein": {
+...     "method": "growing", "upper": 30, "seeds_mm": [[-4.5, 12, 100]], "reach": "20 mm"}}}
+>>> vein = Reader("seeds.yaml").read(SegmentationSettings, document).structures["vein"]
+>>> vein.method.name, vein.method.given.upper, vein.reach
+('growing', 30.0, 0.02)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from us_sim.errors import UsSimError, VolumeError
+from us_sim.settings.choice import Chosen
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import Reader
+from us_sim.settings.registry import SEGMENTATIONS
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.text_file import read_text
+from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.volume.anatomical_colours import Colour
+from us_sim.volume.structure_terms import problem_with
+
+__all__ = ["SegmentationSettings", "StructureSeeds", "read_seeds"]
+
+_MOST = 255
+_MILLIMETRES = Quantity("number", -1e5, 1e5)
+_INDEX = Quantity("number", 0, 1 << 20)
+_RADIUS = Quantity("length", 0.0, 0.05)
+
+_Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class StructureSeeds(Settings):
+    """How one structure is found. Points are in millimetres, in the volume's own frame."""
+
+    section = "structures"
+    error = VolumeError
+
+    method: Chosen = setting(
+        description="how it is found, with that method's keys beside this one",
+        choice=SEGMENTATIONS,
+        place="beside",
+        default=Chosen("growing"),
+    )
+    seeds_mm: tuple[_Point, ...] = setting(
+        _MILLIMETRES, "points in it, left-posterior-superior, mm", default=()
+    )
+    seeds_voxel: tuple[tuple[int, int, int], ...] = setting(
+        _INDEX, "points in it, as indices of voxels", default=()
+    )
+    outside_mm: tuple[_Point, ...] = setting(
+        _MILLIMETRES, "points that are not in it, mm; for the watershed", default=()
+    )
+    reach: float | None = setting(
+        Quantity("length", 1e-3, 1.0),
+        "what is farther from all seeds is not looked at; not given: all is",
+        default=None,
+    )
+    within_mm: tuple[_Point, _Point] | None = setting(
+        _MILLIMETRES, "lower and upper corner of a box that is looked at, mm", default=None
+    )
+    smoothing: str = setting(
+        description="of the grey values before",
+        choices=("gaussian", "median", "diffusion"),
+        default="gaussian",
+    )
+    smooth: float = setting(
+        Quantity("length", 0.0, 0.02),
+        "standard deviation (gaussian, diffusion) or radius (median) of the smoothing, 0 for none",
+        default=0.0,
+    )
+    open: float = setting(
+        _RADIUS, "what a ball of this radius has no room in is left out", default=0
+    )
+    close: float = setting(
+        _RADIUS, "gaps that a ball of this radius has no room in are filled", default=0
+    )
+    fill: bool = setting(description="holes within it are filled", default=True)
+    keep: str | None = setting(
+        description="which parts stay; not given: those that hold a seed, or all where no seed is",
+        choices=("seeded", "largest", "all"),
+        default=None,
+    )
+    smallest_mm3: float = setting(
+        Quantity("number", 0.0, 1e9), "parts that are smaller are left out, mm³", default=0.0
+    )
+    priority: int = setting(
+        Quantity("number", -100, 100),
+        "where structures overlap the one of higher priority stays; of equal ones the first",
+        default=0,
+    )
+    colour: Colour | None = setting(
+        Quantity("number", 0.0, 1.0),
+        "red, green, blue; not given: as the name suggests",
+        default=None,
+    )
+
+    def check(self) -> None:
+        """Refuse parts by seeds where there is none, and a box without inside."""
+        if not (self.seeds_mm or self.seeds_voxel):
+            if self.keep == "seeded":
+                raise self.refused("keep", "is `seeded`, and there are no seeds: give `seeds_mm`")
+            if self.reach is not None:
+                raise self.refused("reach", "is from seeds, and there are none: give `seeds_mm`")
+        if self.within_mm is not None and not all(
+            low < high for low, high in zip(*self.within_mm, strict=True)
+        ):
+            raise self.refused("within_mm", "has a lower corner that is not below its upper one")
+
+
+@dataclass(frozen=True)
+class SegmentationSettings(Settings):
+    """The structures of a volume by name, in the order of their labels."""
+
+    error = VolumeError
+
+    structures: Mapping[str, StructureSeeds] = setting(
+        description="how each is found, by name; artery, vein, nerve and bone get their colours"
+    )
+    description: str = setting(description="for a person", default="")
+
+    def check(self) -> None:
+        """Refuse no structures, too many, and names that are none."""
+        if not 1 <= len(self.structures) <= _MOST:
+            raise self.refused("structures", f"are {len(self.structures)}; give 1 to {_MOST}")
+        for name in self.structures:
+            if problem := problem_with(name):
+                raise self.refused(f"structures.{name}", f"the name {problem}")
+
+
+def read_seeds(path: Path) -> SegmentationSettings:
+    """A file of seeds.
+
+    Raises:
+        VolumeError: it cannot be read, or a key or value will not do.
+    """
+    try:
+        document = load_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise VolumeError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from error
+    except YamlError as error:
+        raise VolumeError(f"{path}: {error}") from error
+    try:
+        return Reader(str(path), None, VolumeError).read(SegmentationSettings, document)
+    except VolumeError:
+        raise
+    except UsSimError as error:
+        raise VolumeError(f"{path}: {error}") from error

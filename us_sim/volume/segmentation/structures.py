@@ -1,0 +1,180 @@
+"""Structures of a volume, each found as its seeds say, put together into labels.
+
+>>> import numpy as np
+>>> from us_sim.settings.choice import Chosen
+>>> from us_sim.volume.segmentation.growing import SeededGrowing
+>>> from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
+>>> from us_sim.volume.segmentation.structures import segment
+>>> from us_sim.volume.volume import Volume
+>>> grey = np.full((20, 20, 20), 90, np.uint8)
+>>> grey[5:15, 8:12, 8:12] = 10
+>>> volume = Volume(grey, np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+>>> dark = Chosen("growing", SeededGrowing(upper=30))
+>>> vein = StructureSeeds(method=dark, seeds_mm=[[10, 10, 10]])
+>>> segment(volume, SegmentationSettings({"vein": vein})).voxels
+{'vein': 160}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import SimpleITK as sitk
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from us_sim.errors import VolumeError
+from us_sim.settings.registry import SEGMENTATIONS
+from us_sim.volume.files.stored_voxels import free_memory
+from us_sim.volume.label_map import LabelMap
+from us_sim.volume.segmentation.morphology import (
+    ball_closed,
+    ball_opened,
+    largest_part,
+    parts_at_least,
+    parts_with,
+)
+from us_sim.volume.segmentation.region import Index, Region, array_of
+from us_sim.volume.segmentation.seed_points import box_of, outside_of, seeds_of
+from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
+from us_sim.volume.volume import Volume
+
+__all__ = ["segment"]
+
+_BYTES = 40
+"""Memory of a voxel that is looked at: some images in single precision, and parts as numbers."""
+
+_DIFFUSION_STEPS = 5
+
+
+def segment(
+    volume: Volume,
+    settings: SegmentationSettings,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> LabelMap:
+    """The labels of structures, numbered in the order in which the settings name them.
+
+    Raises:
+        VolumeError: a seed lies outside the volume or where nothing grows from it, nothing is left
+            of a structure, or what is looked at takes more memory than is free.
+    """
+    labels = np.zeros(volume.shape, np.uint8)
+    names = dict(enumerate(settings.structures, start=1))
+    order = sorted(names, key=lambda number: -settings.structures[names[number]].priority)
+    remarks: list[str] = []
+    for done, number in enumerate(order):
+        name = names[number]
+
+        def tell(part: float, what: str, done: int = done, name: str = name) -> None:
+            progress((done + part) / len(order), f"{name}: {what}" if what else name)
+
+        tell(0.0, "")
+        mask, box = _found(volume, name, settings, tell)
+        there = labels[box]
+        for other in np.unique(there[mask]):
+            if other:
+                both = int(np.count_nonzero(there[mask] == other))
+                remarks.append(f"{both} voxels of {name} are in {names[int(other)]} and stay there")
+        free = mask & (there == 0)
+        if not free.any():
+            raise VolumeError(
+                f"structures.{name}: all of it is in structures that come before it: give it a "
+                f"higher priority, or leave it out"
+            )
+        there[free] = number
+    progress(1.0, "")
+    colours = {n: one.colour for n, one in enumerate(settings.structures.values(), 1) if one.colour}
+    return LabelMap(labels, names, colours, tuple(remarks))
+
+
+def _found(
+    volume: Volume,
+    name: str,
+    settings: SegmentationSettings,
+    progress: Callable[[float, str], None],
+) -> tuple[NDArray[np.bool_], tuple[slice, ...]]:
+    """Where a structure is, (i, j, k) in a box of the volume, and that box."""
+    asked = settings.structures[name]
+    spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
+    seeds = seeds_of(volume, name, asked)
+    box = box_of(volume, name, asked, seeds, spacing)
+    needed = _BYTES * float(np.prod([span.stop - span.start for span in box]))
+    if needed > (free := free_memory()):
+        raise VolumeError(
+            f"structures.{name}: takes {needed / 1e9:.1f} GB of memory where {free / 1e9:.1f} GB "
+            f"are free: give it a `reach` or `within_mm`"
+        )
+    others = [
+        point
+        for other, one in settings.structures.items()
+        for point in (
+            seeds_of(volume, other, one) if other != name else outside_of(volume, name, one)
+        )
+    ]
+    first = np.array([span.start for span in box])
+    grey = _smoothed(volume.intensities[box].astype(np.float32), asked, spacing)
+    inside = [_index(np.array(seed) - first) for seed in seeds]
+    beside = [np.array(other) - first for other in others]
+    near = [_index(at) for at in beside if (at >= 0).all() and (at < grey.shape).all()]
+    region = Region(grey, spacing, tuple(inside), tuple(near), name, progress)
+    mask = asked.method.settings(SEGMENTATIONS).found_in(region)
+    if asked.reach is not None:
+        mask &= _near(inside, asked.reach, spacing, grey.shape)
+    return _finished(mask, asked, region), box
+
+
+def _index(at: NDArray[np.int64]) -> Index:
+    i, j, k = (int(n) for n in at)
+    return i, j, k
+
+
+def _finished(mask: NDArray[np.bool_], asked: StructureSeeds, region: Region) -> NDArray[np.bool_]:
+    """The mask opened, closed, filled, and its parts that stay."""
+    mask = ball_opened(mask, asked.open, region.spacing)
+    mask = ball_closed(mask, asked.close, region.spacing)
+    if asked.fill:
+        mask = np.asarray(ndimage.binary_fill_holes(mask))
+    mask = parts_at_least(mask, asked.smallest_mm3 * 1e-9 / float(np.prod(region.spacing)))
+    keep = asked.keep or ("seeded" if region.seeds else "all")
+    if keep == "seeded":
+        mask = parts_with(mask, region.seeds)
+    elif keep == "largest":
+        mask = largest_part(mask)
+    if not mask.any():
+        raise VolumeError(
+            f"structures.{region.name}: nothing is left of it: widen its range, open it "
+            f"less, or keep smaller parts"
+        )
+    return mask
+
+
+def _smoothed(
+    grey: NDArray[np.float32], asked: StructureSeeds, spacing: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    if asked.smooth <= 0.0:
+        return grey
+    steps = asked.smooth / spacing
+    if asked.smoothing == "gaussian":
+        return np.asarray(ndimage.gaussian_filter(grey, steps, truncate=3.0))
+    image = sitk.GetImageFromArray(np.ascontiguousarray(grey.transpose(2, 1, 0)))
+    if asked.smoothing == "median":
+        smooth = sitk.Median(image, np.maximum(1, np.rint(steps)).astype(int).tolist())
+        return array_of(smooth).astype(np.float32)
+    # Diffusion for a time t smooths as a Gaussian of √(2 t) does, in voxels, away from edges.
+    time = float(np.mean(steps) ** 2) / 2.0
+    rounds = max(_DIFFUSION_STEPS, int(np.ceil(time / 0.0625)))
+    smooth = sitk.CurvatureAnisotropicDiffusion(image, time / rounds, 3.0, 1, rounds)
+    return array_of(smooth).astype(np.float32)
+
+
+def _near(
+    seeds: list[Index], reach: float, spacing: NDArray[np.float64], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """(i, j, k) what is within reach of a seed."""
+    near = np.zeros(shape, bool)
+    grid = np.ogrid[tuple(slice(0, size) for size in shape)]
+    for seed in seeds:
+        away = sum(((n - at) * side) ** 2 for n, at, side in zip(grid, seed, spacing, strict=True))
+        near |= away <= reach**2
+    return near

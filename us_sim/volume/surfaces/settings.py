@@ -1,0 +1,34 @@
+"""How surfaces are made of labels, and as which files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from us_sim.errors import VolumeError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+__all__ = ["SURFACE_FORMATS", "SurfaceSettings"]
+
+SURFACE_FORMATS = ("stl", "ply", "vtp", "obj")
+"""What surfaces may be written as."""
+
+
+@dataclass(frozen=True)
+class SurfaceSettings(Settings):
+    """How surfaces are made of labels."""
+
+    section = "surfaces"
+    error = VolumeError
+
+    smoothing: float | None = setting(
+        Quantity("length", 0.0, 0.1),
+        "bumps of a surface that are shorter than this are taken away, 0 for none; six voxels "
+        "where not given",
+        default=None,
+    )
+    decimation: float = setting(
+        Quantity("length", 0.0, 0.05),
+        "triangles are joined as long as the surface stays within this distance, 0 for not",
+        default=0.0,
+    )
