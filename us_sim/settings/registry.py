@@ -49,7 +49,6 @@ SEGMENTATIONS = Choice(
     "segmentation method",
     key="method",
     error=VolumeError,
-    needs=True,
     growing=f"{_SEGMENTATION}.growing:SeededGrowing",
     confidence=f"{_SEGMENTATION}.growing:ConfidenceConnected",
     threshold=f"{_SEGMENTATION}.growing:Threshold",
