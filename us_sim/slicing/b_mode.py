@@ -94,11 +94,12 @@ class BMode:
         warm_up(self._method, self._threads)
         formation = ImageFormation(probe, imaging)
         blank = np.zeros((probe.rows, probe.columns), dtype=np.uint8)
-        coupling = None
-        if formation.needs_contact:
-            surface = self._contact_surface(deformed=False)
-            coupling = surface.coupling(surface.rest_nodes, probe, Pose())
-        formation.form([blank for _ in formation.planes(Pose())], coupling)
+        blanks = [blank for _ in formation.planes(Pose())]
+        if not formation.needs_contact:
+            formation.form(blanks)
+            return
+        surface = self._contact_surface(deformed=False)
+        formation.form(blanks, *surface.contact(surface.rest_nodes, probe, Pose()))
 
     def carry(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
         """Let this mesh carry the volume: (N, 3) m at rest, and (M, 4) indices into them.
@@ -133,12 +134,11 @@ class BMode:
             VolumeError: the volume has too many voxels.
         """
         slices = [self._slice(plane, nodes) for plane in self._formation.planes(pose)]
-        coupling = None
-        if self._formation.needs_contact:
-            surface = self._contact_surface(nodes is not None)
-            where = surface.rest_nodes if nodes is None else nodes
-            coupling = surface.coupling(where, self._probe, pose)
-        return self._formation.form(slices, coupling)
+        if not self._formation.needs_contact:
+            return self._formation.form(slices)
+        surface = self._contact_surface(nodes is not None)
+        where = surface.rest_nodes if nodes is None else nodes
+        return self._formation.form(slices, *surface.contact(where, self._probe, pose))
 
     def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
         """The volume's label at each pixel (rows, columns), 0 where there is nothing.

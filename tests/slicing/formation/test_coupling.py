@@ -34,7 +34,7 @@ def test_the_gap_is_the_height_above_flat_skin(height):
 
 def test_coupling_from_air_to_full_contact():
     def coupled(z):
-        line = SURFACE.coupling(BLOCK.nodes, PROBE, Pose([0, 0.0011, z]))
+        line = SURFACE.contact(BLOCK.nodes, PROBE, Pose([0, 0.0011, z]))[0]
         assert np.ptp(line) == 0.0
         return float(line[0])
 
@@ -57,7 +57,7 @@ def test_a_tilted_probe_is_in_air_exactly_where_it_is_off_the_skin(degrees, z, m
     height = x * np.sin(angle) - z  # of each line's start above the skin
     np.testing.assert_allclose(gap, height / np.cos(angle), atol=1e-9)
     np.testing.assert_allclose(press, -gap, atol=1e-9)
-    coupling = SURFACE.coupling(BLOCK.nodes, PROBE, pose)
+    coupling = SURFACE.contact(BLOCK.nodes, PROBE, pose)[0]
     assert (coupling[gap > GEL_FILM[1]] == 0.0).all()
     assert (coupling[gap < 0.0] >= np.float32(LIGHT_CONTACT)).all()
 
@@ -89,7 +89,7 @@ def test_beside_the_tissue_there_is_nothing_to_touch():
     np.testing.assert_allclose(gap[~beside], -0.002, atol=1e-12)
     turned = Pose([0, 0.0011, -0.01], [1, 0, 0, 0])  # looks away
     assert np.isinf(SURFACE.gaps(BLOCK.nodes, PROBE, turned)[0]).all()
-    far = SURFACE.coupling(BLOCK.nodes, PROBE, Pose([0, 0.5, 0.002]))
+    far = SURFACE.contact(BLOCK.nodes, PROBE, Pose([0, 0.5, 0.002]))[0]
     assert (far == 0.0).all()
 
 
@@ -103,7 +103,7 @@ def test_triangles_may_face_inward():
     inward = ContactSurface(BLOCK.nodes, BLOCK.boundary[:, ::-1])
     pose = tilted(10.0, 0.001)
     np.testing.assert_array_equal(
-        inward.coupling(BLOCK.nodes, PROBE, pose), SURFACE.coupling(BLOCK.nodes, PROBE, pose)
+        inward.contact(BLOCK.nodes, PROBE, pose)[0], SURFACE.contact(BLOCK.nodes, PROBE, pose)[0]
     )
 
 
@@ -135,4 +135,4 @@ def test_a_surface_that_cannot_be_is_refused(nodes, triangles, words):
 
 def test_nodes_of_another_mesh_are_refused():
     with pytest.raises(MeshError, match="588 nodes at rest"):
-        SURFACE.coupling(BLOCK.nodes[:5], PROBE, Pose())
+        SURFACE.contact(BLOCK.nodes[:5], PROBE, Pose())

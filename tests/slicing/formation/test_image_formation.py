@@ -37,7 +37,7 @@ def test_by_default_the_slice_itself_is_the_picture():
 
 
 def test_what_is_off_is_not_imported():
-    names = ("elevation", "resolution", "reverberation", "grey_levels", "coupling")
+    names = ("elevation", "gel_layer", "resolution", "reverberation", "grey_levels", "coupling")
     parts = [f"us_sim.slicing.formation.{name}" for name in names]
     assert all(map(importlib.util.find_spec, parts))
     code = (

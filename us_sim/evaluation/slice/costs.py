@@ -66,9 +66,10 @@ def costs(volume: Volume, quick: bool) -> tuple[list[Cost], list[Cost]]:
 
         def image(number: int) -> object:
             nodes = frames[number % len(frames)].nodes
-            coupling = surface.coupling(nodes, probe, pose) if formation.needs_contact else None
             images = [slicer.image(nodes, plane) for plane in formation.planes(pose)]
-            return formation.form(images, coupling)
+            if not formation.needs_contact:
+                return formation.form(images)
+            return formation.form(images, *surface.contact(nodes, probe, pose))
 
         return image
 

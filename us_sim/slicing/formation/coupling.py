@@ -8,7 +8,7 @@
 >>> block = box_mesh([-0.01, 0.05], [-0.05, 0.05], [0.0, 0.05])  # skin from x = -10 mm on
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, lines=8)
 >>> surface = ContactSurface(block.nodes, block.boundary)
->>> surface.coupling(block.nodes, probe, Pose([0.0, 0.0, 0.002]))  # pressed 2 mm
+>>> surface.contact(block.nodes, probe, Pose([0.0, 0.0, 0.002]))[0]  # pressed 2 mm
 array([0., 0., 1., 1., 1., 1., 1., 1.], dtype=float32)
 """
 
@@ -72,11 +72,17 @@ class ContactSurface:
         self.rest_nodes = nodes
         self._triangles = corners
 
-    def coupling(self, nodes: ArrayLike, probe: Probe, pose: Pose) -> NDArray[np.float32]:
-        """(lines,) the fraction of an echo's amplitude transmitted: 0 in air, 1 in full contact.
+    def contact(
+        self, nodes: ArrayLike, probe: Probe, pose: Pose
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """How each line meets the surface.
 
         Args:
             nodes: (N, 3) m, where the surface's nodes are now.
+
+        Returns:
+            (lines,) the fraction of an echo's amplitude transmitted: 0 in air, 1 in full contact;
+            and (lines,) m, the gap as `gaps` says.
 
         Raises:
             MeshError: another number of nodes than at rest.
@@ -86,7 +92,7 @@ class ContactSurface:
         bead = GEL_BEAD * np.maximum(press, 0.0)
         wet = 1.0 - _smooth((gap - bead - near) / (far - near))
         firm = LIGHT_CONTACT + (1.0 - LIGHT_CONTACT) * _smooth(press / FULL_PRESS)
-        return np.asarray(wet * firm, dtype=np.float32)
+        return np.asarray(wet * firm, dtype=np.float32), gap
 
     def gaps(
         self, nodes: ArrayLike, probe: Probe, pose: Pose

@@ -28,6 +28,7 @@ from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
     from us_sim.slicing.formation.elevation import Elevation
+    from us_sim.slicing.formation.gel_layer import GelLayer
     from us_sim.slicing.formation.grey_levels import GreyLevels
     from us_sim.slicing.formation.resolution import Resolution
     from us_sim.slicing.formation.reverberation import Reverberation
@@ -38,8 +39,9 @@ __all__ = ["ImageFormation"]
 class ImageFormation:
     """The stages between slices and the picture, in the order in which echoes meet them.
 
-    They are the beam's thickness, its width and the pulse's length; then air in front of the face;
-    then gain, dynamic range and grey map. The result depends on settings and arguments only.
+    They are the beam's thickness, the layer of gel at the face, the beam's width and the pulse's
+    length; then air in front of the face; then gain, dynamic range and grey map. The result depends
+    on settings and arguments only.
 
     Args:
         probe: its geometry.
@@ -49,6 +51,7 @@ class ImageFormation:
     def __init__(self, probe: Probe, imaging: Imaging) -> None:
         self._probe = probe
         self._elevation: Elevation | None = None
+        self._gel_layer: GelLayer | None = None
         self._resolution: Resolution | None = None
         self._reverberation: Reverberation | None = None
         self._grey_levels: GreyLevels | None = None
@@ -61,8 +64,10 @@ class ImageFormation:
 
             self._resolution = Resolution(probe, imaging)
         if imaging.contact:
+            from us_sim.slicing.formation.gel_layer import GelLayer
             from us_sim.slicing.formation.reverberation import Reverberation
 
+            self._gel_layer = GelLayer(probe)
             self._reverberation = Reverberation(probe, imaging)
         if imaging.changes_grey_levels:
             from us_sim.slicing.formation.grey_levels import GreyLevels
@@ -71,7 +76,7 @@ class ImageFormation:
 
     @property
     def needs_contact(self) -> bool:
-        """Whether `form` asks how well each line is coupled to the skin."""
+        """Whether `form` asks how each line meets the skin."""
         return self._reverberation is not None
 
     def planes(self, pose: Pose) -> list[SlicePlane]:
@@ -96,16 +101,20 @@ class ImageFormation:
         self,
         images: Sequence[NDArray[np.uint8]],
         coupling: NDArray[np.float32] | None = None,
+        gap: NDArray[np.float64] | None = None,
     ) -> NDArray[np.uint8]:
         """The picture (rows, columns); the first image itself when nothing is to be done.
 
         Args:
             images: the slices on `planes`, (rows, columns) each.
             coupling: (lines,) from 0 in air to 1 in full contact; None is full contact.
+            gap: (lines,) m, from the face to what carries the volume; None is none.
         """
         image = images[0]
         if self._elevation is not None:
             image = self._elevation.average(images)
+        if self._gel_layer is not None and coupling is not None and gap is not None:
+            image = self._gel_layer.filled(image, gap, coupling)
         if self._resolution is not None:
             image = self._resolution.spread(image)
         if self._reverberation is not None and coupling is not None:

@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
@@ -55,6 +54,7 @@ from us_sim.tissue.solvers.solver import (
     TissueSolver,
     same_pose,
 )
+from us_sim.tissue.solvers.strides import strides
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
 
@@ -70,10 +70,6 @@ the probe can touch, for a tolerance of 1."""
 
 _SINKS = 0.5
 """Depth of the probe in the tissue, over that spacing, that is worth saying."""
-
-_STRIDE, _MOST_STRIDES = 3e-3, 8
-"""Way of a probe in tissue that is gone at once, m; and how many of them are gone in a frame, a
-longer one being a leap."""
 
 _APPROACHING = 0.7
 """Part of a frame's time after which no stride is begun any more."""
@@ -318,7 +314,8 @@ class FemNonlinear(TissueSolver):
         """Go most of a long way in strides, until a time (s): tissue that is hit or swept aside at
         once may end elsewhere than if the probe had moved there.
         """
-        for nearer in self._strides(pose):
+        last = self._aimed if self._newton.load > 0.0 else None
+        for nearer in strides(last, pose, self._newton.depth(pose), self._arm):
             if end is not None and time.perf_counter() > end:
                 break
             start = self._predicted(nearer)
@@ -326,20 +323,6 @@ class FemNonlinear(TissueSolver):
                 self._newton.step(self._newton.patience, 0.0, None if k else start)
                 if self._newton.imbalance <= _LOOSE * self._newton.load:
                     break
-
-    def _strides(self, pose: Pose) -> list[Pose]:
-        """Poses on the way to one: from the last, or after a leap from before the tissue."""
-        newton, last = self._newton, self._aimed
-        if last is not None and newton.load > 0.0:
-            turned = 2 * math.acos(min(1.0, abs(float(last.orientation @ pose.orientation))))
-            way = math.dist(last.position, pose.position) + self._arm * turned
-            count = math.ceil(way / _STRIDE)
-            if count <= _MOST_STRIDES:
-                return [interpolate(last, pose, k / count) for k in range(1, count)]
-        depth = newton.depth(pose)
-        count = min(math.ceil(depth / _STRIDE), _MOST_STRIDES)
-        backs = [(1 - k / count) * depth for k in range(1, count)]
-        return [Pose(pose.position - x * pose.rotation[:, 2], pose.orientation) for x in backs]
 
     def _predicted(self, pose: Pose) -> NDArray[np.float64]:
         """(3, N) m, aim at a new pose and return the linear answer to it."""
