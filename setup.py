@@ -18,6 +18,7 @@ NODES = [
     "slice_interpolator",
     "space_mouse_driver",
     "tissue_deformer",
+    "volume_reconstructor",
 ]
 FOLDER = Path(__file__).resolve().parent
 

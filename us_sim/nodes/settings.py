@@ -20,6 +20,7 @@ from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_
 from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.volume.reconstruction.live import LiveBox, LiveVolume
 
 __all__ = [
     "NODES",
@@ -311,6 +312,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "camera_driver": (CameraDriverSettings, AwaitedSettings),
     "space_mouse_driver": (SpaceMouseDriverSettings,),
     "image_writer": (ImageWriterSettings,),
+    "volume_reconstructor": (LiveVolume, LiveBox),
 }
 """The settings whose fields are a node's parameters; those of parts of a scene come on top."""
 

@@ -35,6 +35,7 @@ _REPORTING = (
     *("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"),
     *("haptic_renderer", "openigtlink_bridge", "path_player", "session_player"),
     *("session_recorder", "camera_driver", "space_mouse_driver", "session_monitor"),
+    "volume_reconstructor",
 )
 
 TOPICS = (
@@ -123,7 +124,7 @@ TOPICS = (
         publishers=("probe_tracker",),
         subscribers=(
             *("tissue_deformer", "skin_deformer", "slice_interpolator"),
-            "openigtlink_bridge",
+            *("openigtlink_bridge", "volume_reconstructor"),
         ),
     ),
     Topic(
@@ -199,7 +200,7 @@ TOPICS = (
         "sensor_msgs/Image",
         "`mono8`, in frame `probe`: columns along the array, rows along the depth",
         publishers=("slice_interpolator",),
-        subscribers=("openigtlink_bridge", "image_writer", "path_player"),
+        subscribers=("openigtlink_bridge", "image_writer", "path_player", "volume_reconstructor"),
     ),
     Topic(
         "ultrasound/image_annotated",
@@ -212,7 +213,7 @@ TOPICS = (
         "std_msgs/Float64MultiArray",
         "4 × 4, from (column, row, 0, 1) of a pixel to metres in frame `probe`",
         publishers=("slice_interpolator",),
-        subscribers=("openigtlink_bridge",),
+        subscribers=("openigtlink_bridge", "volume_reconstructor"),
         latched=True,
     ),
     Topic(
