@@ -10,7 +10,8 @@ from pathlib import Path
 __all__ = ["MODULES", "TARGETS", "Target", "add_targets", "target"]
 
 MODULES = tuple(
-    f"tests.fuzz.{room}" for room in ("bags", "volumes", "segmentations", "meshes", "scenes")
+    f"tests.fuzz.{room}"
+    for room in ("bags", "volumes", "dicoms", "segmentations", "meshes", "scenes")
 )
 """Where the targets are."""
 

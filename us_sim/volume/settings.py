@@ -27,7 +27,7 @@ class VolumeSettings(Settings):
     error = VolumeError
     alternatives = MappingProxyType({"file": (), "case": (), "phantom": ("seed", "voxel_size")})
 
-    file: str | None = setting(description="MHA, NRRD or NIfTI", default=None, file=True)
+    file: str | None = setting(description="MHA, NRRD, NIfTI or DICOM", default=None, file=True)
     case: str | None = setting(
         description="case, or its name, in place of a file: its volume and its labels",
         default=None,

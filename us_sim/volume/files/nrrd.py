@@ -135,7 +135,7 @@ def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         if not file.readline(64).startswith(b"NRRD"):
             raise VolumeError(
                 f"{path}: cannot be read as an image: it does not begin as NRRD does; give an "
-                f"MHA, NRRD or NIfTI volume"
+                f"MHA, NRRD, NIfTI or DICOM volume"
             )
         while line := file.readline(_LONGEST_LINE).decode("latin-1").rstrip("\r\n"):
             if file.tell() > _LARGEST_HEADER:

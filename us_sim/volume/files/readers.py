@@ -1,4 +1,4 @@
-"""Volume files into frame ``patient``: MetaImage, NRRD and NIfTI, through SimpleITK.
+"""Volume files into frame ``patient``: MetaImage, NRRD and NIfTI through SimpleITK, and DICOM.
 
 >>> import tempfile, SimpleITK
 >>> from us_sim.volume.files.readers import read_volume
@@ -23,13 +23,16 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.files.axis_order import fill_from_slices
+from us_sim.volume.files.dicom.header import is_dicom
 from us_sim.volume.files.frame_sequence import holds_sequence
+from us_sim.volume.files.placement import checked_placement
 from us_sim.volume.files.stored_size import check_stored_size
 from us_sim.volume.volume import Volume
 
 __all__ = ["open_image", "read_placement", "read_volume", "stored_voxels_of"]
 
-# Not what else SimpleITK reads: a damaged DICOM file ends the process that reads it.
+# Not what else SimpleITK reads: a damaged DICOM file ends the process in which it reads one.
 _READERS = {
     "mha": "MetaImageIO",
     "mhd": "MetaImageIO",
@@ -38,10 +41,8 @@ _READERS = {
     "nii": "NiftiImageIO",
 }
 
-_METRES = 1e-3  # these formats hold millimetres
-_SPACINGS = (1e-4, 1e2)  # mm, from a microscope's to one voxel for half a limb
-_FARTHEST = 1e5  # mm
-_ORTHONORMAL = 1e-3  # what rounding may do to the products of a direction matrix's columns
+
+_SLAB = 1 << 23  # bytes that are turned at a time
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
@@ -52,6 +53,10 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     mapped linearly so that its smallest finite value becomes 0 and its largest 255 (a constant
     image becomes 0, and so does NaN, which some programs write where nothing was scanned).
 
+    DICOM needs the extra ``dicom``: an Enhanced US Volume, or another file of several images that
+    states where they lie; of several volumes in time the first is taken. Colour becomes grey. The
+    axes are those that the file states: for an Enhanced US Volume its own frame of reference.
+
     Raises:
         VolumeError: the file is missing or no image, holds fewer or more bytes than its header
             says, is larger than `LARGEST_VOLUME` or the free memory, is not a scalar
@@ -59,7 +64,15 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
             origin or direction that places no volume.
     """
     path = Path(path)
+    if _is_dicom(path):
+        from us_sim.volume.files.dicom.placed_images import placed_images
+
+        placed = placed_images([path])
+        return Volume(placed.voxels(), placed.placement)
     header, index_to_patient = open_image(path)
+    plain = _plain_voxels(path, header)
+    if plain is not None:
+        return Volume(plain, index_to_patient)
     image = stored_voxels_of(path, header)
     stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
     return Volume(_grey_values(path, stored), index_to_patient)
@@ -71,7 +84,37 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels.
     """
-    return open_image(Path(path))[1]
+    path = Path(path)
+    if _is_dicom(path):
+        from us_sim.volume.files.dicom.placed_images import placed_images
+
+        return placed_images([path]).placement
+    return open_image(path)[1]
+
+
+def _plain_voxels(path: Path, header: sitk.ImageFileReader) -> NDArray[np.uint8] | None:
+    """The voxels (i, j, k) of a file that holds them as they are, without a second copy of them."""
+    stored = check_stored_size(path)
+    if stored.packed or header.GetPixelID() != sitk.sitkUInt8:
+        return None
+    i, j, k = header.GetSize()
+    voxels = np.empty((i, j, k), np.uint8)
+    slab = max(1, _SLAB // (i * j))
+    with stored.file.open("rb") as file:
+        file.seek(stored.start + stored.skip)
+        for first in range(0, k, slab):
+            count = min(slab, k - first)
+            data = np.fromfile(file, np.uint8, i * j * count)
+            if data.size != i * j * count:
+                raise VolumeError(f"{path}: became shorter while it was read; try again")
+            fill_from_slices(voxels, first, data.reshape(count, j, i))
+    return voxels
+
+
+def _is_dicom(path: Path) -> bool:
+    """Whether it is a DICOM file; one with another format's name is taken for what it says."""
+    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
+    return ending not in _READERS and path.is_file() and is_dicom(path)
 
 
 def stored_voxels_of(path: Path, header: sitk.ImageFileReader) -> sitk.Image:
@@ -104,7 +147,7 @@ def open_image(
     if not os.path.exists(path):
         raise VolumeError(f"{path}: there is no such file")
     if not os.path.isfile(path):
-        raise VolumeError(f"{path}: is not a file; give one MHA, NRRD or NIfTI volume")
+        raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
     if holds_sequence(path):
         raise VolumeError(
             f"{path}: is a sequence of tracked frames, not a volume; make one of it with "
@@ -118,7 +161,7 @@ def open_image(
         header.ReadImageInformation()
     except RuntimeError as error:
         raise VolumeError(
-            f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume"
+            f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume"
         ) from error
     placement = _placement(path, header, layers=layers)
     value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
@@ -145,45 +188,15 @@ def _placement(path: Path, header: sitk.ImageFileReader, *, layers: bool) -> NDA
             f"{path}: holds {header.GetNumberOfComponents()} numbers per voxel ({pixel}); "
             f"convert it to one grey value"
         )
-    spacing = np.array(header.GetSpacing())
-    # MetaImage turns a spacing that is not a number into 0 before it comes here.
-    if not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
-        raise VolumeError(
-            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; every "
-            f"spacing must be a number above zero"
-        )
-    direction = np.array(header.GetDirection()).reshape(3, 3)
-    origin = np.array(header.GetOrigin())
-    if not (np.isfinite(direction).all() and np.isfinite(origin).all()):
-        raise VolumeError(f"{path}: has an origin or a direction matrix that is not finite")
-    if abs(np.linalg.det(direction)) < 1e-6:
-        raise VolumeError(f"{path}: has a singular direction matrix, so its axes span no volume")
-    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
-        raise VolumeError(
-            f"{path}: has axes that are sheared or scaled by its direction matrix; resample it on "
-            f"a grid with right angles"
-        )
-    if not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):
-        raise VolumeError(
-            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; that of a "
-            f"body is {_SPACINGS[0]:g} to {_SPACINGS[1]:g} mm: correct it"
-        )
-    if np.abs(origin).max() > _FARTHEST:
-        raise VolumeError(
-            f"{path}: lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} "
-            f"m are possible at most: correct it"
-        )
-    placement = np.eye(4)
-    placement[:3, :3] = direction * spacing * _METRES
-    placement[:3, 3] = origin * _METRES
-    return placement
+    direction = header.GetDirection()
+    return checked_placement(path, header.GetSpacing(), direction, header.GetOrigin())
 
 
 def _grey_values(path: Path, stored: NDArray[np.generic]) -> NDArray[np.uint8]:
     """Stored values (k, j, i) of any scalar type as (i, j, k) uint8."""
     grey = np.empty(stored.shape[::-1], dtype=np.uint8)
     if stored.dtype == np.uint8:
-        grey[:] = stored.transpose(2, 1, 0)
+        fill_from_slices(grey, 0, np.asarray(stored, np.uint8))
         return grey
     ranges = [_finite_range(plane) for plane in stored]
     low = min(lower for lower, _ in ranges)

@@ -49,6 +49,6 @@ def _voxels(path: Path) -> StoredVoxels:
     if name.endswith((".nii", ".nii.gz")):
         return nifti_voxels(path)
     raise VolumeError(
-        f"{path}: cannot be read as an image; give an MHA, NRRD or NIfTI volume, which 3D Slicer "
-        f"makes of DICOM and others"
+        f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which 3D "
+        f"Slicer makes of others"
     )

@@ -19,7 +19,6 @@ A file is written beside its place under another name and renamed, so it is whol
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -29,13 +28,18 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.files.axis_order import file_order
+from us_sim.volume.files.plain_writing import (
+    check_fields,
+    grid_in_mm,
+    partial_file,
+    write_plain,
+)
 from us_sim.volume.volume import Volume
 
 __all__ = ["write_labels", "write_volume"]
 
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
-_MILLIMETRES = 1e3  # these formats hold millimetres
-_ORTHONORMAL = 1e-6  # of a direction matrix's columns; the readers' own limit is wider
 _SLAB = 1 << 24  # voxels that are turned at a time
 _FASTEST = 1  # zlib's level; speckle hardly becomes smaller with any other
 
@@ -60,7 +64,11 @@ def write_volume(
     path = Path(path)
     if path.name.lower().endswith(".seg.nrrd"):
         raise VolumeError(f"{path}: .seg.nrrd is for labels; name the volume .nrrd")
-    _write(path, _image(path, volume.intensities, volume), dict(header or {}), packed=False)
+    fields = dict(header or {})
+    if path.name.lower().endswith((".nrrd", ".mha")):
+        write_plain(path, volume.intensities, volume.index_to_patient, fields)
+        return
+    _write(path, _image(path, volume.intensities, volume), fields, packed=False)
 
 
 def write_labels(
@@ -119,26 +127,14 @@ def _segments(
 
 def _image(path: Path, voxels: NDArray[np.uint8], volume: Volume) -> sitk.Image:
     """The voxels (i, j, k) where the volume places them; a slab is turned at a time."""
-    matrix = volume.index_to_patient[:3, :3] * _MILLIMETRES
-    spacing = np.linalg.norm(matrix, axis=0)
-    direction = matrix / spacing
-    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
-        raise VolumeError(
-            f"{path}: the volume's axes are not at right angles, which image files cannot hold; "
-            f"resample it on a grid with right angles"
-        )
-    if min(voxels.shape) < 2:
-        raise VolumeError(
-            f"{path}: the volume has {' × '.join(map(str, voxels.shape))} voxels; two or more "
-            f"along each axis can be written"
-        )
+    spacing, direction, origin = grid_in_mm(path, voxels.shape, volume.index_to_patient)
     image = sitk.Image(list(voxels.shape), sitk.sitkUInt8)
     step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
     for k in range(0, voxels.shape[2], step):
-        slab = np.ascontiguousarray(voxels[:, :, k : k + step].transpose(2, 1, 0))
-        image[:, :, k : k + step] = sitk.GetImageFromArray(slab)
+        slab = sitk.GetImageFromArray(file_order(voxels[:, :, k : k + step]))
+        image[:, :, k : k + step] = slab
     image.SetSpacing(spacing.tolist())
-    image.SetOrigin((volume.index_to_patient[:3, 3] * _MILLIMETRES).tolist())
+    image.SetOrigin(origin.tolist())
     image.SetDirection(direction.ravel().tolist())
     return image
 
@@ -147,24 +143,11 @@ def _write(path: Path, image: sitk.Image, fields: Mapping[str, str], *, packed: 
     ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
         raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
+    check_fields(path, fields)
     for key, value in fields.items():
-        if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
-            raise VolumeError(
-                f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
-                f"without blanks, colons and equals signs, and one line of text"
-            )
         image.SetMetaData(key, value)
-    try:
-        folder = tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.parent)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    partial = Path(folder, f"image{ending}")
-    try:
-        sitk.WriteImage(image, str(partial), packed, _FASTEST)
-        os.replace(partial, path)
-    except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or "the disk may be full"
-        raise VolumeError(f"{path}: cannot be written: {reason}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-        os.rmdir(folder)
+    with partial_file(path, f"image{ending}") as partial:
+        try:
+            sitk.WriteImage(image, str(partial), packed, _FASTEST)
+        except RuntimeError as error:
+            raise VolumeError(f"{path}: cannot be written: the disk may be full") from error

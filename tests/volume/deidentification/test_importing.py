@@ -1,0 +1,281 @@
+"""What an import makes, what it refuses, and what it leaves where it ends."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned, write
+
+from us_sim.command.main import main
+from us_sim.errors import UsSimError, VolumeError
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.deidentification.importing import import_files, look_at
+from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS, USED, kept_values
+from us_sim.volume.deidentification.report import report_picture, report_text
+from us_sim.volume.deidentification.settings import ImportSettings
+from us_sim.volume.files.readers import read_volume
+from us_sim.volume.sequences.sweep import read_sweep
+
+VOXELS = np.random.default_rng(5).integers(0, 256, (30, 24, 5), dtype=np.uint8)
+CINE = np.random.default_rng(3).integers(0, 256, (4, 60, 80), dtype=np.uint8)
+
+
+@pytest.fixture
+def volume(tmp_path):
+    return write(tmp_path / "DOE_JANE.dcm", enhanced(VOXELS, turned()))
+
+
+@pytest.fixture
+def cine(tmp_path):
+    made = header(CINE, US_MULTI_FRAME, FrameTime=40.0, FrameIncrementPointer=0x00181063)
+    return write(tmp_path / "DOE_JANE.dcm", made)
+
+
+def test_a_volume_becomes_a_case_that_can_be_opened(volume, tmp_path, capsys):
+    assert main(["import", str(volume), "--out", str(tmp_path / "arm")]) == 0
+    assert "30 × 24 × 5 voxels of 0.5 × 0.25 × 2 mm" in capsys.readouterr().out
+    case = read_case(tmp_path / "arm")
+    assert case.settings.name == "arm"
+    (step,) = case.steps
+    assert step.what == "imported"
+    assert step.counts["elements dropped"] > 10
+    np.testing.assert_array_equal(case.volume().intensities, VOXELS)
+    np.testing.assert_allclose(case.placement()[0], read_volume(volume).index_to_patient, atol=1e-9)
+
+
+def test_a_crop_leaves_every_voxel_where_it_was(volume, tmp_path):
+    import_files([volume], tmp_path / "a.nrrd", ImportSettings(crop="3,2,20,15"))
+    part, whole = read_volume(tmp_path / "a.nrrd"), read_volume(volume)
+    assert part.shape == (18, 14, 5)
+    np.testing.assert_array_equal(part.intensities, VOXELS[3:21, 2:16])
+    at = whole.patient_to_index @ part.index_to_patient @ [1, 1, 1, 1]
+    np.testing.assert_allclose(at, [4, 3, 1, 1], atol=1e-9)
+
+
+def test_a_cine_becomes_images_with_their_times(cine, tmp_path):
+    out = tmp_path / "cine.igs.mha"
+    import_files([cine], out, ImportSettings(crop="10,5,69,54"))
+    sweep = read_sweep(out, tracked=False)
+    np.testing.assert_allclose(sweep.times, [0.0, 0.04, 0.08, 0.12])
+    np.testing.assert_array_equal(np.array(list(sweep.images())), CINE[:, 5:55, 10:70])
+
+
+def test_pixels_have_the_size_that_regions_say(tmp_path):
+    made = header(CINE, US_MULTI_FRAME)
+    edges = {"MinX0": 10, "MinY0": 5, "MaxX1": 80, "MaxY1": 59}  # 80: the first column beyond
+    region = {f"RegionLocation{key}": value for key, value in edges.items()}
+    region |= {"PhysicalUnitsXDirection": 3, "PhysicalUnitsYDirection": 3}
+    region |= {"PhysicalDeltaX": 0.05, "PhysicalDeltaY": 0.025}
+    made.SequenceOfUltrasoundRegions = [item(RegionSpatialFormat=1, RegionDataType=2, **region)]
+    import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
+    assert sitk.ReadImage(str(tmp_path / "a.igs.mha")).GetSpacing()[:2] == (0.5, 0.25)
+
+
+def test_without_regions_a_person_decides(cine, tmp_path, capsys):
+    out = tmp_path / "out" / "cine.igs.mha"
+    out.parent.mkdir()
+    assert main(["import", str(cine), "--out", str(out)]) == 1
+    said = capsys.readouterr().err
+    assert "there is no sequence of ultrasound regions" in said
+    assert "--crop 0,0,79,59 (a proposal), or --keep-whole-image" in said
+    assert not list(out.parent.iterdir())
+    assert main(["import", str(cine), "--out", str(out), "--keep-whole-image"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("edges", "kind", "doubt"),
+    [
+        ((0, 0, 90, 59), (1, 1), "reaches to 90,59 in an image of 80 × 60"),
+        ((50, 0, 40, 59), (1, 1), "holds no pixel"),
+        ((0, 0, None, 59), (1, 1), "has no edges"),
+        ((0, 0, 79, 59), (3, 3), "no region is a two-dimensional image"),
+    ],
+)
+def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, doubt):
+    made = header(CINE, US_MULTI_FRAME)
+    region = item(RegionSpatialFormat=kind[0], RegionDataType=kind[1])
+    for key, value in zip(("MinX0", "MinY0", "MaxX1", "MaxY1"), edges, strict=True):
+        if value is not None:
+            setattr(region, f"RegionLocation{key}", value)
+    made.SequenceOfUltrasoundRegions = [region]
+    with pytest.raises(VolumeError, match=doubt):
+        import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
+
+
+def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
+    frames = np.random.default_rng(4).integers(20, 90, (5, 200, 300), dtype=np.uint8)
+    frames[:, :60] = 0
+    for frame in frames:
+        cv2.putText(frame, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
+    path = write(tmp_path / "a.dcm", header(frames, US_MULTI_FRAME))
+    found = look_at([path], None, ImportSettings())
+    (line,) = found.imported.text
+    where = np.argwhere(frames[0, :60] > 0)
+    found_at = (line.top, line.left), (line.bottom, line.right)
+    np.testing.assert_allclose(found_at, (where.min(axis=0), where.max(axis=0)), atol=1)
+    assert found.imported.proposal.top >= 55  # what moves is below
+    picture = report_picture(found.imported)
+    assert (picture == (60, 60, 255)).all(axis=-1).sum() > 200  # the red box
+    kept = look_at([path], tmp_path / "b.igs.mha", ImportSettings(keep_whole_image=True))
+    assert "1 would go on" in report_text(kept.imported)
+    import_files(
+        [path], tmp_path / "c.igs.mha", ImportSettings(keep_whole_image=True, blank_text=True)
+    )
+    (first, *_) = read_sweep(tmp_path / "c.igs.mha", tracked=False).images()
+    assert not first[:60].any()
+    assert np.array_equal(first[80:], frames[0, 80:])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--crop", "0,0,80,59"], "last column is 79"),
+        (["--crop", "5,5,4,9"], "holds no pixel"),
+        (["--crop", "5;5;4;9"], "is no rectangle"),
+        (["--crop", "0,0,9,9", "--keep-whole-image"], "keep one"),
+        (["--volume", "0"], "volume"),
+    ],
+)
+def test_wrong_options_are_refused(cine, tmp_path, more, message, capsys):
+    assert main(["import", str(cine), "--out", str(tmp_path / "o.igs.mha"), *more]) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [cine]
+
+
+@pytest.mark.parametrize("name", ["case", "a.nrrd", "a.nii.gz"])
+def test_a_cine_is_no_volume(cine, tmp_path, name):
+    with pytest.raises(VolumeError, match=r"2D cine of 4 images.* not a volume"):
+        import_files([cine], tmp_path / name, ImportSettings(keep_whole_image=True))
+    assert list(tmp_path.iterdir()) == [cine]
+
+
+def test_what_is_there_is_not_replaced_and_names_must_fit(volume, tmp_path):
+    (tmp_path / "a.nrrd").write_text("mine")
+    with pytest.raises(VolumeError, match="exists already"):
+        import_files([volume], tmp_path / "a.nrrd")
+    assert (tmp_path / "a.nrrd").read_text() == "mine"
+    with pytest.raises(VolumeError, match="ends as no volume's does"):
+        import_files([volume], tmp_path / "a.stl")
+    with pytest.raises(UsSimError, match=r"cannot be (written|made)"):
+        import_files([volume], Path("/proc/nowhere/a.nrrd"))
+
+
+def test_files_that_do_not_go_together_are_refused(volume, tmp_path):
+    other = tmp_path / "a.nrrd"
+    sitk.WriteImage(sitk.Image([4, 4, 4], sitk.sitkUInt8), str(other))
+    (tmp_path / "note.txt").write_text("hello")
+    for files, message in (
+        ([volume, other], "is no DICOM file"),
+        ([tmp_path / "note.txt"], "is no DICOM file"),
+        ([tmp_path / "nowhere.dcm"], "there is no such file"),
+    ):
+        with pytest.raises(VolumeError, match=message):
+            look_at(files, None, ImportSettings())
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(VolumeError, match="has no DICOM files in it"):
+        look_at([empty], None, ImportSettings())
+
+
+def test_a_damaged_image_leaves_nothing_behind(tmp_path):
+    from made_dicom import compressed
+    from pydicom.uid import JPEG2000Lossless
+
+    made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
+    data = bytearray(made.PixelData)
+    last = bytes(data).rindex(b"\xff\x4f\xff\x51")  # the beginning of the last code stream
+    data[last + 4 : last + 60] = bytes(56)
+    made.PixelData = bytes(data)
+    path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
+    with pytest.raises(VolumeError, match="damaged"):
+        import_files([path], tmp_path / "a.igs.mha", ImportSettings(crop="0,0,9,9"))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_report_is_printed_and_written_with_its_picture(cine, tmp_path, capsys):
+    folder = tmp_path / "report"
+    assert main(["import", str(cine), "--report", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "**Nothing can be written yet**" in said
+    assert "- PatientName\n" in said
+    assert "Jane" not in said
+    text = (folder / "report.md").read_text()
+    assert "![The first image](first_image.png)" in text
+    assert "Jane" not in text
+    picture = cv2.imread(str(folder / "first_image.png"))
+    assert picture.shape == (60, 80, 3)
+    assert main(["import", str(cine), "--report", str(folder)]) == 1
+    assert "holds a report already" in capsys.readouterr().err
+    assert main(["import", str(cine)]) == 1
+    assert "say where to" in capsys.readouterr().err
+
+
+def test_only_numbers_in_their_ranges_and_words_of_closed_lists_go_on():
+    good = {"FrameTime": 33.3, "MechanicalIndex": 1.2, "ApexPosition": [0.0, 1.0, -2.0]}
+    named = {"TransducerType": "CURVED LINEAR"}
+    kept = kept_values(item(**good, **named))
+    assert kept == {
+        "frame_time_ms": "33.3",
+        "mechanical_index": "1.2",
+        "apex_position_mm": "0 1 -2",
+        "transducer_type": "CURVED LINEAR",
+    }
+    for number in NUMBERS:
+        count = number.count or 1
+        for wrong in (int(number.low) - 1, int(number.high) + 1):
+            values = [wrong] * count
+            made = item(**{number.keyword: values if count > 1 else wrong})
+            if number.within:
+                made = item(**{number.within: [made]})
+            assert not kept_values(made), number.keyword
+    assert not kept_values(item(TransducerType="SMITH", MechanicalIndex="nan"))
+
+
+def test_every_name_on_the_positive_list_is_the_standards():
+    from pydicom.datadict import tag_for_keyword
+
+    keywords = {number.keyword for number in NUMBERS} | USED
+    keywords |= {keyword for keyword, _ in CLOSED_LISTS.values()}
+    assert {keyword for keyword in keywords if tag_for_keyword(keyword) is None} == set()
+    assert not {keyword for keyword in keywords if "Patient" in keyword} - {
+        "ImagePositionPatient",
+        "ImageOrientationPatient",
+    }
+
+
+MEASURED = """
+import resource, sys
+from pathlib import Path
+import us_sim.volume.cases.writing, us_sim.volume.deidentification.dicom_source
+from us_sim.volume.deidentification.importing import import_files
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+import_files([sys.argv[1]], Path(sys.argv[2]))
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has another unit elsewhere")
+def test_an_import_takes_no_more_than_three_times_its_size(tmp_path):
+    voxels = np.zeros((256, 256, 256), np.uint8)
+    path = write(tmp_path / "a.dcm", enhanced(voxels, np.diag([0.5, 0.5, 0.5, 1.0])))
+    ran = subprocess.run(
+        [sys.executable, "-c", MEASURED, str(path), str(tmp_path / "o.nrrd")],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ,
+    )
+    assert int(ran.stdout) < 3 * voxels.size
+
+
+def test_a_single_image_is_a_sequence_of_one(tmp_path):
+    path = write(tmp_path / "a.dcm", header(CINE[:1], US_IMAGE))
+    import_files([path], tmp_path / "a.mha", ImportSettings(keep_whole_image=True))
+    assert (tmp_path / "a.mha").read_bytes().endswith(CINE[0].tobytes())

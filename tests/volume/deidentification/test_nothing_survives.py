@@ -1,0 +1,270 @@
+"""No text and no identifier of an original is in any byte of what an import writes."""
+
+import gzip
+import re
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from made_dicom import US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
+from pydicom.uid import RLELossless
+
+from us_sim.command.main import main
+from us_sim.errors import UsSimError
+from us_sim.volume.deidentification.importing import look_at
+from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS
+from us_sim.volume.deidentification.report import report_text
+from us_sim.volume.deidentification.settings import ImportSettings
+from us_sim.volume.files.dicom import decoder, grey
+
+BUNDLED = Path(pydicom.__path__[0]) / "data" / "test_files"
+WHOLE = ImportSettings(keep_whole_image=True)
+TEXTS = ("AE", "AS", "CS", "DA", "DT", "LO", "LT", "PN", "SH", "ST", "TM")
+TEXTS += ("UC", "UI", "UR", "UT", "UN", "OB")
+
+
+def texts_of(header, depth=0):
+    """Every text in a header, those in private elements and sequences too."""
+    for element in list(getattr(header, "file_meta", [])) if depth == 0 else []:
+        yield from texts_of_element(element)
+    for tag in list(header.keys()):
+        try:
+            element = header[tag]
+            inner = list(element.value) if element.VR == "SQ" else []
+        except Exception:
+            continue
+        for each in inner:
+            yield from texts_of(each, depth + 1)
+        if not inner:
+            yield from texts_of_element(element)
+
+
+def texts_of_element(element):
+    if element.VR not in TEXTS or element.value is None or element.keyword == "PixelData":
+        return
+    several = hasattr(element.value, "__iter__") and not isinstance(element.value, str | bytes)
+    for value in element.value if several else [element.value]:
+        yield value.decode("latin-1") if isinstance(value, bytes) else str(value)
+
+
+def telling(path):
+    """Words of four letters or more, identifiers and long numbers of an original."""
+    found = set()
+    for text in texts_of(pydicom.dcmread(path, force=True)):
+        found |= set(re.findall(r"[^\W\d_]{4,}", text))
+        found |= set(re.findall(r"[0-9]+(?:\.[0-9]+){4,}", text))
+        found |= set(re.findall(r"[0-9]{7,}", text))
+    return found
+
+
+def written(folder):
+    """All bytes of all files: headers with the files' names, and voxels; packed ones unpacked."""
+    headers, voxels = b"", b""
+    for file in sorted(folder.rglob("*")):
+        headers += file.name.encode() + b"\n"
+        if not file.is_file():
+            continue
+        content = file.read_bytes()
+        content = gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+        ends = {".nrrd": b"\n\n", ".mha": b"ElementDataFile = LOCAL\n"}
+        end = ends.get(file.suffix)
+        at = content.index(end) + len(end) if end else 352 if ".nii" in file.name else len(content)
+        headers, voxels = headers + content[:at], voxels + content[at:]
+    return headers, voxels
+
+
+@pytest.fixture(scope="module")
+def own_words(tmp_path_factory):
+    """Words that we write whatever is imported."""
+    folder = tmp_path_factory.mktemp("own")
+    made = enhanced(np.full((3, 3, 3), 200, np.uint8), turned())
+    path = write(folder / "a.dcm", made)
+    out = folder / "out"
+    out.mkdir()
+    for name in ("o.nrrd", "o.mha", "o.nii.gz", "case"):
+        look_at([path], out / name, WHOLE).write()
+    flat = write(folder / "b.dcm", header(np.zeros((2, 3, 3), np.uint8), US_MULTI_FRAME))
+    look_at([flat], out / "o.igs.mha", WHOLE).write()
+    words = set(re.findall(r"[A-Za-z]{4,}", written(out)[0].decode("latin-1")))
+    words |= {one.name for one in NUMBERS} | set(CLOSED_LISTS)
+    words |= {word for _, terms in CLOSED_LISTS.values() for word in terms}
+    return words
+
+
+def survivors(telling_words, data, own):
+    """Words of an original that headers hold beside our own, or voxels, if these are no chance."""
+    headers, voxels = (part.decode("latin-1") for part in data)
+    ours = sorted(own, key=len, reverse=True)
+    rest = re.sub("|".join(map(re.escape, ours)), " ", headers).lower()
+    forms = {word: word.encode().decode("latin-1") for word in telling_words}
+    found = {word for word, form in forms.items() if form.lower() in rest}
+    long = {word: form for word, form in forms.items() if len(word) > 5 and len(set(word)) > 3}
+    return found | {word for word, form in long.items() if form in voxels}
+
+
+def decoded_here(jobs, form):
+    """As the decoder's process does it, without starting one for every file."""
+    shape = (form.rows, form.columns) + ((3,) if form.samples == 3 else ())
+    from pydicom.pixels import iter_pixels
+
+    for file, which in jobs:
+        try:
+            for frame in iter_pixels(file.path, indices=list(which), raw=False):
+                assert frame.shape == shape
+                yield frame
+        except Exception as error:
+            raise UsSimError(f"{file.path}: {decoder.WRONG}") from error
+
+
+def all_bundled():
+    return sorted(p for p in BUNDLED.rglob("*") if p.is_file() and p.suffix in (".dcm", ""))
+
+
+def test_of_every_file_that_comes_with_pydicom(tmp_path, own_words, monkeypatch):
+    monkeypatch.setattr(grey, "decoded_frames", decoded_here)
+    endings = ("o.igs.mha", "o.mha")
+    imported, refused, sentences, left = 0, 0, [], []
+    for number, path in enumerate(all_bundled()):
+        out = tmp_path / str(number)
+        out.mkdir()
+        try:
+            look_at([path], out / endings[number % 2], WHOLE).write()
+        except UsSimError as error:
+            refused += 1
+            sentences.append(str(error))
+            left.extend(out.iterdir())
+            continue
+        imported += 1
+        assert not survivors(telling(path), written(out), own_words), path
+    assert not left
+    assert all("\n" not in sentence for sentence in sentences)
+    assert imported > 70
+    assert refused > 10  # structured reports, directories and the like hold no image
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_of_every_real_ultrasound_file(
+    shared_data, tmp_path, own_words, number, capsys, monkeypatch
+):
+    folder = shared_data / "dicom-us-2d"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    monkeypatch.setattr(grey, "decoded_frames", decoded_here)
+    path = sorted(folder.glob("*.dcm"))[number]
+    out = tmp_path / "out"
+    out.mkdir()
+    assert main(["import", str(path), "--out", f"{out}/o.igs.mha", "--keep-whole-image"]) == 0
+    said = capsys.readouterr().out.replace(str(out), "").encode()
+    own = own_words | set(re.findall(r"[A-Za-z]{4,}", "element elements header dropped kept"))
+    secret = telling(path)
+    assert len(secret) > 10
+    assert not survivors(secret, written(out), own)
+    assert not {word for word in secret - own if len(word) > 5 and word.encode() in said}
+
+
+PLANTED = "Zyxwoman"
+
+
+def planted(made):
+    """Plant a name in every kind of text, in private elements, sequences, overlays and beyond."""
+    values = {
+        "PatientName": f"{PLANTED}^Quorra",
+        "InstitutionName": f"{PLANTED} Clinic",
+        "PatientComments": f"born {PLANTED}",
+        "StationName": PLANTED,
+        "RetrieveURL": f"http://{PLANTED}.org",
+        "TransducerType": f"{PLANTED}",
+        "DepthOfScanField": 98279,
+        "StudyDate": "19710203",
+        "LongCodeValue": PLANTED * 40,
+        "ImageComments": PLANTED,
+        "BodyPartExamined": PLANTED.upper(),
+    }
+    for key, value in values.items():
+        setattr(made, key, value)
+    for tag, kind in ((0x00091001, "LO"), (0x00091002, "UN"), (0x00091003, "OB")):
+        made.add_new(tag, kind, PLANTED if kind == "LO" else PLANTED.encode() + b"\0" * 4)
+    made.add_new(0x00090010, "LO", f"{PLANTED} CREATOR")
+    inner = item(
+        CodeMeaning=PLANTED, RequestAttributesSequence=[item(RequestedProcedureID=PLANTED)]
+    )
+    made.AnatomicRegionSequence = [inner]
+    made.add_new(0x60003000, "OW", PLANTED.encode())
+    made.add_new(0x60004000, "LT", PLANTED)
+    made.DataSetTrailingPadding = PLANTED.encode() * 3
+    made.preamble = (PLANTED.encode() * 20)[:128]
+    return made
+
+
+def test_of_a_volume_with_names_in_every_place(tmp_path, own_words):
+    voxels = np.random.default_rng(2).integers(0, 256, (9, 8, 7), dtype=np.uint8)
+    path = write(tmp_path / "a.dcm", planted(enhanced(voxels, turned(), times=2)))
+    assert path.read_bytes().count(PLANTED.encode()) > 50
+    for name in ("o.nrrd", "o.mha", "o.nii", "o.nii.gz", "arm"):
+        out = tmp_path / f"out {name}"
+        out.mkdir()
+        found = look_at([path], out / name, ImportSettings())
+        found.write()
+        assert not survivors(telling(path), written(out), own_words), name
+        assert PLANTED.lower() not in report_text(found.imported).lower()
+        assert b"98279" not in written(out)[0]
+
+
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii.gz"])
+def test_of_other_formats_nothing_but_the_grid_goes_on(tmp_path, suffix):
+    import SimpleITK as sitk
+
+    image = sitk.GetImageFromArray(np.arange(60, dtype=np.uint8).reshape(5, 4, 3))
+    image.SetSpacing((0.5, 0.25, 2.0))
+    for key in ("Comment", "0010|0010", PLANTED, "descrip", "aux_file", "intent_name"):
+        image.SetMetaData(key, PLANTED)
+    path = tmp_path / f"a{suffix}"
+    sitk.WriteImage(image, str(path))
+    assert PLANTED.encode() in b"".join(written(tmp_path))
+    out = tmp_path / "out"
+    out.mkdir()
+    found = look_at([path], out / "o.nrrd", ImportSettings())
+    found.write()
+    assert PLANTED.encode() not in b"".join(written(out))
+    assert PLANTED not in report_text(found.imported)
+    assert found.imported.dropped
+    again = sitk.ReadImage(str(out / "o.nrrd"))
+    assert again.GetSpacing() == pytest.approx((0.5, 0.25, 2.0))
+    np.testing.assert_array_equal(sitk.GetArrayFromImage(again), sitk.GetArrayFromImage(image))
+
+
+def test_new_identifiers_are_of_random_numbers(tmp_path):
+    path = write(tmp_path / "a.dcm", enhanced(np.zeros((3, 3, 3), np.uint8), turned()))
+    made = [look_at([path], None, ImportSettings()).source.kept for _ in range(2)]
+    first, second = (each["frame_of_reference_uid"] for each in made)
+    assert first != second
+    for new in (first, second):
+        number = int(new.removeprefix("2.25."))
+        assert number >> 76 & 0xF == 4  # a UUID of the random kind (RFC 9562, 5.4)
+        assert len(new) <= 64
+
+
+def test_burned_in_text_is_gone_from_every_image(tmp_path):
+    rng = np.random.default_rng(7)
+    for colour in (False, True):
+        frames = rng.integers(0, 120, (5, 40, 60), dtype=np.uint8)
+        frames[:, :8] = frames[:, :, :6] = 255  # stands for text
+        pixels = np.repeat(frames[..., None], 3, axis=3) if colour else frames
+        made = header(pixels, US_MULTI_FRAME)
+        edges = {"MinX0": 6, "MinY0": 8, "MaxX1": 49, "MaxY1": 39}
+        region = {f"RegionLocation{key}": value for key, value in edges.items()}
+        bar = dict.fromkeys(region, 0) | {"RegionLocationMaxX1": 5, "RegionLocationMaxY1": 39}
+        made.SequenceOfUltrasoundRegions = [
+            item(RegionSpatialFormat=1, RegionDataType=1, **region),
+            item(RegionSpatialFormat=0, RegionDataType=13, **bar),
+        ]
+        for syntax in (None,) if colour else (None, RLELossless):
+            source = compressed(made, syntax) if syntax else made
+            path = write(tmp_path / "a.dcm", source, *filter(None, [syntax]))
+            out = tmp_path / f"{colour}{syntax}.igs.mha"
+            look_at([path], out, ImportSettings()).write()
+            kept = np.frombuffer(out.read_bytes()[-frames.size :], np.uint8).reshape(frames.shape)
+            expected = np.zeros_like(frames)
+            expected[:, 8:40, 6:50] = frames[:, 8:40, 6:50]
+            np.testing.assert_array_equal(kept, expected)

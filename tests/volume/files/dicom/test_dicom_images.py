@@ -1,0 +1,215 @@
+"""Images of DICOM files: grey values, claims of sizes, decoders."""
+
+import sys
+import zlib
+
+import numpy as np
+import pydicom
+import pytest
+from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
+from pydicom.pixels import apply_color_lut, pixel_array
+from pydicom.uid import ExplicitVRBigEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files import stored_voxels
+from us_sim.volume.files.dicom import decoding
+from us_sim.volume.files.dicom.frame_times import frame_times
+from us_sim.volume.files.dicom.grey import GreyImages
+from us_sim.volume.files.dicom.header import open_dicom
+
+CINE = np.random.default_rng(3).integers(0, 256, (4, 12, 10), dtype=np.uint8)
+
+
+def images(path):
+    return np.array(list(GreyImages([open_dicom(path)]).images()))
+
+
+@pytest.fixture
+def real(shared_data):
+    folder = shared_data / "dicom-us-2d"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    return folder
+
+
+def test_a_real_palette_of_16_bits_is_as_pydicom_makes_it(real):
+    path = real / "gdcm-US-ALOKA-16.dcm"
+    coloured = apply_color_lut(pixel_array(path), pydicom.dcmread(path)) / 65535
+    brightness = coloured @ [0.299, 0.587, 0.114] * 255
+    grey = images(path)[0]
+    # Its table is written in 8 bits, in entries of 16: the brightest is 255.
+    scale = 255 / brightness.max() if brightness.max() < 2 else 1.0
+    assert np.abs(grey - brightness * scale).max() <= 1.0
+
+
+@pytest.mark.parametrize(
+    "name", ["JPGLosslessP14SV1_1s_1f_8b", "US1_J2KR", "US1_UNCR", "examples_ybr_color"]
+)
+def test_real_images_are_as_pydicom_decodes_them(real, name):
+    path = real / f"{name}.dcm"
+    stored = pixel_array(path).astype(float)
+    expected = stored @ [0.299, 0.587, 0.114] if stored.shape[-1] == 3 else stored
+    grey = images(path).reshape(expected.shape)
+    assert np.abs(grey - expected).max() <= 1.5
+
+
+def test_the_same_real_image_is_the_same_compressed_and_not(real):
+    np.testing.assert_array_equal(images(real / "US1_J2KR.dcm"), images(real / "US1_UNCR.dcm"))
+
+
+@pytest.mark.parametrize("syntax", [RLELossless, JPEG2000Lossless])
+def test_compressed_images_come_back(tmp_path, syntax):
+    path = write(tmp_path / "a.dcm", compressed(header(CINE, US_MULTI_FRAME), syntax), syntax)
+    np.testing.assert_array_equal(images(path), CINE)
+
+
+def test_big_endian_signed_and_inverted_values(tmp_path):
+    stored = (np.arange(4 * 12 * 10).reshape(4, 12, 10) - 100).astype(np.int16)
+    expected = np.floor(np.arange(480).reshape(stored.shape) / 479 * 255 + 0.5)
+    path = write(tmp_path / "a.dcm", header(stored, US_MULTI_FRAME))
+    np.testing.assert_array_equal(images(path), expected)
+    swapped = header(stored.astype(">i2"), US_MULTI_FRAME)
+    path = write(tmp_path / "b.dcm", swapped, ExplicitVRBigEndian)
+    np.testing.assert_array_equal(images(path), expected)
+    white = header(CINE, US_MULTI_FRAME, PhotometricInterpretation="MONOCHROME1")
+    np.testing.assert_array_equal(images(write(tmp_path / "c.dcm", white)), 255 - CINE)
+    falling = header(CINE, US_MULTI_FRAME, RescaleSlope=-2.0, RescaleIntercept=5.0)
+    low, high = int(CINE.min()), int(CINE.max())
+    spread = np.floor((high - CINE.astype(float)) / (high - low) * 255 + 0.5)
+    np.testing.assert_array_equal(images(write(tmp_path / "d.dcm", falling)), spread)
+
+
+def test_each_image_may_be_rescaled_on_its_own(tmp_path):
+    voxels = np.full((3, 3, 4), 10, np.uint8)
+    voxels[0] = 0
+    made = enhanced(voxels, turned())
+    for n, group in enumerate(made.PerFrameFunctionalGroupsSequence):
+        by = item(RescaleSlope=float(n + 1), RescaleIntercept=0.0, RescaleType="US")
+        group.PixelValueTransformationSequence = [by]
+    grey = images(write(tmp_path / "a.dcm", made))
+    np.testing.assert_array_equal(grey.max(axis=(1, 2)), [64, 128, 191, 255])
+
+
+def test_bits_that_do_not_count_are_ignored(tmp_path):
+    stored = CINE.astype(np.uint16) | 0xF000
+    path = write(tmp_path / "a.dcm", header(stored, US_MULTI_FRAME, BitsStored=12, HighBit=11))
+    grey = images(path)
+    assert grey.min() == 0
+    assert grey.max() == 255
+
+
+def test_times_of_images(tmp_path):
+    vector = header(CINE, US_MULTI_FRAME, FrameTimeVector=[0.0, 10.0, 30.0, 20.0])
+    file = open_dicom(write(tmp_path / "a.dcm", vector))
+    np.testing.assert_allclose(frame_times(file, 4), [0, 0.01, 0.04, 0.06])
+    rate = open_dicom(write(tmp_path / "b.dcm", header(CINE, US_MULTI_FRAME, CineRate=50)))
+    np.testing.assert_allclose(frame_times(rate, 4), [0, 0.02, 0.04, 0.06])
+    none = open_dicom(write(tmp_path / "c.dcm", header(CINE, US_MULTI_FRAME)))
+    assert frame_times(none, 4) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"Rows": 13}, "holds 480 bytes of images where its header says 520"),
+        ({"NumberOfFrames": 3}, "holds 480 bytes of images where its header says 360"),
+        ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "are read at most"),
+        ({"NumberOfFrames": -1}, "holds -1 images"),
+        ({"Rows": 0}, "10 × 0 pixels"),
+        ({"BitsAllocated": 1}, "of 1 bits"),
+        ({"BitsStored": 77}, "77 of 8 bits"),
+        ({"SamplesPerPixel": 4}, "4 numbers as"),
+        ({"PhotometricInterpretation": "RGB"}, "1 numbers as 'RGB'"),
+        ({"PhotometricInterpretation": "PALETTE COLOR"}, "table of red values is missing"),
+    ],
+)
+def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values))
+    with pytest.raises(VolumeError, match=message) as refused:
+        images(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
+    monkeypatch.setattr(stored_voxels, "free_memory", lambda: 500.0)
+    with pytest.raises(VolumeError, match="of memory where"):
+        images(path)
+
+
+def test_a_small_compressed_file_that_claims_gigabytes_is_refused_at_once(tmp_path, monkeypatch):
+    def never(*_):
+        raise AssertionError("it was to be refused before anything is decoded")
+
+    monkeypatch.setattr(decoding.subprocess, "Popen", never)
+    made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
+    for values in ({"NumberOfFrames": 5000}, {"Rows": 60000, "Columns": 60000}):
+        lying = made.copy()
+        for key, value in values.items():
+            setattr(lying, key, value)
+        path = write(tmp_path / "a.dcm", lying, RLELossless)
+        with pytest.raises(VolumeError, match=r"4 compressed images where|are read at most"):
+            images(path)
+
+
+def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
+    made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
+    made.Rows = 13
+    path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
+    with pytest.raises(VolumeError, match="damaged, or not of the size and type"):
+        images(path)
+
+
+def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):
+    # A folder without packages stands for an installation without decoders.
+    path = write(
+        tmp_path / "a.dcm", compressed(header(CINE, US_IMAGE), JPEGBaseline8Bit), JPEGBaseline8Bit
+    )
+    shadow = tmp_path / "shadow"
+    for name in ("PIL", "gdcm", "pylibjpeg"):
+        (shadow / name).mkdir(parents=True)
+        (shadow / name / "__init__.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(shadow))
+    with pytest.raises(VolumeError, match=r"compressed as JPEG Baseline.*us_sim\[dicom\]"):
+        images(path)
+
+
+def test_what_has_no_decoder_at_all_is_refused(tmp_path):
+    made = compressed(header(CINE, US_MULTI_FRAME), JPEGBaseline8Bit)
+    mpeg = "1.2.840.10008.1.2.4.102"
+    with pytest.raises(VolumeError, match=r"compressed as MPEG-4.*export them uncompressed"):
+        images(write(tmp_path / "a.dcm", made, mpeg))
+
+
+def test_without_pydicom_the_extra_is_named(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
+    monkeypatch.setitem(sys.modules, "pydicom", None)
+    with pytest.raises(VolumeError, match=r"needs an extra package: pip install 'us_sim\[dicom\]'"):
+        open_dicom(path)
+
+
+def test_a_bomb_is_not_inflated(tmp_path):
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME), deflated=True)
+    start = path.read_bytes()
+    at = 144 + int.from_bytes(start[140:144], "little")
+    plain = zlib.decompress(start[at:], -zlib.MAX_WBITS)
+    pack = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    bomb = pack.compress(plain) + b"".join(pack.compress(bytes(1 << 20)) for _ in range(200))
+    path.write_bytes(start[:at] + bomb + pack.flush())
+    with pytest.raises(VolumeError, match="inflates to more than the"):
+        open_dicom(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"DICM", bytes(200), bytes(128) + b"DICM" + bytes(60)])
+def test_what_is_no_dicom_is_refused(tmp_path, content):
+    path = tmp_path / "a.dcm"
+    path.write_bytes(content)
+    with pytest.raises(VolumeError, match=r"no DICOM file|read as DICOM|holds no image"):
+        images(path)
+
+
+def test_a_cut_file_is_refused(tmp_path):
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(VolumeError, match="breaks off"):
+        open_dicom(path)

@@ -1,0 +1,276 @@
+"""DICOM volumes: where their voxels are, by every way in which a header states it."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned, write
+from pydicom.data import get_testdata_file
+from pydicom.uid import ImplicitVRLittleEndian
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.dicom.placed_images import placed_images
+from us_sim.volume.files.readers import read_placement, read_volume
+from us_sim.volume.files.writing import write_volume
+
+VOXELS = np.random.default_rng(5).integers(0, 256, (7, 6, 5), dtype=np.uint8)
+PLACED = turned()
+
+
+def voxel_at(volume, point):
+    """The grey value at a point in m."""
+    index = np.rint(volume.patient_to_index @ [*point, 1.0]).astype(int)[:3]
+    return volume.intensities[tuple(index)]
+
+
+@pytest.mark.parametrize("order", [None, [3, 0, 4, 1, 2], [4, 3, 2, 1, 0]])
+@pytest.mark.parametrize("syntax", [None, ImplicitVRLittleEndian, "deflated"])
+def test_an_enhanced_volume_lies_where_its_groups_say(tmp_path, order, syntax):
+    made = enhanced(VOXELS, PLACED, order=order)
+    path = tmp_path / "volume.dcm"
+    if syntax == "deflated":
+        write(path, made, deflated=True)
+    else:
+        write(path, made, *filter(None, [syntax]))
+    volume = read_volume(path)
+    np.testing.assert_array_equal(volume.intensities, VOXELS)
+    np.testing.assert_allclose(volume.index_to_patient[:3], PLACED[:3] * 1e-3, atol=1e-12)
+    np.testing.assert_array_equal(read_placement(path), volume.index_to_patient)
+
+
+@given(
+    angle=st.floats(-3.0, 3.0),
+    spacing=st.tuples(*[st.sampled_from([0.125, 0.5, 0.75, 2.0])] * 3),
+    order=st.permutations(range(5)),
+)
+@settings(max_examples=15, deadline=None)
+def test_any_grid_is_the_same_from_every_format(tmp_path_factory, angle, spacing, order):
+    folder = tmp_path_factory.mktemp("formats")
+    placed = turned(angle, spacing)
+    first = read_volume(write(folder / "a.dcm", enhanced(VOXELS, placed, order=order)))
+    inner = (first.index_to_patient @ np.array([[2, 1, 3, 1], [6, 5, 4, 1]]).T).T[:, :3]
+    for ending in (".nrrd", ".mha", ".nii.gz"):
+        write_volume(folder / f"a{ending}", first)
+        again = read_volume(folder / f"a{ending}")
+        atol = 1e-9 if ending != ".nii.gz" else 1e-8  # NIfTI holds float32
+        np.testing.assert_allclose(again.index_to_patient, first.index_to_patient, atol=atol)
+        assert voxel_at(again, inner[0]) == VOXELS[2, 1, 3]
+        assert voxel_at(again, inner[1]) == VOXELS[6, 5, 4]
+
+
+def test_each_volume_in_time_can_be_had(tmp_path):
+    path = write(tmp_path / "a.dcm", enhanced(VOXELS, PLACED, times=3))
+    for time in (1, 2, 3):
+        voxels = placed_images([path], volume=time).voxels()
+        np.testing.assert_array_equal(voxels, VOXELS + np.uint8(time - 1))
+    with pytest.raises(VolumeError, match="holds 3 volumes in time; number 4"):
+        placed_images([path], volume=4)
+
+
+def test_of_several_kinds_of_values_the_echoes_are_taken(tmp_path):
+    made = enhanced(VOXELS, PLACED, times=2)
+    flow = [item(DataType="FLOW_VELOCITY")]
+    for n, group in enumerate(made.PerFrameFunctionalGroupsSequence):
+        kind = flow if n < 5 else [item(DataType="TISSUE_INTENSITY")]
+        group.ImageDataTypeSequence = kind
+    volume = read_volume(write(tmp_path / "a.dcm", made))
+    np.testing.assert_array_equal(volume.intensities, VOXELS + np.uint8(1))
+
+
+def single_files(folder: Path, **more) -> list[Path]:
+    """A file for each slice, as SimpleITK's own reader of series wants them."""
+    axes = PLACED[:3, :3] / np.linalg.norm(PLACED[:3, :3], axis=0)
+    series = pydicom.uid.generate_uid()
+    frame = pydicom.uid.generate_uid()
+    paths = []
+    for k in range(5):
+        made = header(
+            VOXELS[:, :, k].T[None].copy(),
+            "1.2.840.10008.5.1.4.1.1.4",
+            SeriesInstanceUID=series,
+            FrameOfReferenceUID=frame,
+            InstanceNumber=k + 1,
+            ImagePositionPatient=[round(x, 9) for x in PLACED[:3, 3] + k * PLACED[:3, 2]],
+            ImageOrientationPatient=[round(x, 9) for x in axes[:, :2].T.ravel()],
+            PixelSpacing=[0.25, 0.5],
+            **more,
+        )
+        del made.NumberOfFrames
+        paths.append(write(folder / f"{(k * 3) % 5}.dcm", made))
+    return paths
+
+
+def test_a_series_of_files_lies_where_simpleitk_says(tmp_path):
+    paths = single_files(tmp_path)
+    placed = placed_images(paths[::-1])
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(tmp_path)))
+    image = reader.Execute()
+    matrix = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    np.testing.assert_allclose(placed.placement[:3, :3], matrix * 1e-3, atol=1e-9)
+    np.testing.assert_allclose(placed.placement[:3, 3], np.array(image.GetOrigin()) * 1e-3)
+    stored = sitk.GetArrayFromImage(image).transpose(2, 1, 0)
+    np.testing.assert_array_equal(placed.voxels(), stored)
+
+
+def real_series(name):
+    """Files of a real series that comes with pydicom."""
+    folder = Path(get_testdata_file("CT_small.dcm")).parent / "dicomdirtests" / name
+    if not folder.is_dir():
+        pytest.skip(f"pydicom has come without {folder}")
+    return [file for file in sorted(folder.iterdir()) if file.is_file()]
+
+
+def test_a_real_series_lies_where_simpleitk_says():
+    files = real_series("98892001/CT5N")
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(files[0].parent)))
+    image = reader.Execute()
+    placed = placed_images(files)
+    assert placed.shape == image.GetSize()
+    matrix = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    np.testing.assert_allclose(placed.placement[:3, :3], matrix * 1e-3, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(placed.placement[:3, 3], np.array(image.GetOrigin()) * 1e-3)
+    stored = sitk.GetArrayFromImage(image).astype(float).transpose(2, 1, 0)
+    spread = (stored - stored.min()) / np.ptp(stored) * 255
+    assert np.abs(placed.voxels() - spread).max() <= 0.5 + 1e-9
+
+
+def test_a_real_series_with_a_gap_is_refused():
+    with pytest.raises(VolumeError, match=r"are 1\.25 to 202\.5 mm apart, which is not even"):
+        placed_images(real_series("77654033/CT2"))
+
+
+def test_offsets_of_slices_count_along_the_normal(tmp_path):
+    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME)
+    made.ImageOrientationPatient = [0, 1, 0, 0, 0, 1]  # rows along y, columns along z: normal x
+    made.ImagePositionPatient = [10, 20, 30]
+    made.PixelSpacing = [0.25, 0.5]
+    made.GridFrameOffsetVector = [0, 2, 4, 6, 8]
+    volume = read_volume(write(tmp_path / "a.dcm", made))
+    np.testing.assert_allclose(
+        volume.index_to_patient @ [1, 2, 3, 1], [0.016, 0.0205, 0.0305, 1], atol=1e-12
+    )
+
+
+def philips_cartesian():
+    voxels = np.stack([VOXELS, VOXELS + np.uint8(7)])  # two volumes in time
+    stack = voxels.transpose(0, 3, 2, 1).reshape(10, 6, 7).copy()
+    made = header(stack, "1.2.840.113543.6.6.1.3.10002", NumberOfFrames=2, FrameTime=50.0)
+    made.PhysicalDeltaX, made.PhysicalDeltaY = 0.05, 0.025  # cm
+    made.add_new(0x30010010, "LO", "Philips3D")
+    made.add_new(0x30011001, "UL", 5)
+    made.add_new(0x30011003, "FD", 0.2)
+    return made
+
+
+def test_philips_cartesian_export_is_read_as_slicerheart_reads_it(tmp_path):
+    path = write(tmp_path / "a.dcm", philips_cartesian())
+    volume = read_volume(path)
+    np.testing.assert_array_equal(volume.intensities, VOXELS)
+    np.testing.assert_allclose(np.diag(volume.index_to_patient), [5e-4, 2.5e-4, 2e-3, 1])
+    second = placed_images([path], volume=2)
+    np.testing.assert_array_equal(second.voxels(), VOXELS + np.uint8(7))
+
+
+def test_affiniti_and_artemis_state_distances_in_their_own_ways(tmp_path):
+    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME)
+    made.add_new(0x200D0010, "LO", "Philips US Imaging DD 036")
+    made.add_new(0x200D1003, "LO", ["0.5", "0.25", "2.0"])
+    volume = read_volume(write(tmp_path / "a.dcm", made))
+    np.testing.assert_allclose(np.diag(volume.index_to_patient), [5e-4, 2.5e-4, 2e-3, 1])
+    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME, PixelAspectRatio=[400, 400])
+    made.Manufacturer, made.ManufacturerModelName = "Eigen", "Artemis"
+    volume = read_volume(write(tmp_path / "b.dcm", made))
+    np.testing.assert_allclose(np.diag(volume.index_to_patient), [4e-4, 4e-4, 4e-4, 1])
+    np.testing.assert_allclose(volume.extent.sum(axis=0), 0.0, atol=1e-12)  # about its centre
+
+
+@pytest.mark.parametrize(
+    ("tag", "creator", "remedy"),
+    [
+        (0x7FE10011, "KRETZ_US", "SlicerHeart"),
+        (0x7FE10010, "GEMS_Ultrasound_MovieGroup_001", "the maker's loader"),
+        (0x200D0010, "Philips US Imaging DD 001", "Cartesian DICOM"),
+        (0x01390010, "SIEMENS MED SMS USG S2000 3D VOLUME", "Enhanced US Volume"),
+    ],
+)
+def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path, tag, creator, remedy):
+    made = header(VOXELS[:, :, :1].transpose(2, 1, 0).copy(), US_IMAGE)
+    made.add_new(tag, "LO", creator)
+    path = write(tmp_path / "a.dcm", made)
+    with pytest.raises(VolumeError, match=f"private data of .*{remedy}"):
+        read_volume(path)
+    del made.PixelData
+    path = tmp_path / "b.dcm"
+    made.save_as(path, enforce_file_format=True)
+    with pytest.raises(VolumeError, match=f"holds no image, but .*{remedy}"):
+        read_volume(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g.pop(2), "not a volume"),
+        (lambda g: place(g[2], 0, 0.7), "apart, which is not even"),
+        (lambda g: place(g[2], 1, 3.0), "shifted against each other"),
+        (lambda g: g.__setitem__(2, g[1]), "not at every place as many"),
+        (lambda g: place(g[4], 0, np.nan), "not a volume"),
+    ],
+)
+def test_images_that_are_no_grid_are_refused(tmp_path, change, message):
+    made = enhanced(VOXELS, np.diag([0.5, 0.25, 2.0, 1.0]))
+    change(made.PerFrameFunctionalGroupsSequence)
+    path = write(tmp_path / "a.dcm", made)
+    with pytest.raises(VolumeError, match=message) as refused:
+        read_volume(path)
+    assert str(refused.value).startswith(f"{path}: ")
+
+
+def place(group, axis, by):
+    """Move an image: along the normal (0), or within its plane (1)."""
+    at = group.PlanePositionVolumeSequence[0]
+    moved = list(at.ImagePositionVolume)
+    moved[2 if axis == 0 else 0] += by
+    at.ImagePositionVolume = moved
+
+
+def test_directions_that_are_not_at_right_angles_are_refused(tmp_path):
+    made = enhanced(VOXELS, PLACED)
+    shared = made.SharedFunctionalGroupsSequence[0]
+    shared.PlaneOrientationVolumeSequence[0].ImageOrientationVolume = [1, 0, 0, 0.5, 1, 0]
+    with pytest.raises(VolumeError, match="not at right angles"):
+        read_volume(write(tmp_path / "a.dcm", made))
+
+
+def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
+    paths = single_files(tmp_path)
+    with pytest.raises(VolumeError, match="is one slice of a volume; give all files"):
+        read_volume(paths[0])
+    made = pydicom.dcmread(paths[0])
+    made.SeriesInstanceUID = pydicom.uid.generate_uid()
+    made.save_as(paths[0])
+    with pytest.raises(VolumeError, match="of several series"):
+        placed_images(paths)
+
+
+def test_a_two_dimensional_file_says_what_to_do(shared_data):
+    folder = shared_data / "dicom-us-2d"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    with pytest.raises(VolumeError, match=r"is a 2D cine of 30 images.*not a volume.*Enhanced US"):
+        read_volume(folder / "examples_ybr_color.dcm")
+    with pytest.raises(VolumeError, match=r"is a 2D image, not a volume"):
+        read_volume(folder / "US1_UNCR.dcm")
+
+
+def test_a_scene_takes_a_dicom_volume(tmp_path):
+    from us_sim.volume.settings import VolumeSettings
+
+    path = write(tmp_path / "a.dcm", enhanced(VOXELS, PLACED))
+    assert dataclasses.asdict(VolumeSettings(file=str(path)))["file"] == str(path)

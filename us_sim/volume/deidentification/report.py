@@ -1,0 +1,166 @@
+"""The report of an import: what went on and what did not, by names and never by values.
+
+The picture shows the first image as it was, so that a person sees what is burned in. It belongs
+where the original is kept, and not to the case.
+
+>>> import pydicom.data
+>>> from us_sim.volume.deidentification.importing import look_at
+>>> from us_sim.volume.deidentification.report import report_text
+>>> from us_sim.volume.deidentification.settings import ImportSettings
+>>> file = pydicom.data.get_testdata_file("examples_ybr_color.dcm")
+>>> text = report_text(look_at([file], None, ImportSettings(keep_whole_image=True)).imported)
+>>> "- PatientName" in text and "Example" not in text
+True
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.deidentification.imported import Imported
+from us_sim.volume.deidentification.kept_values import NUMBERS
+from us_sim.volume.deidentification.rectangle import Rectangle
+
+__all__ = ["refuse_report", "report_picture", "report_text", "summary", "write_report"]
+
+_GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (0, 220, 255)  # of OpenCV: blue, green, red
+_REPORT, _PICTURE = "report.md", "first_image.png"
+
+
+def report_text(imported: Imported) -> str:
+    """The report as Markdown, without its picture."""
+    lines = ["# Import", ""]
+    lines += [f"{_files(imported)}: {imported.kind}. Made of it: {imported.what}.", ""]
+    if imported.undecided:
+        lines += [f"**Nothing can be written yet**: {imported.undecided}. {_decide(imported)}", ""]
+    lines += [f"Blanked: {imported.blanked}.", ""]
+    if imported.conversions:
+        lines += [f"Converted: {'; '.join(imported.conversions)}.", ""]
+    lines += [*_text_lines(imported), ""]
+    lines += ["## Kept as they are", ""]
+    reasons = {one.name: f": {one.why}" for one in NUMBERS}
+    reasons["frame_of_reference_uid"] = ": a new one of random numbers, in place of the original's"
+    lines += _listed({name + reasons.get(name, ""): 1 for name in imported.kept})
+    lines += ["", "## Used, so that their effect goes on", ""]
+    lines += ["The grid, the times, the grey values and what is blanked come of these.", ""]
+    lines += _listed(imported.used)
+    lines += ["", "## Dropped", ""]
+    lines += ["Names only: with values this report would say whose it is.", ""]
+    lines += _listed(imported.dropped)
+    return "\n".join([*lines, ""])
+
+
+def summary(imported: Imported) -> str:
+    """The report in a sentence or two."""
+    said = [imported.what, f"blanked: {imported.blanked}", *imported.conversions]
+    dropped = sum(imported.dropped.values())
+    said.append(f"{dropped} elements of the header dropped, {len(imported.kept)} kept")
+    if imported.remaining:
+        said.append(
+            f"{len(imported.remaining)} places that go on may be text: look at the picture of "
+            f"--report"
+        )
+    return "; ".join(said)
+
+
+def report_picture(imported: Imported) -> NDArray[np.uint8]:
+    """(rows, columns, 3) the first image as it was, with what is kept and what may be text."""
+    picture = np.asarray(cv2.cvtColor(imported.first, cv2.COLOR_GRAY2BGR), np.uint8)
+    _draw(picture, imported.regions, _GREEN)
+    _draw(picture, imported.text, _RED, margin=2)
+    _draw(picture, [imported.proposal] if imported.proposal else [], _YELLOW)
+    return picture
+
+
+def write_report(folder: Path, imported: Imported) -> list[Path]:
+    """Write the report and its picture into a new folder, or one without a report.
+
+    Raises:
+        VolumeError: there is one already, or it cannot be written.
+    """
+    refuse_report(folder)
+    text = report_text(imported)
+    seen = (
+        f"![The first image]({_PICTURE})\n\n*The first image as it was. Green: kept. Red: may be "
+        f"text. Yellow: proposed for --crop. It may show a name: keep it where the original is "
+        f"kept.*\n\n"
+    )
+    text = text.replace("## Kept as they are", f"{seen}## Kept as they are", 1)
+    done, data = cv2.imencode(".png", report_picture(imported))
+    assert done
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(folder / _PICTURE, data.tobytes())
+        _write(folder / _REPORT, text.encode())
+    except OSError as error:
+        raise VolumeError(f"{folder}: cannot be written: {error.strerror}") from error
+    return [folder / _REPORT, folder / _PICTURE]
+
+
+def refuse_report(folder: Path) -> None:
+    """Refuse a place for a report where there is one, or a file.
+
+    Raises:
+        VolumeError: there is.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise VolumeError(f"--report {folder}: is a file; name a folder for the report")
+    if os.path.lexists(folder / _REPORT):
+        raise VolumeError(f"--report {folder}: holds a report already; name another folder")
+
+
+def _write(path: Path, data: bytes) -> None:
+    number, partial = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
+    try:
+        with os.fdopen(number, "wb") as file:  # the owner's alone, as mkstemp makes it
+            file.write(data)
+        os.replace(partial, path)
+    finally:
+        Path(partial).unlink(missing_ok=True)
+
+
+def _files(imported: Imported) -> str:
+    return "1 file" if imported.files == 1 else f"{imported.files} files"
+
+
+def _decide(imported: Imported) -> str:
+    proposed = f" `{imported.proposal}` is proposed: the yellow box." if imported.proposal else ""
+    return f"Say `--crop X0,Y0,X1,Y1` or `--keep-whole-image`.{proposed}"
+
+
+def _text_lines(imported: Imported) -> list[str]:
+    if not imported.text:
+        return ["Nothing that looks like text was found, which is no proof that there is none."]
+    blanked = len(imported.text) - len(imported.remaining)
+    lines = [
+        f"{len(imported.text)} places may be text; {blanked} of them are blanked or cut off, and "
+        f"{len(imported.remaining)} would go on:"
+    ]
+    if not imported.remaining:
+        return [lines[0].replace("would go on:", "would go on.")]
+    return [*lines, "", *(f"- columns and rows {line}" for line in imported.remaining)]
+
+
+def _listed(names: Mapping[str, int]) -> list[str]:
+    if not names:
+        return ["Nothing."]
+    return [f"- {name}{f' ({count} times)' if count > 1 else ''}" for name, count in names.items()]
+
+
+def _draw(
+    picture: NDArray[np.uint8],
+    boxes: Iterable[Rectangle],
+    colour: tuple[int, int, int],
+    margin: int = 0,
+) -> None:
+    for box in boxes:
+        first = (box.left - margin, box.top - margin)
+        cv2.rectangle(picture, first, (box.right + margin, box.bottom + margin), colour, 1)

@@ -1,0 +1,161 @@
+"""Text that is burned into images: where it may be, without reading it.
+
+What is looked for is what all text of scanners is: thin strokes, brighter or darker than what is
+around them, the same in every image, of about one brightness, and beside one another on a line.
+Speckle has the strokes, but neither the one brightness nor the line. It is a help for a person who
+looks at the picture, and no proof: it misses letters across bright tissue, handwriting, and faces.
+
+>>> import cv2, numpy as np
+>>> from us_sim.volume.deidentification.text_detection import find_text
+>>> image = np.random.default_rng(1).normal(60, 15, (120, 320)).clip(0, 255).astype(np.uint8)
+>>> image[:30] = 0
+>>> _ = cv2.putText(image, "DOE JANE 1971", (20, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 230)
+>>> (line,) = find_text([image])
+>>> line.top >= 5 and line.bottom <= 24 and line.left <= 24 and line.right > 120
+True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.volume.deidentification.rectangle import Rectangle
+
+__all__ = ["find_text"]
+
+_STILL = 12  # grey levels by which the same letter differs between images; JPEG makes about ten
+_STROKE = 11  # px, wider than the strokes of the largest letters
+_CONTRAST = 45  # grey levels, of one image
+_STILL_CONTRAST = 16  # of three or more, where what stands still is little else than text
+_HEIGHTS = (5, 60)  # px
+_SMALL = 600  # px, rows or columns of a picture whose letters may touch
+_LETTERS = 3  # on a line, at least
+
+
+@dataclass(frozen=True)
+class _Glyphs:
+    """Bright spots; each array has one number a spot."""
+
+    left: NDArray[np.int64]
+    top: NDArray[np.int64]
+    right: NDArray[np.int64]  # the last column that belongs to it
+    bottom: NDArray[np.int64]
+
+    @property
+    def height(self) -> NDArray[np.int64]:
+        return self.bottom - self.top + 1
+
+
+def find_text(images: Sequence[NDArray[np.uint8]]) -> list[Rectangle]:
+    """Lines of what may be text, from the top down.
+
+    Args:
+        images: (rows, columns) of equal size; several, from all over a recording, tell text from
+            what moves.
+    """
+    stack = np.stack(images)
+    low, high = stack.min(axis=0), stack.max(axis=0)
+    still = (high - low) <= _STILL
+    contrast = _CONTRAST if len(images) < 3 else _STILL_CONTRAST
+    lines = []
+    for scale in (1, 2) if min(low.shape) <= _SMALL else (1,):
+        for picture in (low, 255 - high):
+            lines += _lines(_glyphs(picture, still, contrast, scale), scale)
+    lines = _without_covered(lines)
+    return sorted(lines, key=lambda line: (line.top, line.left))
+
+
+def _glyphs(
+    picture: NDArray[np.uint8], still: NDArray[np.bool_], contrast: float, scale: int
+) -> _Glyphs:
+    """Strokes that stand out brightly, connected, and of a letter's size and evenness."""
+    if scale > 1:  # small letters touch one another
+        size = (picture.shape[1] * scale, picture.shape[0] * scale)
+        larger = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+        picture = np.asarray(larger, np.uint8)
+        still = still.repeat(scale, axis=0).repeat(scale, axis=1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (_STROKE, _STROKE))
+    stands_out = cv2.morphologyEx(picture, cv2.MORPH_TOPHAT, kernel)
+    enough = np.maximum(0.5 * cv2.dilate(stands_out, kernel), contrast)
+    strokes = ((stands_out > enough) & still).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(strokes, connectivity=8)
+    left, top, width, height, area = stats.T.astype(np.int64)
+    where = np.flatnonzero(strokes)
+    flat, heights = labels.ravel()[where], stands_out.ravel()[where]
+    brightest = np.zeros(count, np.int64)
+    np.maximum.at(brightest, flat, heights)
+    even = np.bincount(flat, heights >= 0.6 * brightest[flat], count) / area
+    filled = area / (width * height)
+    good = (_HEIGHTS[0] <= height) & (height <= _HEIGHTS[1]) & (width <= 2 * height)
+    good &= (filled > 0.12) & ((filled < 0.9) | (width < 0.5 * height)) & (even > 0.5)
+    good[0] = False  # what is between the strokes
+    edges = (left, top, left + width - 1, top + height - 1)
+    return _Glyphs(*(each[good] for each in edges))
+
+
+def _lines(glyphs: _Glyphs, scale: int) -> list[Rectangle]:
+    """Glyphs of about one height, beside one another on a common base or top."""
+    order = np.argsort(glyphs.left, kind="stable")
+    groups = np.arange(len(order))
+    for place, a in enumerate(order):
+        reach = 1.3 * glyphs.height[a]
+        for b in order[place + 1 :]:
+            if glyphs.left[b] - glyphs.right[a] > reach:
+                break  # those that begin further right are no nearer
+            if _beside(glyphs, a, b):
+                groups[groups == groups[b]] = groups[a]
+    lines = []
+    for group in np.unique(groups):
+        members = np.flatnonzero(groups == group)
+        if len(members) >= _LETTERS and _is_line(glyphs, members):
+            lines.append(
+                Rectangle(
+                    int(glyphs.left[members].min()) // scale,
+                    int(glyphs.top[members].min()) // scale,
+                    int(glyphs.right[members].max()) // scale,
+                    int(glyphs.bottom[members].max()) // scale,
+                )
+            )
+    return lines
+
+
+def _without_covered(lines: list[Rectangle]) -> list[Rectangle]:
+    """Each line once, where it was found at both scales."""
+    kept: list[Rectangle] = []
+    for line in sorted(lines, key=lambda line: -line.size[0] * line.size[1]):
+        middle = (line.left + line.right) / 2, (line.top + line.bottom) / 2
+        covered = (
+            one.left <= middle[0] <= one.right and one.top <= middle[1] <= one.bottom
+            for one in kept
+        )
+        if not any(covered):
+            kept.append(line)
+    return kept
+
+
+def _beside(glyphs: _Glyphs, a: int, b: int) -> bool:
+    heights = sorted((int(glyphs.height[a]), int(glyphs.height[b])))
+    between = glyphs.left[b] - glyphs.right[a]
+    overlap = min(glyphs.bottom[a], glyphs.bottom[b]) - max(glyphs.top[a], glyphs.top[b])
+    return bool(
+        heights[1] <= 1.8 * heights[0]
+        and -2 <= between <= heights[1]
+        and overlap > 0.5 * heights[0]
+    )
+
+
+def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
+    """Whether most stand on one base, or hang from one top, and the whole is wide."""
+    height = float(np.median(glyphs.height[members]))
+    slack = 1.0 + 0.08 * height
+    width = glyphs.right[members].max() - glyphs.left[members].min()
+    aligned = max(
+        np.mean(np.abs(edge - np.median(edge)) <= slack)
+        for edge in (glyphs.bottom[members], glyphs.top[members])
+    )
+    return bool(aligned >= 0.7 and width > 1.5 * height)

@@ -1,0 +1,283 @@
+"""Opening a DICOM file: everything but its images, and where in the file those are.
+
+Nothing large is read: of the images and of private data only the place is kept. A deflated file is
+inflated step by step, and not further than its own header says that it goes.
+
+>>> import pydicom.data
+>>> from us_sim.volume.files.dicom.header import open_dicom
+>>> file = open_dicom(pydicom.data.get_testdata_file("MR_small.dcm"))
+>>> file.header.Rows, file.pixels.length, file.compressed
+(64, 8192, False)
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.dicom.values import text, whole
+from us_sim.volume.files.stored_voxels import check_claim
+
+__all__ = ["EXTRA", "DicomFile", "PixelPlace", "is_dicom", "open_dicom"]
+
+EXTRA = "pip install 'us_sim[dicom]'"
+
+_DEFER = 1 << 20  # bytes of a value that is not read; a palette has 128 KiB a colour
+_STEP = 1 << 20
+_DEFLATED = "1.2.840.10008.1.2.1.99"
+_NATIVE = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2", _DEFLATED, "")
+_UNDEFINED = 0xFFFFFFFF
+_LONG = (b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV")
+"""Value representations whose length takes four bytes (PS3.5, 7.1.2)."""
+_MOST_HEADER = 1 << 26  # bytes of an inflated file beside its images
+_NAMES = (".dcm", ".dicom", ".ima")
+
+
+@dataclass(frozen=True)
+class PixelPlace:
+    """Where the images are."""
+
+    start: int  # byte of the file, or of what was inflated
+    length: int | None  # bytes; None where they are in fragments, up to a delimiter
+    element: int  # the tag: whole numbers, or numbers in single or double precision
+
+
+@dataclass(frozen=True, eq=False)
+class DicomFile:
+    """A DICOM file that was opened."""
+
+    path: Path
+    header: Any  # pydicom.Dataset, of which values are read by `values`
+    syntax: str  # UID of the transfer syntax; empty where the file does not say
+    little_endian: bool
+    pixels: PixelPlace | None
+    inflated: bytes | None = None
+
+    @property
+    def compressed(self) -> bool:
+        """Whether the images are, each on its own."""
+        return self.syntax not in _NATIVE
+
+    @property
+    def size(self) -> int:
+        """Bytes there are."""
+        return self.path.stat().st_size if self.inflated is None else len(self.inflated)
+
+    def open(self) -> BinaryIO:
+        """The bytes in which the place of the images counts."""
+        return self.path.open("rb") if self.inflated is None else io.BytesIO(self.inflated)
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file says that it is DICOM, by its first bytes or its name."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(132)
+    except OSError:
+        return False
+    return start[128:] == b"DICM" or path.suffix.lower() in _NAMES
+
+
+def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
+    """Read the header of a DICOM file.
+
+    Raises:
+        VolumeError: there is no such file, it is none, its header breaks off, it inflates to more
+            than it says, or pydicom is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise VolumeError(f"{path}: there is no such file")
+    try:
+        import pydicom  # noqa: F401
+    except ImportError as error:
+        raise VolumeError(f"{path}: reading DICOM needs an extra package: {EXTRA}") from error
+    try:
+        with _quiet():
+            return _opened(path)
+    except (VolumeError, MemoryError):
+        raise
+    except Exception as error:  # pydicom raises what the bytes of a damaged file lead to
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the file cannot be read at all
+        raise VolumeError(
+            f"{path}: cannot be read as DICOM: its header is damaged or cut short; copy or export "
+            f"it again"
+        ) from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No warning for every value that does not keep to the standard: many files have some."""
+    from pydicom import config
+
+    before = config.settings.reading_validation_mode
+    config.settings.reading_validation_mode = config.IGNORE
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        config.settings.reading_validation_mode = before
+
+
+class _DeflatedError(Exception):
+    """Everything behind the first elements is deflated."""
+
+
+class _Bounded(io.BufferedIOBase):
+    """A file of which never more is asked for than there is, as memory is taken for what is asked.
+
+    Only a deflated file is read to its end at once by pydicom, to be inflated without a limit.
+    """
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file, self._size = file, size
+
+    def read(self, count: int | None = -1, /) -> bytes:
+        if count is None or count < 0:
+            raise _DeflatedError
+        return self._file.read(min(count, max(self._size - self._file.tell(), 0)))
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+
+def _opened(path: Path) -> DicomFile:
+    with path.open("rb") as file:
+        start = file.read(144)
+        old = start[:1] in (b"\x02", b"\x08") and start[1:2] == b"\0"  # without a preamble
+        if start[128:132] != b"DICM" and not old:
+            raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
+        file.seek(0)
+        try:
+            return _read(path, file, path.stat().st_size)
+        except _DeflatedError:
+            inflated = _inflated(path, start)
+    return _read(path, io.BytesIO(inflated), len(inflated), inflated)
+
+
+def _read(path: Path, whole: BinaryIO, size: int, inflated: bytes | None = None) -> DicomFile:
+    """The header before and after the images."""
+    from pydicom import dcmread
+    from pydicom.filereader import read_dataset
+
+    file = _Bounded(whole, size)
+    header = dcmread(file, defer_size=_DEFER, stop_before_pixels=True, force=True)
+    syntax = _DEFLATED if inflated else text(header.file_meta, "TransferSyntaxUID")
+    implicit, little = header.original_encoding
+    implicit, little = implicit is not False, little is not False
+    pixels = _pixel_place(file, implicit, "<" if little else ">")
+    if pixels is not None:
+        try:
+            file.seek(pixels.start + pixels.length if pixels.length is not None else _end(file))
+            more = read_dataset(cast(BinaryIO, file), implicit, little, defer_size=_DEFER)
+            header.update(more)
+        except Exception:  # what stands behind the images is not needed
+            pass
+    if not len(header):
+        raise VolumeError(f"{path}: is no DICOM file: it has no elements")
+    if pixels and pixels.length is not None and pixels.start + pixels.length > size:
+        raise VolumeError(
+            f"{path}: breaks off: it holds {max(size - pixels.start, 0)} of the {pixels.length} "
+            f"bytes of its images; copy or export it again"
+        )
+    return DicomFile(path, header, syntax, little, pixels, inflated)
+
+
+def _pixel_place(file: _Bounded, implicit: bool, order: str) -> PixelPlace | None:
+    """Where the images are, in a file that stands at their element."""
+    start = file.read(8)
+    if len(start) < 8:
+        return None
+    group, element = struct.unpack(f"{order}2H", start[:4])
+    if implicit:
+        (length,) = struct.unpack(f"{order}I", start[4:])
+    elif start[4:6] in _LONG:
+        more = file.read(4)
+        if len(more) < 4:
+            return None
+        (length,) = struct.unpack(f"{order}I", more)
+    else:
+        (length,) = struct.unpack(f"{order}H", start[6:])
+    tag = (group << 16) | element
+    if tag not in (0x7FE00008, 0x7FE00009, 0x7FE00010):
+        return None
+    return PixelPlace(file.tell(), None if length == _UNDEFINED else length, tag)
+
+
+def _end(file: _Bounded) -> int:
+    """The first byte behind the fragments of images, at the first of which a file stands."""
+    while True:
+        head = file.read(8)
+        if len(head) < 8:
+            return file.tell()
+        tag, length = struct.unpack("<4sI", head)
+        if tag != b"\xfe\xff\x00\xe0":
+            return file.tell()
+        file.seek(length, 1)
+
+
+def _inflated(path: Path, start: bytes) -> bytes:
+    """The file as if it had not been deflated (PS3.5, A.5), with the same syntax in its meta."""
+    if len(start) < 144 or start[132:138] != b"\x02\0\0\0UL":
+        raise VolumeError(f"{path}: is deflated, and does not say where that begins: export again")
+    (meta,) = struct.unpack("<I", start[140:144])
+    if 144 + meta > path.stat().st_size:
+        raise VolumeError(f"{path}: breaks off in its header; copy or export it again")
+    # Explicit little endian, which is what it is once it is inflated.
+    plain = b"\x02\0\x10\0UI\x14\0" + b"1.2.840.10008.1.2.1\0"
+    made = bytearray(128) + b"DICM\x02\0\0\0UL\x04\0" + struct.pack("<I", len(plain)) + plain
+    first = len(made)
+    inflate, most = zlib.decompressobj(-zlib.MAX_WBITS), _MOST_HEADER
+    told = False
+    with path.open("rb") as file:
+        file.seek(144 + meta)
+        try:
+            while not inflate.eof:
+                packed = inflate.unconsumed_tail or file.read(_STEP)
+                if not packed:
+                    raise VolumeError(f"{path}: its compression is cut short; copy it again")
+                made += inflate.decompress(packed, _STEP)
+                if len(made) - first > most:
+                    if told:
+                        raise VolumeError(
+                            f"{path}: inflates to more than the {most} bytes that its header says; "
+                            f"export it again"
+                        )
+                    most, told = _MOST_HEADER + _claim(path, bytes(made)), True
+        except zlib.error as error:
+            raise VolumeError(f"{path}: its compression is damaged; copy it again") from error
+    return bytes(made)
+
+
+def _claim(path: Path, begun: bytes) -> int:
+    """Bytes of images that the first part of a file says there are.
+
+    Raises:
+        VolumeError: they are more than is read.
+    """
+    from pydicom import dcmread
+
+    file = _Bounded(io.BytesIO(begun), len(begun))
+    header = dcmread(file, defer_size=_DEFER, stop_before_pixels=True, force=True)
+    size = [max(whole(header, key) or 1, 1) for key in ("NumberOfFrames", "Rows", "Columns")]
+    size.append(max(whole(header, "SamplesPerPixel") or 1, 1))
+    value = -(-max(whole(header, "BitsAllocated") or 8, 8) // 8)
+    check_claim(path, tuple(size), value)
+    claimed = value
+    for count in size:
+        claimed *= count
+    return claimed

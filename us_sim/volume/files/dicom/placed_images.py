@@ -1,0 +1,210 @@
+"""Which images of DICOM files make a volume, in which order, and where they lie.
+
+>>> import pydicom.data
+>>> from us_sim.volume.files.dicom.placed_images import placed_images
+>>> file = pydicom.data.get_testdata_file("examples_ybr_color.dcm")
+>>> placed_images([file])  # doctest: +ELLIPSIS
+Traceback (most recent call last):
+...
+us_sim.errors.VolumeError: ...: is a 2D cine of 30 images, not a volume: ...
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.axis_order import fill_from_slices
+from us_sim.volume.files.dicom.grey import GreyImages
+from us_sim.volume.files.dicom.header import DicomFile, open_dicom
+from us_sim.volume.files.dicom.planes import Plane, grid_of
+from us_sim.volume.files.dicom.stated_planes import image_kinds, image_times, stated_planes
+from us_sim.volume.files.dicom.values import number, text
+from us_sim.volume.files.dicom.vendors import (
+    hidden_volume,
+    one_image_after_another,
+    vendor_planes,
+)
+
+__all__ = ["PlacedImages", "is_flat", "opened_images", "placed_images"]
+
+_SLAB = 32  # images that are turned at a time
+_TISSUE = "TISSUE_INTENSITY"
+_MOST_FILES = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedImages:
+    """The images of one volume, ordered along their normal."""
+
+    images: GreyImages
+    which: list[tuple[int, int]]  # of which file, and which of its images
+    placement: NDArray[np.float64]  # (4, 4) m, from (column, row, image)
+    volumes: int  # how many there are in time
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along each axis."""
+        return self.images.form.columns, self.images.form.rows, len(self.which)
+
+    def voxels(
+        self,
+        keep: NDArray[np.bool_] | None = None,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> NDArray[np.uint8]:
+        """The grey values (i, j, k), read a few images at a time.
+
+        Args:
+            keep: (rows, columns) what of each image is kept; the rest becomes 0.
+            progress: told the fraction that is read.
+
+        Raises:
+            VolumeError: an image is damaged, or its decoder is missing.
+        """
+        grey: NDArray[np.uint8] | None = None
+        slab: list[NDArray[np.uint8]] = []
+        # Not before the first image was read: only then is it known that the size is no lie.
+        for k, image in enumerate(self.images.images(self.which, keep), start=1):
+            grey = np.empty(self.shape, np.uint8) if grey is None else grey
+            slab.append(image)
+            if len(slab) == _SLAB or k == len(self.which):
+                fill_from_slices(grey, k - len(slab), np.stack(slab))
+                slab.clear()
+                if progress:
+                    progress(k / len(self.which), f"{k} of {len(self.which)} images")
+        assert grey is not None
+        return grey
+
+
+def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
+    """The images of one or several DICOM files.
+
+    Raises:
+        VolumeError: as `open_dicom` and `GreyImages`.
+    """
+    if len(paths) > _MOST_FILES:
+        raise VolumeError(f"{len(paths)} files are more than the {_MOST_FILES} that are read")
+    files = [one_image_after_another(open_dicom(path)) for path in paths]
+    # A maker's own volume may have a picture of no use beside it, or none at all.
+    for file in files:
+        if file.pixels is None and (remedy := hidden_volume(file)):
+            raise VolumeError(f"{file.path}: holds no image, but {remedy}")
+    return GreyImages(files)
+
+
+def is_flat(images: GreyImages) -> bool:
+    """Whether nothing says where the images lie in space, so that they are no volume."""
+    planes, _ = _planes(images)
+    return planes is None or len(planes) < 2
+
+
+def placed_images(
+    paths: Sequence[str | os.PathLike[str]] | GreyImages, volume: int = 1
+) -> PlacedImages:
+    """The volume that DICOM files hold: an enhanced or multi-frame one, or an image each.
+
+    Args:
+        paths: of the files, in any order; or their images.
+        volume: which one where there are several in time, the first of which is 1.
+
+    Raises:
+        VolumeError: the files hold no volume, or one that only its maker can read; or they do not
+            belong together.
+    """
+    images = paths if isinstance(paths, GreyImages) else opened_images(paths)
+    _check_series(images.files)
+    planes, times = _planes(images)
+    if planes is None or len(planes) < 2:
+        raise VolumeError(f"{images.files[0].path}: {_why_flat(images, planes)}")
+    wanted = images.all
+    kinds: list[str] = []
+    for file, form in zip(images.files, images.formats, strict=True):
+        kinds += image_kinds(file, form.frames)
+    kind = _TISSUE if _TISSUE in kinds else kinds[0]
+    here = [n for n in range(len(wanted)) if kinds[n] == kind]
+    groups = _in_time(images.files[0].path, here, planes, times)
+    if not 1 <= volume <= len(groups):
+        raise VolumeError(
+            f"{images.files[0].path}: holds {len(groups)} volumes in time; number {volume} is none "
+            f"of them"
+        )
+    chosen = groups[volume - 1]
+    order, placement = grid_of(images.files[0].path, [planes[n] for n in chosen])
+    which = [wanted[chosen[n]] for n in order]
+    placed = PlacedImages(images, which, placement, len(groups))
+    if min(placed.shape) < 2:
+        raise VolumeError(
+            f"{images.files[0].path}: has {' × '.join(map(str, placed.shape))} voxels; a volume "
+            f"needs two or more along each axis"
+        )
+    return placed
+
+
+def _planes(images: GreyImages) -> tuple[list[Plane] | None, list[float]]:
+    """The place and time of every image; None where a file does not state them."""
+    planes: list[Plane] = []
+    times: list[float] = []
+    for file, form in zip(images.files, images.formats, strict=True):
+        found = vendor_planes(file, form.frames)
+        own = found[0] if found else stated_planes(file, form.frames)
+        if own is None:
+            return None, []
+        planes += own
+        times += found[1] if found else image_times(file, form.frames)
+    return planes, times
+
+
+def _check_series(files: Sequence[DicomFile]) -> None:
+    for key in ("SeriesInstanceUID", "FrameOfReferenceUID"):
+        if len({text(file.header, key) for file in files}) > 1:
+            raise VolumeError(
+                f"{files[0].path}: and the other files are of several series; give the files of one"
+            )
+
+
+def _in_time(
+    path: Path, here: Sequence[int], planes: Sequence[Plane], times: Sequence[float]
+) -> list[list[int]]:
+    """The images of each volume, by their times, or where these are alike as they follow."""
+    if len({times[n] for n in here}) > 1:
+        groups: dict[float, list[int]] = {}
+        for n in here:
+            groups.setdefault(times[n], []).append(n)
+        return [groups[time] for time in sorted(groups)]
+    places = Counter(planes[n].position for n in here)
+    count = max(places.values())
+    if set(places.values()) != {count}:
+        raise VolumeError(
+            f"{path}: several of its images are at the same place, but not at every place as many; "
+            f"give the files of one volume"
+        )
+    made: list[list[int]] = [[] for _ in range(count)]
+    seen: Counter[tuple[float, ...]] = Counter()
+    for n in here:
+        made[seen[planes[n].position]].append(n)
+        seen[planes[n].position] += 1
+    return made
+
+
+def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
+    """What the files are in place of a volume, and what to do."""
+    count = len(images.all)
+    if planes:
+        return "is one slice of a volume; give all files of its series"
+    what = "a 2D image" if count == 1 else f"a 2D cine of {count} images"
+    if len(images.files) > 1:
+        what = f"one of {len(images.files)} files with 2D images"
+    timed = number(images.files[0].header, "FrameTime")
+    what += ", one after another in time" if timed and count > 1 else ""
+    hidden = next(filter(None, map(hidden_volume, images.files)), "")
+    remedy = hidden or (
+        "export the 3D data as an Enhanced US Volume, or record a tracked sweep and reconstruct it"
+    )
+    return f"is {what}, not a volume: nothing in it says where its images lie in space; {remedy}"
