@@ -9,11 +9,11 @@ holds for fields of other formats whose names are nobody's convention.
 >>> header, inner = Dataset(), Dataset()
 >>> inner.CodeMeaning = "Left arm of Jane Doe"; header.AnatomicRegionSequence = [inner]
 >>> header.add_new(0x00090010, "LO", "DOE"); header.PatientName = "Doe^Jane"
->>> for name, count in dicom_names(header).items():
+>>> for name, count in sorted(dicom_names(header).items()):
 ...     print(name, count)
-private element (0009,0010) 1
 AnatomicRegionSequence > CodeMeaning 1
 PatientName 1
+private element (0009,0010) 1
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
 >>> import numpy as np
 >>> from us_sim.volume.files.placement import checked_placement
->>> checked_placement("a.nrrd", (0.5, 0.5, 1.0), np.eye(3), (10.0, 0.0, -20.0))
-array([[ 0.0005,  0.    ,  0.    ,  0.01  ],
-       [ 0.    ,  0.0005,  0.    ,  0.    ],
-       [ 0.    ,  0.    ,  0.001 , -0.02  ],
-       [ 0.    ,  0.    ,  0.    ,  1.    ]])
+>>> placement = checked_placement("a.nrrd", (0.5, 0.5, 1.0), np.eye(3), (10.0, 0.0, -20.0))
+>>> placement @ [2, 0, 5, 1]
+array([ 0.011,  0.   , -0.015,  1.   ])
 """
 
 from __future__ import annotations

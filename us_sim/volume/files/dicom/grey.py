@@ -8,7 +8,7 @@ greatest 255, as `us_sim.volume.files.readers` does. Colour becomes grey by its 
 >>> from us_sim.volume.files.dicom.header import open_dicom
 >>> file = open_dicom(pydicom.data.get_testdata_file("MR_small.dcm"))
 >>> (image,) = GreyImages([file]).images()
->>> image.shape, image.min(), image.max()
+>>> image.shape, int(image.min()), int(image.max())
 ((64, 64), 0, 255)
 """
 
