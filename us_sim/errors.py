@@ -13,6 +13,7 @@ __all__ = [
     "SettingsError",
     "SolverError",
     "StampError",
+    "StiffnessError",
     "TrackingError",
     "UsSimError",
     "VolumeError",
@@ -90,3 +91,7 @@ class TrackingError(UsSimError):
 
 class CalibrationError(UsSimError):
     """Calibration data are wrong, or cannot determine the answer."""
+
+
+class StiffnessError(UsSimError):
+    """A recorded press is no press, or cannot determine how stiff tissue is."""

@@ -64,6 +64,7 @@ def _parser() -> ChosenParser:
     from us_sim.command.compile import add_compile
     from us_sim.command.demo import add_demo
     from us_sim.command.evaluate import add_evaluate
+    from us_sim.command.fit_stiffness import add_fit_stiffness
     from us_sim.command.import_files import add_import
     from us_sim.command.play import add_play
     from us_sim.command.print_marker import add_print_marker
@@ -83,6 +84,7 @@ def _parser() -> ChosenParser:
     for add in (
         add_import,
         add_calibrate,
+        add_fit_stiffness,
         add_reconstruct,
         add_segment,
         add_print_marker,

@@ -28,7 +28,7 @@ from us_sim.recording.topic import BagMessage, BagTopic
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
 
-__all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path"]
+__all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 
@@ -134,11 +134,20 @@ def write_path(
         BagError: the file exists or cannot be written.
     """
     with BagWriter(file, compression="zstd", sidecar=sidecar) as writer:
-        writer.add_topic(path.topic, POSE_STAMPED, [qos or QosProfile()])
-        rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
-        for stamp, log_time, position, orientation in rows:
-            message = _serialized(int(stamp), path.frame_id, position, orientation)
-            writer.write(path.topic, message, int(log_time), int(stamp))
+        write_poses(writer, path, qos=qos)
+
+
+def write_poses(writer: BagWriter, path: ProbePath, *, qos: QosProfile | None = None) -> None:
+    """Writes a path into a bag that is open, as one of its topics.
+
+    Raises:
+        BagError: it cannot be written.
+    """
+    writer.add_topic(path.topic, POSE_STAMPED, [qos or QosProfile()])
+    rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
+    for stamp, log_time, position, orientation in rows:
+        message = _serialized(int(stamp), path.frame_id, position, orientation)
+        writer.write(path.topic, message, int(log_time), int(stamp))
 
 
 def _serialized(

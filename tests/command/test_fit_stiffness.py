@@ -1,0 +1,135 @@
+"""`us-sim fit-stiffness` from a recording to a scene, and recordings that will not do."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from known_press import KnownPress, arm
+from PIL import Image
+
+from us_sim.command.main import main
+from us_sim.recording.path import ProbePath, write_poses
+from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.wrench import WrenchRecord, write_wrenches
+from us_sim.recording.writer import BagWriter
+from us_sim.scene.reading import load_scene
+from us_sim.settings.reading import Reader
+from us_sim.volume.cases.case import read_case
+from us_sim.volume.cases.settings import CaseSettings
+from us_sim.volume.cases.writing import new_case, write_case_settings
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.volume import Volume
+
+OTHERS = ("skin", "fat", "bone", "artery", "vein", "nerve")
+
+
+@pytest.fixture(scope="module")
+def press(small_scene) -> KnownPress:
+    """The small arm, pressed by few poses; its muscle is 20 kPa, and not 12 as the scene says."""
+    tissue = arm(small_scene)
+    path = replace(press_and_slide(rate=4.0, duration=10.0), topic="/probe/pose")
+    return KnownPress(tissue, {**tissue.moduli, "muscle": 20e3}, path)
+
+
+def session(folder: Path, path: ProbePath, wrenches: WrenchRecord | None) -> str:
+    folder.mkdir()
+    with BagWriter(folder / "session.mcap") as writer:
+        write_poses(writer, path)
+        if wrenches is not None:
+            write_wrenches(writer, wrenches)
+    return str(folder / "session.mcap")
+
+
+def felt(press: KnownPress, wrenches: np.ndarray | None = None, frame="probe") -> WrenchRecord:
+    made = press.felt if wrenches is None else wrenches
+    return WrenchRecord("/probe/wrench", frame, press.path.stamps, made)
+
+
+def test_a_press_gives_a_scene_with_its_moduli_and_a_picture(press, small_scene, tmp_path, capsys):
+    wrenches = press.noisy(0.005, np.random.default_rng(3))
+    recording = session(tmp_path / "bag", press.path, felt(press, wrenches))
+    out = tmp_path / "fitted.yaml"
+    words = ["fit-stiffness", str(small_scene), recording, "--out", str(out), "--poses", "14"]
+    assert main([*words, "--keep", *OTHERS]) == 0
+    printed = capsys.readouterr().out
+    assert "left over (RMS)" in printed
+    made = yaml.safe_load(out.read_text())
+    assert list(made["tissue"]["materials"]) == ["muscle"]
+    scene = load_scene(out)
+    assert scene.tissue is not None
+    assert scene.tissue.materials["muscle"].young_modulus == pytest.approx(20e3, rel=0.05)
+    assert scene.tissue.materials["fat"].young_modulus == 5e3
+    with Image.open(out.with_suffix(".png")) as picture:
+        assert picture.width > 800
+    assert main([*words, "--keep", *OTHERS]) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda press: (press.path, None), "has no topic probe/wrench"),
+        (lambda press: (press.path, felt(press, frame="flange")), "in frame 'flange'"),
+        (lambda press: (replace(press.path, frame_id="camera"), felt(press)), "--pose"),
+        (
+            lambda press: (
+                replace(press.path, positions=press.path.positions - [0, 0, 0.1]),
+                felt(press),
+            ),
+            "mm away from it at its nearest",
+        ),
+        (lambda press: (press.path, felt(press, np.full_like(press.felt, np.nan))), "not finite"),
+    ],
+    ids=["no wrench", "other frame", "other pose frame", "no contact", "no numbers"],
+)
+def test_what_is_no_press_is_one_sentence(press, small_scene, tmp_path, capsys, spoil, sentence):
+    recording = session(tmp_path / "bag", *spoil(press))
+    out = tmp_path / "fitted.yaml"
+    words = ["fit-stiffness", str(small_scene), recording, "--out", str(out)]
+    assert main([*words, "--keep", *OTHERS]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("us-sim: ")
+    assert sentence in error
+    assert "Traceback" not in error
+    assert not list(tmp_path.glob("*fitted*"))
+
+
+def test_a_scene_without_tissue_is_refused(tmp_path, capsys):
+    scene = tmp_path / "bare.yaml"
+    scene.write_text(
+        "name: bare\nvolume: {phantom: upper_arm, voxel_size: 2 mm}\n"
+        "probe: {aperture: 40 mm, depth: 40 mm}\n"
+    )
+    out = str(tmp_path / "fitted.yaml")
+    assert main(["fit-stiffness", str(scene), "none.mcap", "--out", out]) == 1
+    assert "tissue: is missing" in capsys.readouterr().err
+
+
+def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
+    grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
+    grid[:3, 3] = [-0.04, -0.03, 0.0]
+    grey = np.random.default_rng(1).integers(60, 120, (40, 30, 25), dtype=np.uint8)
+    case = tmp_path / "gel"
+    probe = {"aperture": "30 mm", "depth": "40 mm"}
+    probe["collider"] = {"shape": "sphere", "radius": "30 mm"}
+    given = {"name": "gel", "start": {}, "probe": probe, "around": {"young_modulus": 7e3}}
+    with new_case(case) as folder:
+        write_volume(folder / "volume.nrrd", Volume(grey, grid))
+        write_case_settings(folder, Reader("case.yaml").read(CaseSettings, given | {"nodes": 500}))
+    path = replace(press_and_slide(rate=4.0, depth=0.006), topic="/probe/pose")
+    made = KnownPress(arm(f"case:{case}"), {"tissue": 11e3}, path)
+    wrenches = made.noisy(0.002, np.random.default_rng(3))
+    recording = session(tmp_path / "bag", path, felt(made, wrenches))
+    out = tmp_path / "fitted.yaml"
+    words = ["fit-stiffness", str(case), recording, "--out", str(out), "--poses", "12"]
+    assert main([*words, "--into-case"]) == 0
+    assert "has these moduli now" in capsys.readouterr().out
+    changed = read_case(case)
+    assert changed.settings.material_of("tissue").young_modulus == pytest.approx(11e3, rel=0.03)
+    assert changed.steps[-1].settings["moduli"]["tissue"]["factor"] < 1.1
+    scene = load_scene(out)
+    assert scene.volume.case == str(case)
+    assert scene.tissue is not None
+    assert scene.tissue.materials["tissue"].young_modulus == pytest.approx(11e3, rel=0.03)

@@ -1,0 +1,152 @@
+"""Moduli from presses whose moduli are known, and presses that cannot tell them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from known_press import KnownPress, layered_block
+
+from us_sim.errors import StiffnessError
+from us_sim.geometry.collider import RoundedBox
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import LabelFractions, average_over_labels
+from us_sim.tissue.identification.landmarks import Landmarks
+from us_sim.tissue.identification.press_model import PressModel
+from us_sim.tissue.identification.press_record import paired, without_wrench
+from us_sim.tissue.identification.settings import StiffnessSettings
+from us_sim.tissue.identification.stiffness import Tissue, fit_stiffness
+from us_sim.tissue.mesh.node_selection import face_nodes
+from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.tissue.model import TissueModel
+
+FEW = StiffnessSettings(poses=16)
+
+
+def test_moduli_are_within_5_percent_with_1_percent_noise_and_within_their_intervals(press, random):
+    inside = 0
+    for _ in range(3):
+        found = fit_stiffness(press.tissue, press.record(press.noisy(0.01, random)), FEW)
+        for name, true in press.moduli.items():
+            assert found.moduli[name] == pytest.approx(true, rel=0.05)
+            inside += found.intervals[name].lower <= true <= found.intervals[name].upper
+        assert found.scatter("force") == pytest.approx(0.01 * 3.5, rel=0.4)
+    assert inside >= 5  # of 6
+
+
+def test_a_sensor_without_torque_will_do(press, random):
+    felt = press.noisy(0.01, random)
+    felt[:, 3:] = 0.0
+    found = fit_stiffness(press.tissue, press.record(felt), FEW)
+    for name, true in press.moduli.items():
+        assert found.moduli[name] == pytest.approx(true, rel=0.1)
+    assert any("no torque" in remark for remark in found.remarks)
+
+
+def test_two_springs_in_series_are_told_as_one_and_either_from_the_other():
+    """A column of two layers under a plate: F = A d / (h1 / E1 + h2 / E2)."""
+    side, height = 0.04, 0.06
+    across, deep = uniform_planes(-side / 2, side / 2, 4), uniform_planes(0.0, height, 7)
+    mesh = box_mesh(across, across, deep)
+    lower = mesh.nodes[mesh.tetrahedra][:, :, 2].mean(axis=1) > 0.02
+    fractions = LabelFractions(np.arange(2, dtype=np.uint8), np.eye(2)[lower.astype(int)])
+    fixed = np.zeros(len(mesh.nodes), dtype=bool)
+    fixed[face_nodes(mesh, "bottom")] = True
+
+    def materials_for(moduli):
+        return average_over_labels(
+            fractions, {k: Material(moduli[name], 0.0) for k, name in enumerate(("top", "base"))}
+        )
+
+    start = {"top": 8e3, "base": 20e3}
+    plate = RoundedBox(length=0.1, width=0.1, height=0.03, rounding=0.001)
+    model = TissueModel(mesh, materials_for(start), fixed, plate, face_nodes(mesh, "top"))
+    column = Tissue(model, materials_for, start)
+    depth = 0.0012 * np.sin(np.pi * np.linspace(0, 1, 61)) ** 2
+    true = {"top": 5e3, "base": 20e3}
+    force = side**2 * depth / (0.02 / true["top"] + 0.04 / true["base"])
+    force += 1e-4 * force.max() * np.sin(np.arange(61) ** 2)
+    stamps = np.arange(61) * 50_000_000
+    poses = stamps, np.outer(depth, [0, 0, 1]), np.tile([0.0, 0, 0, 1], (61, 1))
+    record = paired(poses, (stamps, np.outer(force, [0, 0, -1, 0, 0, 0])), tolerance=0.01)
+    found = fit_stiffness(column, record, StiffnessSettings(poses=14, keep=("base",)))
+    assert found.moduli["top"] == pytest.approx(true["top"], rel=0.04)  # the probe sinks in a bit
+    assert found.intervals["top"].factor < 1.05
+    with pytest.raises(StiffnessError, match=r"(base|top) cannot be told from (top|base)"):
+        fit_stiffness(column, record, StiffnessSettings(poses=14))
+
+
+def test_a_structure_that_no_force_reaches_is_refused_by_name(press, random):
+    tissue = press.tissue
+
+    def with_bone(moduli):
+        made = tissue.materials_for(moduli)
+        modulus = made.young_modulus.copy()
+        modulus[-1] = moduli["bone"]  # in a corner of the face that is held
+        return replace(made, young_modulus=modulus)
+
+    more = Tissue(tissue.model, with_bone, {**tissue.moduli, "bone": 1e5})
+    record = press.record(press.noisy(0.01, random))
+    with pytest.raises(
+        StiffnessError, match=r"does not determine bone: bone hardly matters.*--keep bone"
+    ):
+        fit_stiffness(more, record, FEW)
+    found = fit_stiffness(more, record, replace(FEW, keep=("bone",)))
+    assert found.moduli["bone"] == 1e5
+    assert "bone" not in found.intervals
+
+
+def test_another_mesh_than_the_one_that_made_the_forces_is_said_in_the_residual(press, random):
+    record = press.record(press.noisy(0.001, random))
+    own = fit_stiffness(press.tissue, record, FEW)
+    other = fit_stiffness(layered_block((8, 8, 8)), record, FEW)
+    assert other.scatter("force") > 1.5 * own.scatter("force")
+    for name, true in press.moduli.items():
+        assert other.moduli[name] == pytest.approx(true, rel=0.35)
+        assert other.intervals[name].factor > own.intervals[name].factor
+
+
+def seen_by(press: KnownPress) -> Landmarks:
+    """Where four points of the block are at five moments of the press."""
+    mesh = press.tissue.model.mesh
+    rest = np.array([[0.0, 0, 0.01], [0.01, 0.01, 0.02], [-0.01, 0, 0.025], [0.02, -0.01, 0.03]])
+    poses = np.array([30, 45, 60, 75, 90])
+    located = locate(mesh, rest)
+    whole = PressModel(press.tissue.model, press.tissue.materials_for, [], [])
+    solver = whole.solver(press.moduli)
+    places = []
+    for k in poses:
+        moved = whole.balanced(solver, Pose(press.path.positions[k]), 0)
+        nodes = mesh.tetrahedra[located.tetrahedra]
+        places.append(rest + np.einsum("la,lax->lx", located.weights, moved[nodes]))
+    times = (press.path.stamps[poses] - press.path.stamps[0]) / 1e9
+    return Landmarks(
+        ("a", "b", "c", "d"), rest, np.tile(np.arange(4), 5), np.repeat(times, 4), np.vstack(places)
+    )
+
+
+def test_landmarks_alone_tell_ratios_and_refuse_the_scale(press):
+    path = press.path
+    record = without_wrench((path.stamps, path.positions, path.orientations))
+    with pytest.raises(StiffnessError, match="only ratios"):
+        fit_stiffness(press.tissue, record, FEW, seen_by(press))
+    start = replace(press.tissue, moduli={"fat": 10e3, "muscle": press.moduli["muscle"]})
+    few = replace(FEW, poses=12, keep=("muscle",))
+    found = fit_stiffness(start, record, few, seen_by(press))
+    assert found.moduli["fat"] == pytest.approx(press.moduli["fat"], rel=0.02)
+    assert found.scatter("landmark") < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("keep", "sign", "sentence"),
+    [
+        (("skin",), 1.0, "there is no such structure; there are fat, muscle"),
+        (("fat", "muscle"), 1.0, "nothing to fit"),
+        (("fat",), -1.0, "points the other way"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(press, keep, sign, sentence):
+    record = press.record(sign * press.felt)
+    with pytest.raises(StiffnessError, match=sentence):
+        fit_stiffness(press.tissue, record, replace(FEW, keep=keep))

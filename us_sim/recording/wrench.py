@@ -1,0 +1,131 @@
+"""The wrenches of a bag: forces and torques over time, from a simulated probe or from a sensor.
+
+>>> import tempfile
+>>> import numpy as np
+>>> from us_sim.recording.wrench import WrenchRecord, read_wrenches, write_wrenches
+>>> file = tempfile.mkdtemp() + "/press.mcap"
+>>> pressed = np.array([[0.0, 0.0, -2.5, 0.0, 0.0, 0.0]])
+>>> write_wrenches(file, WrenchRecord("/probe/wrench", "probe", np.array([10**18]), pressed))
+>>> read_wrenches(file, "probe/wrench").wrenches
+array([[ 0. ,  0. , -2.5,  0. ,  0. ,  0. ]])
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import BagError
+from us_sim.recording.qos import QosProfile
+from us_sim.recording.reader import read_bag
+from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.writer import BagWriter
+
+__all__ = ["WRENCH_STAMPED", "WrenchRecord", "read_wrenches", "write_wrenches"]
+
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+
+
+@dataclass(frozen=True, eq=False)
+class WrenchRecord:
+    """Wrenches in the order in which they were recorded.
+
+    Raises:
+        BagError: the arrays are not of K wrenches.
+    """
+
+    topic: str
+    frame_id: str
+    stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
+    wrenches: NDArray[np.float64]  # (K, 6) force N and torque N m, frame frame_id; as recorded
+
+    def __post_init__(self) -> None:
+        if self.stamps.ndim != 1 or self.wrenches.shape != (len(self.stamps), 6):
+            raise BagError(
+                f"{len(self.stamps)} stamps need as many wrenches (K, 6), not an array of shape "
+                f"{self.wrenches.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+def read_wrenches(path: str | Path, topic: str = "probe/wrench") -> WrenchRecord:
+    """Reads the wrenches on a topic of a bag.
+
+    Args:
+        path: any bag that ``read_bag`` reads.
+        topic: its name, with or without the leading slash.
+
+    Raises:
+        BagError: there is no such bag or topic, it is of another type, is silent, or its wrenches
+            are of several frames.
+    """
+    bag = read_bag(path)
+    chosen = bag.topic(topic)
+    if chosen.type_name != WRENCH_STAMPED:
+        raise BagError(
+            f"{bag.path} holds {chosen.name} as {chosen.type_name}, not {WRENCH_STAMPED}"
+        )
+    stamps: list[int] = []
+    wrenches: list[tuple[float, ...]] = []
+    frames: dict[str, None] = {}
+    for raw in bag.messages([chosen.name]):
+        message = bag.deserialize(raw)
+        try:
+            stamp, f, t = message.header.stamp, message.wrench.force, message.wrench.torque
+            stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+            wrenches.append(tuple(float(number) for number in (f.x, f.y, f.z, t.x, t.y, t.z)))
+            frames[str(message.header.frame_id)] = None
+        except (AttributeError, TypeError, ValueError) as error:
+            raise BagError(
+                f"{bag.path} defines {chosen.type_name} as ROS 2 does not, so that there are no "
+                f"wrenches on {chosen.name}: {error}"
+            ) from None
+    if not stamps:
+        raise BagError(f"{bag.path} holds no wrench on {chosen.name}; {bag.note or 'it is silent'}")
+    if len(frames) > 1:
+        raise BagError(
+            f"{bag.path} holds wrenches on {chosen.name} in the frames {', '.join(frames)}: one "
+            f"sensor has one frame"
+        )
+    try:
+        times = np.array(stamps, dtype=np.int64)
+    except OverflowError:
+        raise BagError(f"{bag.path} holds a stamp on {chosen.name} that is no time") from None
+    return WrenchRecord(chosen.name, next(iter(frames)), times, np.array(wrenches))
+
+
+def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
+    """Writes them as a bag of their one topic, or beside other topics into one that is open.
+
+    Raises:
+        BagError: the file exists or cannot be written.
+    """
+    if not isinstance(file, BagWriter):
+        with BagWriter(file, compression="zstd") as writer:
+            write_wrenches(writer, record)
+        return
+    file.add_topic(record.topic, WRENCH_STAMPED, [QosProfile()])
+    for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
+        file.write(record.topic, _serialized(stamp, record.frame_id, wrench), stamp, stamp)
+
+
+def _serialized(stamp: int, frame_id: str, wrench: list[float]) -> Any:
+    """A WrenchStamped as CDR; stamp in ns."""
+    store = jazzy_definitions()
+    types = store.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    message = types[WRENCH_STAMPED](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id=frame_id
+        ),
+        wrench=types["geometry_msgs/msg/Wrench"](
+            force=vector(*wrench[:3]), torque=vector(*wrench[3:])
+        ),
+    )
+    return store.serialize_cdr(message, WRENCH_STAMPED, little_endian=True)
