@@ -83,24 +83,24 @@ class DarkVessels(Settings):
         """(i, j, k) where vessels are."""
         factor = np.maximum(1, (self.thinnest / _VOXELS_ACROSS / region.spacing).astype(int))
         region.progress(0.0, "where data are")
-        covered = covered_part(region.grey, region.spacing)
-        if not covered.any():
-            return covered
         grey = _shrunk(region.grey, factor)
-        data = _shrunk(covered.astype(np.float32), factor)
-        found = self._search(grey, data > 0.5, region.spacing * factor, region.progress)
+        has_data = _shrunk((region.grey >= 1.0).astype(np.float32), factor)
+        data = covered_part(has_data, region.spacing * factor, lower=0.5)
+        if not data.any():
+            return np.zeros(region.grey.shape, bool)
+        found = self._search(grey, data, region.spacing * factor, region.progress)
         if (factor == 1).all():
-            return found & covered
+            return found
         # A coarse voxel's centre lies amid the fine ones that it is the mean of.
         fine = ndimage.affine_transform(
             found.astype(np.float32),
             1.0 / factor,
             -(factor - 1.0) / (2.0 * factor),
-            output_shape=covered.shape,
+            output_shape=region.grey.shape,
             order=1,
             mode="nearest",
         )
-        return np.asarray((fine > 0.5) & covered)
+        return np.asarray(fine > 0.5)
 
     def _search(
         self,

@@ -83,9 +83,12 @@ def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def parts_with(mask: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]]) -> NDArray[np.bool_]:
-    """The parts that hold one of some voxels."""
+    """The parts that hold one of some voxels, which may lie beside the mask."""
     parts, _ = ndimage.label(mask, _TOUCHING)
-    held = {int(parts[seed]) for seed in seeds} - {0}
+    inside = [
+        seed for seed in seeds if all(0 <= n < m for n, m in zip(seed, mask.shape, strict=True))
+    ]
+    held = {int(parts[seed]) for seed in inside} - {0}
     return np.isin(parts, sorted(held))
 
 

@@ -18,6 +18,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import SimpleITK as sitk
@@ -121,7 +122,33 @@ def _found(
     mask = asked.method.settings(SEGMENTATIONS).found_in(region)
     if asked.reach is not None:
         mask &= _near(inside, asked.reach, spacing, grey.shape)
-    return _finished(mask, asked, region), box
+    # What follows takes time and memory by the size of what it is given.
+    part = _around(mask, max(asked.open, asked.close), spacing)
+    region = replace(
+        region,
+        grey=grey[part],
+        seeds=tuple(_index(np.array(seed) - [span.start for span in part]) for seed in inside),
+    )
+    finished = _finished(mask[part], asked, region)
+    whole = tuple(
+        slice(outer.start + inner.start, outer.start + inner.stop)
+        for outer, inner in zip(box, part, strict=True)
+    )
+    return finished, whole
+
+
+def _around(
+    mask: NDArray[np.bool_], margin: float, spacing: NDArray[np.float64]
+) -> tuple[slice, ...]:
+    """The box around a mask, wider by a margin (m) and a voxel; all where it is empty."""
+    found = ndimage.find_objects(mask.view(np.uint8))
+    if not found:
+        return tuple(slice(0, size) for size in mask.shape)
+    more = np.ceil(margin / spacing).astype(int) + 1
+    return tuple(
+        slice(max(0, span.start - int(by)), min(size, span.stop + int(by)))
+        for span, by, size in zip(found[0], more, mask.shape, strict=True)
+    )
 
 
 def _index(at: NDArray[np.int64]) -> Index:

@@ -25,6 +25,8 @@ __all__ = ["filter_coefficients", "pass_band_for", "response", "smoothed", "with
 _CORRECTIONS = 4
 """Newton steps to the wanted volume; each leaves the square of the error before."""
 
+_EXACT = 1e-6  # of the volume
+
 _WIDEST_BAND = 1.5
 
 _SHARPNESS = 10.0
@@ -69,7 +71,10 @@ def with_volume(surface: ClosedSurface, volume: float, farthest: float) -> Close
     normals = vertex_normals(surface.vertices, surface.triangles)
     moved, distance = surface, 0.0
     for _ in range(_CORRECTIONS):
-        distance += (volume - moved.volume) / moved.area
+        missing = volume - moved.volume
+        if abs(missing) <= _EXACT * volume:
+            break
+        distance += missing / moved.area
         distance = float(np.clip(distance, -farthest, farthest))
         moved = surface.moved_to(surface.vertices + distance * normals)
     return moved
