@@ -71,7 +71,7 @@ def test_every_piece_of_a_scene_can_be_read(page):
     arm = yaml.safe_load((ROOT / "config/scenes/upper_arm.yaml").read_text(encoding="utf-8"))
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
         given = yaml.safe_load(block)
-        base = arm if given.pop("based_on", None) else bare
+        base = arm if given.pop("based_on", None) or given.get("case") else bare
         if {"winkler", "udp"} & {str(word) for word in re.findall(r"\w+", block)}:
             continue  # what a package of others adds; see test_contributing
         if "phantom" not in given.get("volume", {"phantom": ""}):

@@ -129,10 +129,12 @@ def _at_structures(
         return start
     array: Any = probe.array.settings(PROBES)
     pose = start.pose
-    seen = _placed(volume, np.isin(volume.labels, counted), pose)
+    step = max(1, math.ceil((volume.labels.size / _MOST_POINTS / 5) ** (1 / 3)))
+    every = (slice(None, None, step),) * 3
+    seen = _placed(volume, np.isin(volume.labels[every], counted), step, pose)
     widest = array.width / 2 * np.clip(seen[:, 2] / array.depth, 0.3, 1.0)
     seen = seen[(np.abs(seen[:, 0]) < widest) & (seen[:, 2] > 0.0) & (seen[:, 2] < array.depth)]
-    scanned = _placed(volume, volume.intensities > 0, pose)
+    scanned = _placed(volume, volume.intensities[every] > 0, step, pose)
     beam = scanned[np.abs(scanned[:, 0]) < max(_BESIDE, _spacing(volume))]
     best, moved = 0.0, pose
     for offset in np.arange(-_FARTHEST, _FARTHEST + _OFFSET / 2, _OFFSET):
@@ -146,11 +148,10 @@ def _at_structures(
     return _start(moved)
 
 
-def _placed(volume: Volume, mask: NDArray[np.bool_], pose: Pose) -> NDArray[np.float64]:
-    """(N, 3) m, in the frame of a probe, voxels of a mask, as few as make a million of them all."""
-    step = max(1, math.ceil((mask.size / _MOST_POINTS / 5) ** (1 / 3)))
+def _placed(volume: Volume, mask: NDArray[np.bool_], step: int, pose: Pose) -> NDArray[np.float64]:
+    """(N, 3) m, in the frame of a probe, voxels of a mask that has every ``step``-th of them."""
     matrix = pose.inverse().matrix @ volume.index_to_patient
-    found = np.argwhere(mask[::step, ::step, ::step]) * step
+    found = np.argwhere(mask) * step
     return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
 
 

@@ -75,7 +75,7 @@ class SweepSettings(Settings):
         """Refuse a place that cannot be written to, which is worth knowing before the work."""
         if self.out.exists():
             raise self.refused("out", f"{self.out}: exists already; choose another name")
-        if not self.out.absolute().parent.is_dir():
+        if self.is_volume and not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
         if self.is_volume and self.picture.exists():
             raise self.refused("out", f"{self.picture}: exists already; choose another name")
