@@ -89,11 +89,15 @@ class Insertion:
         step = _step(self.grid, image_to_reference)
         if self._plus_rounding:
             step = np.trunc(step * _PLUS_PLACES + np.copysign(0.5, step)) / _PLUS_PLACES
+        shape = np.array(self.grid.shape, dtype=np.int64)
+        if self._mode == _MEAN and not self._linear:
+            _add_nearest(image, used, step, shape, self._gathered)
+            return
         _insert_image(
             image,
             used,
             step,
-            np.array(self.grid.shape, dtype=np.int64),
+            shape,
             self._linear,
             self._mode,
             self._gathered,
@@ -246,6 +250,31 @@ def _insert_image(image, used, step, shape, linear, mode, gathered, cursor, valu
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_nearest(image, used, step, shape, gathered):
+    """As `_insert_image` does for the mean of nearest voxels, in a third of the time."""
+    for row in range(image.shape[0]):
+        x0 = step[0, 0] + step[0, 2] * row
+        y0 = step[1, 0] + step[1, 2] * row
+        z0 = step[2, 0] + step[2, 2] * row
+        for column in range(image.shape[1]):
+            if used[row, column]:
+                x = x0 + step[0, 1] * column
+                y = y0 + step[1, 1] * column
+                z = z0 + step[2, 1] * column
+                if not (
+                    -0.5 <= x < shape[0] - 0.5
+                    and -0.5 <= y < shape[1] - 0.5
+                    and -0.5 <= z < shape[2] - 0.5
+                ):
+                    continue
+                # Nothing is below zero here, so that cutting off rounds.
+                i, j, k = np.int64(x + 0.5), np.int64(y + 0.5), np.int64(z + 0.5)
+                voxel = (i * shape[1] + j) * shape[2] + k
+                gathered[voxel, 0] += np.float32(image[row, column])
+                gathered[voxel, 1] += np.float32(1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _insert_points(pixels, points, shape, linear, mode, gathered, cursor, values):
     """Insert pixels (P,) at indices (P, 3); the rest as for `_insert_image`."""
     for p in range(pixels.shape[0]):
@@ -265,11 +294,7 @@ def _insert(x, y, z, pixel, shape, linear, mode, gathered, cursor, values):
         # Nothing is below zero here, so that cutting off rounds.
         i, j, k = np.int64(x + 0.5), np.int64(y + 0.5), np.int64(z + 0.5)
         voxel = (i * shape[1] + j) * shape[2] + k
-        if mode == _MEAN:
-            gathered[voxel, 0] += np.float32(pixel)
-            gathered[voxel, 1] += np.float32(1.0)
-        else:
-            _gather(voxel, pixel, 1.0, False, mode, gathered, cursor, values)
+        _gather(voxel, pixel, 1.0, False, mode, gathered, cursor, values)
         return
     i0 = np.int64(math.floor(x))
     j0 = np.int64(math.floor(y))
