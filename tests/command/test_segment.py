@@ -137,6 +137,18 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(
     assert contents(case.parent) == before
 
 
+def test_a_name_that_means_something_else_in_a_case_is_refused(case, tmp_path, capsys):
+    file = tmp_path / "labels.seg.nrrd"
+    labelled = block()
+    write_labels(file, Volume(labelled.intensities, labelled.index_to_patient, labelled.labels))
+    before = contents(case)
+    assert main(["segment", str(case), "--labels", str(file), "--names", "6=tissue"]) == 1
+    error = capsys.readouterr().err
+    assert "structures.tissue: means something else already" in error
+    assert "--names 6=NAME" in error
+    assert contents(case) == before
+
+
 def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, capsys):
     before = contents(case.parent)
 

@@ -81,6 +81,7 @@ def _segment_case(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Pr
     progress(0.0, "reading")
     volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / "volume.nrrd")
     found = _found(asked, volume, progress)
+    _with_structures(case.settings, found.labels, [])  # refuses a name before the rest is made
     made = _surfaces(found.labels.on(volume), surfaces, progress)
     remarks = list(found.labels.remarks)
     with changed_case(case.folder) as folder:
@@ -194,7 +195,11 @@ def _surface_step(made: list[StructureSurface], settings: SurfaceSettings) -> St
 
 
 def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str]) -> CaseSettings:
-    """The case's settings with these structures; one that was there keeps its material."""
+    """The case's settings with these structures; one that was there keeps its material.
+
+    Raises:
+        CaseError: a name means something else in a case.
+    """
     structures = {}
     for label, name in labels.names.items():
         before = settings.structures.get(name)
@@ -205,7 +210,12 @@ def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str
     if gone:
         remarks.append(f"{', '.join(gone)}: was a structure of the case and is none now")
     fixed = tuple(name for name in settings.fixed if name not in gone)
-    return dataclasses.replace(settings, structures=structures, fixed=fixed)
+    try:
+        return dataclasses.replace(settings, structures=structures, fixed=fixed)
+    except CaseError as error:
+        numbers = {f"structures.{name}": label for label, name in labels.names.items()}
+        hint = f"; for a file of labels that is --names {numbers.get(error.key, 'LABEL')}=NAME"
+        raise CaseError(f"{error.key}: {error.problem}{hint}") from error
 
 
 def _write(

@@ -23,6 +23,7 @@ __all__ = ["draw_segmentation"]
 _AXES = ("i", "j", "k")
 _SLICES = 3  # along each axis
 _MOST_TRIANGLES = 20_000  # of all surfaces; matplotlib draws them in a second or two
+_MARGIN = 20.0  # mm that slices show around what is labelled
 _LINES: tuple[Any, ...] = ("solid", "dashed", "dotted", "dashdot")
 """In turn, since several structures may have one colour."""
 _LIGHT = np.array([0.4, -0.5, 0.77])
@@ -32,13 +33,13 @@ def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
     """Write the picture as PNG.
 
     Each row has slices through the middle and both sides of the structures along one axis of the
-    grid, in millimetres from the grid's first voxel.
+    grid, in millimetres from the grid's first voxel, with what is near the structures.
     """
     figure = Figure(figsize=(17, 11))
     FigureCanvasAgg(figure)
     # Its places are given: to find them out takes matplotlib as long as all the drawing.
     grid = figure.add_gridspec(
-        3, 2 + _SLICES, left=0.03, right=0.97, bottom=0.05, top=0.96, wspace=0.16, hspace=0.22
+        3, 2 + _SLICES, left=0.04, right=0.97, bottom=0.05, top=0.96, wspace=0.24, hspace=0.22
     )
     for axis in range(3):
         for column, index in enumerate(_indices(found.labels, axis)):
@@ -69,6 +70,15 @@ def _indices(labels: NDArray[np.uint8], axis: int) -> list[int]:
     return [int(index) for index in np.searchsorted(covered, parts)]
 
 
+def _shown_part(labels: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """(2, 3) first and last index of what is labelled along each axis."""
+    ends = []
+    for axis in range(3):
+        there = np.flatnonzero(labels.any(axis=tuple(other for other in range(3) if other != axis)))
+        ends.append((there[0], there[-1]))
+    return np.array(ends).T
+
+
 def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -> None:
     """One slice, brightened by a square root, as vessels are in the dark."""
     sides = np.delete(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0), axis) * 1e3
@@ -84,6 +94,10 @@ def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -
             colour = [found.colours[label]]
             panel.contour(x, y, shown == label, [0.5], colors=colour, linestyles=line)
     names = [name for other, name in enumerate(_AXES) if other != axis]
+    lower, upper = np.delete(_shown_part(found.labels), axis, axis=1) * sides
+    panel.set_xlim(lower[0] - _MARGIN, upper[0] + _MARGIN)
+    panel.set_ylim(upper[1] + _MARGIN, lower[1] - _MARGIN)
+    panel.set_facecolor("black")
     panel.set_title(f"{_AXES[axis]} = {index}", fontsize=10)
     panel.set_xlabel(f"{names[0]}, mm", fontsize=8)
     panel.set_ylabel(f"{names[1]}, mm", fontsize=8)
