@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sweep_file import write_sweep
 
+from us_sim.command.main import main
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of, tissue_model_of, volume_of
@@ -13,6 +14,7 @@ from us_sim.scene.reading import load_scene
 from us_sim.scene.rest_placement import probe_pose, rest_placement
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.tissue.solvers.solver import create_solver
+from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import read_sweep
@@ -97,3 +99,16 @@ def test_a_scene_without_tissue_is_refused(pressed):
     scene, _, sweep = pressed
     with pytest.raises(SceneError, match="has no tissue"):
         rest_placement(dataclasses.replace(scene, tissue=None), sweep, ImagePart())
+
+
+def test_the_command_places_images_at_rest(pressed, small_scene, tmp_path, capsys):
+    scene, _, sweep = pressed
+    out = tmp_path / "rest.nrrd"
+    words = ["reconstruct", str(sweep.path), "--out", str(out), "--spacing", "1 mm"]
+    assert main([*words, "--undo-pressure", str(small_scene)]) == 0
+    assert "from 25 frames" in capsys.readouterr().out
+    how = Compounding(spacing=1e-3)
+    rest = rest_placement(scene, sweep, ImagePart())
+    made = reconstruct(plan(sweep, how, rest=rest))
+    np.testing.assert_array_equal(read_volume(out).intensities, made.volume.intensities)
+    assert made.volume.shape[2] > 40  # the probe's depth of 40 mm, and what it had pressed down
