@@ -25,7 +25,7 @@ VERBS = (
     *("demo", "run", "render", "play", "bag", "info"),
     *("evaluate", "tissue", "stability", "hand", "slice", "tracking", "latency"),
     *("calibrate", "camera", "pivot", "landmarks", "probe", "time", "print-marker", "reference"),
-    *("compile", "fit-stiffness", "reconstruct", "segment", "cases"),
+    *("compile", "fit-stiffness", "reconstruct", "segment", "cases", "import"),
 )
 
 COMMANDS = sorted(
