@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +186,7 @@ def planted(made):
         setattr(made, key, value)
     for tag, kind in ((0x00091001, "LO"), (0x00091002, "UN"), (0x00091003, "OB")):
         made.add_new(tag, kind, PLANTED if kind == "LO" else PLANTED.encode() + b"\0" * 4)
+    made.add_new(0x0020000D, "UI", f"1.2.0123.{PLANTED}")  # of which pydicom warns, and shows it
     made.add_new(0x00090010, "LO", f"{PLANTED} CREATOR")
     inner = item(
         CodeMeaning=PLANTED, RequestAttributesSequence=[item(RequestedProcedureID=PLANTED)]
@@ -204,8 +206,11 @@ def test_of_a_volume_with_names_in_every_place(tmp_path, own_words):
     for name in ("o.nrrd", "o.mha", "o.nii", "o.nii.gz", "arm"):
         out = tmp_path / f"out {name}"
         out.mkdir()
-        found = look_at([path], out / name, ImportSettings())
-        found.write()
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            found = look_at([path], out / name, ImportSettings())
+            found.write()
+        assert not [one for one in warned if PLANTED in str(one.message)]
         assert not survivors(telling(path), written(out), own_words), name
         assert PLANTED.lower() not in report_text(found.imported).lower()
         assert b"98279" not in written(out)[0]

@@ -25,6 +25,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from us_sim.volume.files.dicom.values import quiet
 from us_sim.volume.files.metaimage import metaimage_header
 
 __all__ = ["dicom_names", "other_names"]
@@ -128,9 +129,10 @@ def dicom_names(header: Any) -> dict[str, int]:
     """How often each element is there, those within sequences by the way to them."""
     found: Counter[str] = Counter()
     meta = getattr(header, "file_meta", None)
-    if meta is not None:
-        _count(meta, "", found, 0)
-    _count(header, "", found, 0)
+    with quiet():
+        if meta is not None:
+            _count(meta, "", found, 0)
+        _count(header, "", found, 0)
     return dict(found)
 
 

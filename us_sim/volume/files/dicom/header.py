@@ -15,16 +15,13 @@ from __future__ import annotations
 import io
 import os
 import struct
-import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.values import text, whole
+from us_sim.volume.files.dicom.values import quiet, text, whole
 from us_sim.volume.files.stored_voxels import check_claim
 
 __all__ = ["EXTRA", "DicomFile", "PixelPlace", "is_dicom", "open_dicom"]
@@ -102,7 +99,7 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
     except ImportError as error:
         raise VolumeError(f"{path}: reading DICOM needs an extra package: {EXTRA}") from error
     try:
-        with _quiet():
+        with quiet():
             return _opened(path)
     except (VolumeError, MemoryError):
         raise
@@ -113,21 +110,6 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
             f"{path}: cannot be read as DICOM: its header is damaged or cut short; copy or export "
             f"it again"
         ) from error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """No warning for every value that does not keep to the standard: many files have some."""
-    from pydicom import config
-
-    before = config.settings.reading_validation_mode
-    config.settings.reading_validation_mode = config.IGNORE
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        config.settings.reading_validation_mode = before
 
 
 class _DeflatedError(Exception):

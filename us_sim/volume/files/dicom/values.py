@@ -16,10 +16,27 @@ True
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["items", "number", "numbers", "private", "text", "value", "whole"]
+__all__ = ["items", "number", "numbers", "private", "quiet", "text", "value", "whole"]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """No warnings of pydicom: they would show the values that do not keep to the standard."""
+    from pydicom import config
+
+    before = config.settings.reading_validation_mode
+    config.settings.reading_validation_mode = config.IGNORE
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        config.settings.reading_validation_mode = before
 
 
 def value(header: Any, key: str | int) -> Any:
@@ -27,7 +44,8 @@ def value(header: Any, key: str | int) -> Any:
     try:
         if header is None or key not in header:
             return None
-        return header[key].value
+        with quiet():
+            return header[key].value
     except Exception:  # the bytes of a stranger: struct, unicode, index and many other errors
         return None
 
@@ -75,7 +93,8 @@ def items(header: Any, key: str | int) -> list[Any]:
     """The items of a sequence; none where there is none."""
     found = value(header, key)
     try:
-        return [] if found is None or isinstance(found, str | bytes) else list(found)
+        with quiet():
+            return [] if found is None or isinstance(found, str | bytes) else list(found)
     except Exception:  # an item is made when it is asked for, too
         return []
 
