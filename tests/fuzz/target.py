@@ -11,7 +11,7 @@ __all__ = ["MODULES", "TARGETS", "Target", "add_targets", "target"]
 
 MODULES = tuple(
     f"tests.fuzz.{room}"
-    for room in ("bags", "volumes", "dicoms", "segmentations", "meshes", "scenes")
+    for room in ("bags", "volumes", "dicoms", "segmentations", "cases", "meshes", "scenes")
 )
 """Where the targets are."""
 

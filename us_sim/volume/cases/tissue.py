@@ -20,8 +20,10 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +40,13 @@ __all__ = ["CaseTissue", "read_tissue", "write_tissue"]
 
 _LARGEST = 1 << 29
 """Bytes of the arrays together: a million nodes take less."""
+
+_DAMAGED = (
+    *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, MemoryError),
+    *(AttributeError, NotImplementedError, RuntimeError, MeshError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+"""What zipfile and NumPy raise for files that are none or are changed."""
 
 _ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
 _PLANES = ("planes_x", "planes_y", "planes_z")
@@ -117,7 +126,5 @@ def read_tissue(path: Path) -> CaseTissue:
             raise CaseError(f"{path}: its arrays do not go together; remove it")
         fractions /= fractions.sum(axis=1, keepdims=True)
         return CaseTissue(mesh, labels.astype(np.uint8), fractions, said)
-    except (OSError, EOFError, KeyError, ValueError, TypeError, MeshError) as error:
-        raise CaseError(f"{path}: is no tissue that us_sim wrote ({error}); remove it") from error
-    except zipfile.BadZipFile as error:
-        raise CaseError(f"{path}: is damaged ({error}); remove it") from error
+    except _DAMAGED as error:
+        raise CaseError(f"{path}: is no tissue that us_sim wrote, or damaged; remove it") from error
