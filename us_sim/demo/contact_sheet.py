@@ -44,7 +44,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes = figure.add_subplot(grid[divmod(i, 3)])
         extent = (left, right, bottom, top)
         axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
-        if scanner is not None and stamp in session.nodes:
+        seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
+        if scanner is not None and seen:  # through air nothing is
             found = scanner.labels(session.poses[stamp], session.nodes[stamp])
             _outline(axes, found, {numbers[name]: _colour(scene, name) for name in numbers}, extent)
         where = _place(session.poses[stamp])

@@ -49,6 +49,7 @@ def parts() -> Iterator[Part]:
     for method in SLICERS:
         yield method, partial(_make_image, method)
     yield "camera", _track_marker
+    yield "reconstruction", _reconstruct
 
 
 def _block(*, box: bool) -> TissueModel:
@@ -117,3 +118,24 @@ def _track_marker() -> None:
     from us_sim.tracking.camera.warm_up import practice
 
     practice(RigidBody.single("4X4_50", 7, 0.04))
+
+
+def _reconstruct() -> None:
+    """A sweep's images in both ways, and gathered for medians."""
+    from us_sim.volume.reconstruction.grid import grid_around
+    from us_sim.volume.reconstruction.hole_filling import fill_holes
+    from us_sim.volume.reconstruction.insertion import Collection, Insertion
+
+    grid = grid_around(np.array([[0.0, 0.0, 0.0], [0.002, 0.002, 0.002]]), 0.001)
+    image, used = np.ones((2, 2), np.uint8), np.ones((2, 2), np.bool_)
+    place = np.diag([0.001, 0.001, 0.001, 1.0])
+    for method in ("nearest", "linear"):
+        insertion = Insertion(grid, method=method, compounding="mean")
+        insertion.insert(image, place, used)
+        insertion.insert_points(np.ones(1, np.uint8), np.zeros((1, 3)))
+        fill_holes(*insertion.result(), 1.0)
+    gathered = Collection(grid, method="nearest")
+    gathered.count(place, used)
+    gathered.reserve()
+    gathered.insert(image, place, used)
+    gathered.result()
