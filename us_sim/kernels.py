@@ -33,7 +33,7 @@ from numba.core.serialize import dumps
 
 from us_sim.cache import cache_folder
 
-__all__ = ["njit"]
+__all__ = ["kernel_folder", "njit"]
 
 _DIGEST = 32  # bytes of a checksum, at the beginning of a file
 _WRITABLE_BY_OTHERS = 0o022
@@ -61,6 +61,12 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     return decorate if function is None else decorate(function)
 
 
+def kernel_folder() -> Path:
+    """Where compiled code is kept: NUMBA_CACHE_DIR, or `kernels` in the cache folder."""
+    given = getattr(config, "CACHE_DIR", "")
+    return Path(given) if given else cache_folder() / "kernels"
+
+
 # Its name differs between numba's versions.
 _UserProvidedCacheLocator: Any = CompileResultCacheImpl._locator_classes[0]
 
@@ -71,9 +77,7 @@ class _Locator(_UserProvidedCacheLocator):
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
         self._py_file = py_file
         self._lineno = py_func.__code__.co_firstlineno
-        given = getattr(config, "CACHE_DIR", "")
-        folder = Path(given) if given else cache_folder() / "kernels"
-        self._cache_path = str(folder / self.get_suitable_cache_subpath(py_file))
+        self._cache_path = str(kernel_folder() / self.get_suitable_cache_subpath(py_file))
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator | None:

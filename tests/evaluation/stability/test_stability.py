@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba.core import config
 
+from us_sim.cache import cache_folder
 from us_sim.evaluation.stability import measure as stability
 from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
 from us_sim.evaluation.stability.held_cases import HOLD, held_cases
@@ -16,6 +18,7 @@ from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
 from us_sim.evaluation.stability.points import Trial, agrees, equations_of, run_trial, try_case
 from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
+from us_sim.kernels import kernel_folder
 from us_sim.tissue.solvers.fem_cg import FemCg
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
@@ -313,6 +316,17 @@ def test_predicted_and_observed_step_limits_agree(springs, damping):
     case = StabilityCase("bisected", contrast=1e3, damping=damping, springs=springs)
     predicted, observed = observed_step_limit("msds", case)
     assert observed == pytest.approx(predicted, rel=0.02)
+
+
+def test_a_process_keeps_by_itself_all_but_the_kernels(tmp_path, monkeypatch):
+    kernels = kernel_folder()
+    monkeypatch.setenv("US_SIM_CACHE", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    monkeypatch.setattr(stability, "threadpool_limits", lambda _: None)
+    stability._prepare(str(tmp_path), str(kernels))
+    assert cache_folder() == tmp_path
+    assert kernel_folder() == kernels
 
 
 def test_the_report_has_a_row_for_each_case_and_a_map_for_each_method(

@@ -8,6 +8,7 @@ import sys
 import pytest
 from tissue_block import block
 
+from us_sim.kernels import kernel_folder
 from us_sim.tissue.solvers.compilation import compiled_solver
 from us_sim.tissue.solvers.solver import SolverSettings
 
@@ -76,6 +77,8 @@ for model, method, settings in (
 
 
 def test_no_frame_meets_a_kernel_that_is_not_compiled(tmp_path, monkeypatch):
+    # What is kept of a tissue is not there, so that it is made; kernels are those of all tests.
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernel_folder()))
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
     ran = subprocess.run([sys.executable, "-c", FRAMES], capture_output=True, text=True)
     assert ran.stdout.split("\n") == ["set()"] * 3 + [""], ran.stderr

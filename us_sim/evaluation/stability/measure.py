@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from numba.core import config
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import SolverError
@@ -31,6 +32,7 @@ from us_sim.evaluation.stability.points import Trial, Tried, try_case
 from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
 from us_sim.evaluation.stability.report import table, write_report
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
+from us_sim.kernels import kernel_folder
 from us_sim.progress import Progress
 from us_sim.tissue.solvers.solver import create_solver
 
@@ -93,7 +95,7 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
             max_workers=max(1, min(2, os.cpu_count() or 1)),
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_prepare,
-            initargs=(cache,),
+            initargs=(cache, str(kernel_folder())),
         ) as pool,
     ):
         try:
@@ -110,9 +112,13 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
     return tried
 
 
-def _prepare(cache: str) -> None:
-    """In a new process: one thread for BLAS, and what is kept on disk goes to ``cache``."""
+def _prepare(cache: str, kernels: str) -> None:
+    """In a new process: one thread for BLAS, and what is kept on disk goes to ``cache``.
+
+    Kernels alone are those of every other process: in a new folder all would be compiled again.
+    """
     os.environ["US_SIM_CACHE"] = cache
+    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = kernels  # type: ignore[attr-defined]
     threadpool_limits(1)
 
 
