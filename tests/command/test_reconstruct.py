@@ -50,6 +50,11 @@ def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, t
     assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
     case = read_case(out)
     assert case.volume().shape == (10, 10, 12)
+    assert case.settings.probe.geometry == "linear"  # as wide as the rectangle that is used
+    assert case.settings.probe.array.given.aperture == pytest.approx(10 * PIXEL)
+    assert len(case.settings.scanned) == 11
+    assert case.settings.start.proposed
+    assert case.settings.start.position == case.settings.scanned[5].position
     (step,) = case.steps
     assert step.what == "reconstructed"
     assert (step.counts["frames"], step.counts["frames left out"]) == (11, 1)

@@ -39,8 +39,12 @@ def test_the_case_has_two_veins_and_a_probe_and_no_name_of_the_sweep(case):
     assert set(opened.settings.structures) == {"vena cava", "portal vein"}
     assert set(opened.surfaces) == {"vena cava", "portal vein"}
     assert opened.settings.probe.geometry == "convex"
-    # The array that made the sweep: 177 mm deep, as its header has it.
-    assert opened.settings.probe.array.given.depth == pytest.approx(0.177, abs=0.01)
+    # The array that made the sweep, as its header has it.
+    array = opened.settings.probe.array.given
+    assert array.radius == pytest.approx(50.79e-3, abs=5e-4)
+    assert array.depth == pytest.approx(0.177, abs=5e-3)
+    start, scanned = opened.settings.start, opened.settings.scanned
+    assert (start.position, start.orientation) in [(p.position, p.orientation) for p in scanned]
     assert [step.what for step in opened.steps][:1] == ["reconstructed"]
     for text in ("case.yaml", "provenance.yaml"):
         assert "igs" not in (case / text).read_text()

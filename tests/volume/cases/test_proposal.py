@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CaseError
+from us_sim.geometry.placement import Placement
 from us_sim.geometry.pose import Pose
 from us_sim.volume.cases.proposal import proposed_probe, proposed_start, with_proposal
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
@@ -101,3 +102,25 @@ def test_a_volume_of_nothing_is_refused():
     empty = Volume(np.zeros((9, 9, 9), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
     with pytest.raises(CaseError, match="nothing to scan"):
         proposed_start(empty)
+
+
+def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():
+    def vessel(x, y, z):
+        return 3 * (np.hypot(x, z - 0.07) < 0.01) * (abs(y - 0.004) < 5e-3)
+
+    volume = scanned_by(Pose(np.array([0.0, 0.0, -0.06])), vessel)
+    poses = tuple(
+        Placement((0.0, y, -0.06), (0.0, 0.0, 0.0, 1.0)) for y in np.linspace(-0.02, 0.02, 11)
+    )
+    vein = {"vein": CaseStructure(3)}
+    plain = with_proposal(CaseSettings("a", scanned=poses), volume)
+    seen = with_proposal(CaseSettings("a", scanned=poses, structures=vein), volume)
+    assert plain.start.proposed
+    assert plain.start.position == (0.0, 0.0, -0.06)
+    assert seen.start.position == (0.0, 0.0, -0.06)  # it slides by 8 mm, and the vein is midway
+    far = tuple(Placement((0.0, p.position[1] + 0.02, -0.06)) for p in poses)
+    moved = with_proposal(CaseSettings("a", scanned=far, structures=vein), volume)
+    assert moved.start.position == (0.0, 0.004, -0.06)  # the first that is not the sweep's end
+    said = CaseStart((0.01, 0.0, 0.0))
+    fixed = CaseSettings("a", start=said, scanned=poses, structures=vein)
+    assert with_proposal(fixed, volume).start == said

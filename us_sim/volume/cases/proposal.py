@@ -1,11 +1,14 @@
 """Where to start and with which probe, for a case that does not say.
 
-Voxels that were never scanned are 0. The region that a spreading probe has scanned widens with
-depth, so its distances along the beams are spread unevenly, with a tail towards the probe: the
-skewness along the beams is least of all directions, or of those about a corner of the region; of
-several corners the probe is at the one where echoes are brightest. A region without such a
-direction is taken for one that a linear array has scanned along the rows of its images, the
-volume's second axis.
+A case that knows where it was scanned from starts at one of these poses, so that its first image
+is one that was really seen: the middle one, or the one that shows most of the structures.
+
+Else the volume alone tells. Voxels that were never scanned are 0. The region that a spreading probe
+has scanned widens with depth, so its distances along the beams are spread unevenly, with a tail
+towards the probe: the skewness along the beams is least of all directions, or of those about a
+corner of the region; of several corners the probe is at the one where echoes are brightest. A
+region without such a direction is taken for one that a linear array has scanned along the rows of
+its images, the volume's second axis.
 
 >>> import numpy as np
 >>> from us_sim.volume.cases.proposal import proposed_start
@@ -60,6 +63,7 @@ _SLID, _SHOWN = (
     6e-3,
 )  # m: the press slides 8 mm along y; its middle, and half of what it shows
 _BETTER = 1.02
+_ENDS = 0.1  # of a sweep, at both sides
 _FLAT = 0.015  # m, that the skin may be nearer or farther there
 _WIDEST = 0.05  # m, of a linear array's face
 _DEPTHS = (0.01, 0.25)  # m
@@ -68,17 +72,23 @@ _DEPTHS = (0.01, 0.25)  # m
 def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
     """The settings of a case, with a start and a probe where they say none.
 
-    A start that was proposed is proposed anew. Where the volume has labels, the probe is moved
-    along its elevation, on the skin, to where its image shows most of the structures.
+    A start that was proposed is proposed anew: a pose of the sweep where these are known. Where
+    the volume has labels, it is the pose whose image shows most of the structures; where no poses
+    are known, the probe is moved there along its elevation, on the skin.
 
     Raises:
         CaseError: nothing was scanned: all voxels are 0.
     """
     start, probe = settings.start, settings.probe
     if start is None or start.proposed:
-        start = proposed_start(volume)
-        probe = probe or proposed_probe(volume, start)
-        start = _at_structures(settings, volume, start, probe)
+        if settings.scanned:
+            start = _start(settings.scanned[len(settings.scanned) // 2].pose)
+            probe = probe or proposed_probe(volume, start)
+            start = _of_scanned(settings, volume, probe)
+        else:
+            start = proposed_start(volume)
+            probe = probe or proposed_probe(volume, start)
+            start = _at_structures(settings, volume, start, probe)
     probe = probe or proposed_probe(volume, start)
     if probe.collider is None:
         probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
@@ -116,24 +126,60 @@ def _start(pose: Pose) -> CaseStart:
     return CaseStart((x, y, z), (a, b, c, d), proposed=True)
 
 
-def _at_structures(
-    settings: CaseSettings, volume: Volume, start: CaseStart, probe: ProbeSettings
-) -> CaseStart:
-    """The start, moved along the probe's y to where most of the structures is in the image."""
-    counted = [
+def _of_scanned(settings: CaseSettings, volume: Volume, probe: ProbeSettings) -> CaseStart:
+    """The pose of the sweep whose image, and what is beside it, shows most of the structures.
+
+    The middle one where there are none; none of those at the ends, beside which nothing was seen.
+    """
+    poses = settings.scanned
+    best, first = 0.0, len(poses) // 2
+    end = math.floor(_ENDS * len(poses))
+    counted = _counted(settings, volume)
+    step = _step(volume)
+    structures = _points(volume, counted, step) if counted is not None else np.empty((0, 3))
+    for k in range(end, len(poses) - end):
+        pose = poses[k].pose
+        seen = _in_image((structures - pose.position) @ pose.rotation, probe)
+        shown = float((np.abs(seen[:, 1] - _SLID) < _SHOWN).sum())
+        if shown > best * _BETTER:
+            best, first = shown, k
+    return _start(poses[first].pose)
+
+
+def _counted(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None:
+    """Which of every so many voxels are in structures; None without structures to look at."""
+    labels = [
         structure.label
         for name, structure in settings.structures.items()
         if kind_of(name) not in (*LAYERS, "bone")
     ]
-    if volume.labels is None or not counted:
-        return start
+    if volume.labels is None or not labels:
+        return None
+    return np.asarray(np.isin(volume.labels[(slice(None, None, _step(volume)),) * 3], labels))
+
+
+def _step(volume: Volume) -> int:
+    return max(1, math.ceil((volume.intensities.size / _MOST_POINTS / 5) ** (1 / 3)))
+
+
+def _in_image(seen: NDArray[np.float64], probe: ProbeSettings) -> NDArray[np.float64]:
+    """Of points (N, 3) m in the probe's frame, those in front of and behind its image."""
     array: Any = probe.array.settings(PROBES)
-    pose = start.pose
-    step = max(1, math.ceil((volume.labels.size / _MOST_POINTS / 5) ** (1 / 3)))
-    every = (slice(None, None, step),) * 3
-    seen = _placed(volume, np.isin(volume.labels[every], counted), step, pose)
     widest = array.width / 2 * np.clip(seen[:, 2] / array.depth, 0.3, 1.0)
-    seen = seen[(np.abs(seen[:, 0]) < widest) & (seen[:, 2] > 0.0) & (seen[:, 2] < array.depth)]
+    inside = (np.abs(seen[:, 0]) < widest) & (seen[:, 2] > 0.0) & (seen[:, 2] < array.depth)
+    return seen[inside]
+
+
+def _at_structures(
+    settings: CaseSettings, volume: Volume, start: CaseStart, probe: ProbeSettings
+) -> CaseStart:
+    """The start, moved along the probe's y to where most of the structures is in the image."""
+    counted = _counted(settings, volume)
+    if counted is None:
+        return start
+    pose, step = start.pose, _step(volume)
+    every = (slice(None, None, step),) * 3
+    seen = _in_image(_placed(volume, counted, step, pose), probe)
     scanned = _placed(volume, volume.intensities[every] > 0, step, pose)
     beam = scanned[np.abs(scanned[:, 0]) < max(_BESIDE, _spacing(volume))]
     best, moved = 0.0, pose
@@ -150,9 +196,13 @@ def _at_structures(
 
 def _placed(volume: Volume, mask: NDArray[np.bool_], step: int, pose: Pose) -> NDArray[np.float64]:
     """(N, 3) m, in the frame of a probe, voxels of a mask that has every ``step``-th of them."""
-    matrix = pose.inverse().matrix @ volume.index_to_patient
-    found = np.argwhere(mask) * step
-    return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
+    return np.asarray((_points(volume, mask, step) - pose.position) @ pose.rotation)
+
+
+def _points(volume: Volume, mask: NDArray[np.bool_], step: int) -> NDArray[np.float64]:
+    """(N, 3) m, the same in the volume's frame."""
+    matrix = volume.index_to_patient
+    return np.asarray((np.argwhere(mask) * step) @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
@@ -181,7 +231,12 @@ def proposed_collider(array: Chosen) -> Chosen:
     given: Any = array.settings(PROBES)
     if array.name == "convex":
         chord = 2 * given.radius * math.sin(given.opening_angle / 2)
-        size = {"radius": given.radius, "length": chord + 0.011, "width": 0.018, "height": 0.06}
+        size = {
+            "radius": given.radius,
+            "length": round(chord + 0.011, 4),
+            "width": 0.018,
+            "height": 0.06,
+        }
         return _shape("convex", size | {"rounding": 0.006})
     length = getattr(given, "aperture", 0.02) + 0.006
     return _shape(

@@ -120,6 +120,11 @@ class CaseSettings(Settings):
         "bottom, and structures of bone",
         default=(),
     )
+    scanned: tuple[Placement, ...] = setting(
+        description="poses of the probe along the sweep that the volume was made of, in the "
+        "volume's own frame; a proposed start is one of them",
+        default=(),
+    )
 
     def check(self) -> None:
         """Names are names, and no two structures are one label."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from us_sim.errors import VolumeError
+from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.cases.provenance import Source, Step, add_step, settings_said
@@ -27,6 +30,7 @@ from us_sim.volume.reconstruction.reconstruction import (
     plan,
     reconstruct,
 )
+from us_sim.volume.reconstruction.scanning_probe import ScanningProbe, scanning_probe
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import Sweep, sweep_of
@@ -127,15 +131,33 @@ def reconstruct_sweep(
     rest = None if rest_of is None else rest_of(sweep, part)
     planned = plan(sweep, compounding, part, smallest_box=settings.smallest_box, rest=rest)
     made = reconstruct(planned, progress=progress)
+    scanner = None if settings.is_volume else scanning_probe(sweep, part, planned.used)
     prediction = None
     if settings.leave_one_out:
         prediction = leave_one_out(planned, settings.leave_one_out, progress)
-    picture = _write(settings, planned, made, prediction)
-    return _said(settings, planned, made, prediction, picture)
+    case = _case(settings, planned, scanner)
+    picture = _write(settings, planned, made, prediction, case)
+    return _said(settings, planned, made, prediction, picture, case)
+
+
+def _case(settings: SweepSettings, planned: Plan, scanner: ScanningProbe | None) -> CaseSettings:
+    """What the sweep tells of the case: its probe, and where this was.
+
+    The poses are those of a probe that pressed, so they are not said where that has been undone.
+    """
+    case = CaseSettings(name=settings.out.name)
+    if scanner is None:
+        return case
+    case = dataclasses.replace(case, probe=scanner.probe)
+    return case if planned.rest else dataclasses.replace(case, scanned=scanner.poses)
 
 
 def _write(
-    settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
+    settings: SweepSettings,
+    planned: Plan,
+    made: Reconstruction,
+    prediction: Prediction | None,
+    case: CaseSettings,
 ) -> Path:
     """Write the volume or case; the picture's path."""
     title = f"{' × '.join(map(str, made.volume.shape))} voxels of {_spacing(planned)} mm"
@@ -145,7 +167,7 @@ def _write(
         return settings.picture
     with new_case(settings.out) as folder:
         write_volume(folder / "volume.nrrd", made.volume)
-        write_case_settings(folder, CaseSettings(name=settings.out.name))
+        write_case_settings(folder, case)
         add_step(folder, _step(settings, planned, made, prediction))
         draw_slices(folder / "volume.png", made.volume, made.covered, title)
     return settings.out / "volume.png"
@@ -186,6 +208,7 @@ def _said(
     made: Reconstruction,
     prediction: Prediction | None,
     picture: Path,
+    case: CaseSettings,
 ) -> str:
     share = 100.0 * made.covered.mean()
     compounding = planned.compounding
@@ -208,7 +231,23 @@ def _said(
             f"seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at worst "
             f"({_FRAME} {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
         )
+    if case.probe is not None:
+        sentences.append(f"its images are those of {_array_said(case.probe)}")
+    elif not settings.is_volume:
+        sentences.append("its images do not show the probe's shape, which is guessed")
     return "; ".join([*sentences, f"slices in {picture}"])
+
+
+def _array_said(probe: ProbeSettings) -> str:
+    """The transducer in words."""
+    array: Any = probe.array.given
+    depth = f"{1e3 * array.depth:.0f} mm deep"
+    if probe.geometry == "linear":
+        return f"a linear array of {1e3 * array.aperture:.1f} mm, {depth}"
+    opening = f"{math.degrees(array.opening_angle):.1f}°, {depth}"
+    if probe.geometry == "sector":
+        return f"a phased array, {opening}"
+    return f"a curved array of radius {1e3 * array.radius:.1f} mm, {opening}"
 
 
 def _spacing(planned: Plan) -> str:

@@ -1,0 +1,175 @@
+"""The probe is found in its images: fans and rectangles that are known, and two real sweeps."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sweep_file import write_sweep
+
+from us_sim.volume.reconstruction.calibration_file import read_calibration
+from us_sim.volume.reconstruction.image_mask import image_mask
+from us_sim.volume.reconstruction.scanned_part import Fan, Rectangle, fitted_part
+from us_sim.volume.reconstruction.scanning_probe import scanning_probe
+from us_sim.volume.reconstruction.settings import ImagePart
+from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sweep import read_sweep, sweep_of
+
+ROWS, COLUMNS = 300, 400
+SIDE = np.array([0.5e-3, 0.5e-3])
+
+
+def fan_mask(x, z, begins, ends, first, last, side=SIDE):
+    """Pixels whose centres a fan holds; lengths in metres, angles in degrees."""
+    row, column = np.indices((ROWS, COLUMNS))
+    across, down = column * side[0] - x, row * side[1] - z
+    radius, angle = np.hypot(across, down), np.degrees(np.arctan2(across, down))
+    return (radius > begins) & (radius < ends) & (angle > first) & (angle < last)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    begins=st.floats(0.008, 0.07),
+    half=st.floats(18.0, 40.0),
+    tilt=st.floats(-4.0, 4.0),
+    unlike=st.floats(0.8, 1.2),
+    noise=st.integers(0, 99),
+)
+def test_fans_are_found_to_a_pixel(begins, half, tilt, unlike, noise):
+    side = SIDE * [1.0, unlike]
+    top = 0.012 - begins * math.cos(math.radians(half - abs(tilt)))
+    mask = fan_mask(0.1, top, begins, 0.14 * unlike - top, tilt - half, tilt + half, side)
+    rng = np.random.default_rng(noise)
+    mask &= rng.random(mask.shape) > 0.02  # black specks
+    mask[5:12, 5:40] = True  # letters beside it
+    found = fitted_part(mask, side)
+    assert isinstance(found, Fan)
+    np.testing.assert_allclose(found.apex, [0.1, top], atol=1.5e-3)
+    np.testing.assert_allclose(found.radius, [begins, 0.14 * unlike - top], atol=1.5e-3)
+    np.testing.assert_allclose(np.degrees(found.angles), [tilt - half, tilt + half], atol=0.8)
+
+
+def test_a_fan_that_the_image_cuts_at_its_sides_and_its_bottom_is_found():
+    mask = fan_mask(0.1, -0.03, 0.05, 0.2, -40, 40)
+    assert mask[:, 0].any()
+    assert mask[-1].any()
+    found = fitted_part(mask, SIDE)
+    assert isinstance(found, Fan)
+    np.testing.assert_allclose(np.degrees(found.angles), [-40, 40], atol=0.8)
+    assert found.radius[0] == pytest.approx(0.05, abs=1e-3)
+
+
+def test_a_phased_arrays_fan_begins_in_a_point():
+    found = fitted_part(fan_mask(0.1, 2e-3, 0.0, 0.14, -38, 38), SIDE)
+    assert isinstance(found, Fan)
+    assert found.radius[0] < 2e-3
+    assert math.degrees(found.opening_angle) == pytest.approx(76.0, abs=1.0)
+
+
+def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():
+    mask = np.zeros((ROWS, COLUMNS), bool)
+    mask[10:250, 100:200] = True
+    mask[150:200, 130:160] = False
+    found = fitted_part(mask, SIDE)
+    assert isinstance(found, Rectangle)
+    np.testing.assert_allclose(found.x, [0.04975, 0.09975], atol=1e-9)
+    np.testing.assert_allclose(found.z, [0.00475, 0.12475], atol=1e-9)
+
+
+def shapes_of_no_probe():
+    row, column = np.indices((ROWS, COLUMNS))
+    disc = np.hypot(row - 150, column - 200) < 120
+    flat = (abs(column - 200) < 50 + 0.5 * row) & (row > 20) & (row < 260)
+    parallelogram = (abs(column - 150 - 0.4 * row) < 60) & (row > 20) & (row < 260)
+    return {
+        "nothing": np.zeros((ROWS, COLUMNS), bool),
+        "a disc": disc,
+        "a trapezoid": flat,
+        "a parallelogram": parallelogram,
+        "a fan without its face": fan_mask(0.1, -0.06, 0.03, 0.19, -25, 25),
+        "half a fan": fan_mask(0.1, 0.0, 0.04, 0.14, -30, 30) & (row < 140),
+    }
+
+
+@pytest.mark.parametrize("name", shapes_of_no_probe())
+def test_of_what_fits_badly_nothing_is_said(name):
+    assert fitted_part(shapes_of_no_probe()[name], SIDE) is None
+
+
+def swept(tmp_path, mask, step=2e-3):
+    """A sweep along +y of images with a mask, columns along -x and rows along z."""
+    matrices = np.zeros((9, 4, 4))
+    matrices[:, 0, 0] = -SIDE[0]
+    matrices[:, 2, 1] = matrices[:, 1, 2] = SIDE[1]
+    matrices[:, 1, 3] = step * np.arange(9)
+    matrices[:, 3, 3] = 1.0
+    images = np.broadcast_to((mask * 90).astype(np.uint8), (9, ROWS, COLUMNS))
+    return read_sweep(write_sweep(tmp_path / "s.igs.mha", images, matrices))
+
+
+def test_the_poses_are_of_the_middle_of_the_face(tmp_path):
+    mask = fan_mask(0.1, -0.03, 0.04, 0.11, -20, 30)
+    found = scanning_probe(swept(tmp_path, mask), ImagePart(), np.ones_like(mask))
+    array = found.probe.array.given
+    assert found.probe.geometry == "convex"
+    assert array.radius == pytest.approx(0.04, abs=5e-4)
+    assert array.depth == pytest.approx(0.07, abs=5e-4)
+    assert len(found.poses) == 9
+    middle = np.radians(5.0)
+    pose = found.poses[4].pose
+    face = [-(0.1 + 0.04 * np.sin(middle)), 0.008, -0.03 + 0.04 * np.cos(middle)]
+    np.testing.assert_allclose(pose.position, face, atol=1e-3)
+    ahead = [-np.sin(middle), 0.0, np.cos(middle)]
+    assert np.degrees(np.arccos(pose.rotation[:, 2] @ ahead)) < 0.5
+    assert pose.rotation[0, 0] < -0.99  # along the columns
+
+
+def test_a_fan_that_is_named_is_the_probes(tmp_path):
+    fan = {"fan_origin": [200, -60], "fan_radius": [80, 220], "fan_angles": ["-30 deg", "30 deg"]}
+    part = ImagePart(**fan)
+    mask = np.ones((ROWS, COLUMNS), bool)
+    found = scanning_probe(swept(tmp_path, mask), part, image_mask(part, COLUMNS, ROWS))
+    array = found.probe.array.given
+    assert (array.radius, array.depth) == (0.04, 0.07)
+    assert math.degrees(array.opening_angle) == pytest.approx(60.0, abs=1e-3)
+    np.testing.assert_allclose(found.poses[0].position, [-0.1, 0.0, 0.01], atol=1e-5)
+
+
+def test_a_wide_picture_is_no_linear_array(tmp_path):
+    mask = np.ones((ROWS, COLUMNS), bool)  # 200 mm
+    assert scanning_probe(swept(tmp_path, mask), ImagePart(), mask) is None
+
+
+def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):
+    sweep = read_sweep(shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha")
+    used = np.ones((sweep.rows, sweep.columns), bool)
+    found = scanning_probe(sweep, ImagePart(), used)
+    array = found.probe.array.given
+    # Its publisher's: 161.34 pixels, 30.28° to either side; beams end at 724.35 pixels by it,
+    # but the images go on to their last row, 592, which is 731 pixels from the apex.
+    pixel = 0.314818e-3
+    assert array.radius / pixel == pytest.approx(161.34, abs=1.5)
+    assert math.degrees(array.opening_angle) == pytest.approx(60.56, abs=0.3)
+    assert (array.radius + array.depth) / pixel == pytest.approx(731.0, abs=4.0)
+    # config/scenes/liver_sweep.yaml
+    middle = sweep.image_to_reference[len(sweep.numbers) // 2] @ [369, 22.01, 0, 1]
+    places = np.array([pose.position for pose in found.poses])
+    assert np.linalg.norm(places - middle[:3], axis=1).min() < 2e-3
+
+
+def test_the_linear_array_of_a_real_sweep_is_found_in_its_images(shared_data):
+    folder = shared_data / "plus-spine-freehand"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    file = folder / "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml"
+    calibration = read_calibration(file, "Probe")
+    sequence = read_sequence(folder / "SpinePhantomFreehand.igs.mha")
+    sweep = sweep_of(sequence, calibration=calibration.transforms)
+    used = image_mask(calibration.part, sweep.columns, sweep.rows)
+    found = scanning_probe(sweep, calibration.part, used)
+    assert found.probe.geometry == "linear"
+    # Columns 185 to 630 and rows 11 to 600, as one sees them in its pictures.
+    columns, rows = np.linalg.norm(sweep.image_to_reference[0][:3, :2], axis=0)
+    assert found.probe.array.given.aperture == pytest.approx(445 * columns, abs=1e-3)
+    assert found.probe.array.given.depth == pytest.approx(590 * rows, abs=1e-3)
