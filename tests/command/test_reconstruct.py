@@ -95,3 +95,9 @@ def test_nothing_is_written_over(sweep, tmp_path, capsys):
     (tmp_path / "volume.png").write_text("mine")
     assert main(["reconstruct", str(path), "--out", str(tmp_path / "volume.nrrd")]) == 1
     assert "volume.png: exists already" in capsys.readouterr().err
+
+
+def test_an_ending_of_something_else_is_no_case(sweep, tmp_path, capsys):
+    path, _ = sweep
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "liver.png")]) == 1
+    assert "liver.png: its name ends as no volume's does" in capsys.readouterr().err

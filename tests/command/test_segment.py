@@ -165,4 +165,4 @@ def test_what_is_no_case_and_no_volume_is_said(tmp_path, seeds, capsys):
     assert main(["segment", str(tmp_path), "--seeds", seeds]) == 1
     assert "has no case.yaml" in capsys.readouterr().err
     assert main(["segment", str(tmp_path / "a.mha"), "--seeds", seeds, "--out", "x"]) == 1
-    assert "there is no such file" in capsys.readouterr().err
+    assert "there is no such case or volume file" in capsys.readouterr().err

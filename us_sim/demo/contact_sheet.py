@@ -96,10 +96,12 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
     if areas is None:
         return "lateral, mm"
     sample = int(np.argmin(np.abs(areas.time - time)))
-    return ",   ".join(
-        f"{name} {area[sample] * 1e6:.1f} mm² ({area[sample] / area[areas.rest] * 100:.0f} %)"
-        for name, area in areas.area.items()
-    )
+    said = []
+    for name, area in areas.area.items():
+        percent = 100 * areas.fraction(name)[sample]
+        of_rest = "" if np.isnan(percent) else f" ({percent:.0f} %)"
+        said.append(f"{name} {area[sample] * 1e6:.1f} mm²{of_rest}")
+    return ",   ".join(said)
 
 
 def _outline(
@@ -129,10 +131,10 @@ def _colour(scene: Scene, name: str) -> Colour:
 def _plot_areas(
     axes: Any, areas: LumenAreas, moments: list[float], colours: Mapping[str, Colour]
 ) -> None:
-    for name, area in areas.area.items():
-        percent = area / area[areas.rest] * 100
+    for name in areas.area:
+        percent = 100 * areas.fraction(name)
         axes.plot(areas.time, percent, color=colours[name], label=f"{name} lumen", lw=2)
-    axes.set(xlabel="time, s", ylabel="area, % of rest")
+    axes.set(xlabel="time, s", ylabel="area, % of the same plane at rest")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
     for time in moments:

@@ -29,6 +29,10 @@ PLAYED = ("/tracker/pose", "/camera/camera_info")
 """What comes in, of a path and of a camera."""
 STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
+_HARDLY_CUT = 0.1
+"""Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
+_STEEPEST = 0.2
+"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 MILLISECOND = 1e6
 """In nanoseconds."""
 
@@ -40,21 +44,21 @@ class LumenAreas:
     time: NDArray[np.float64]  # (K,) s since the first pose
     depth: NDArray[np.float64]  # (K,) m, how deep the probe is pressed below the skin
     area: dict[str, NDArray[np.float64]]  # (K,) m² by vessel
-
-    @property
-    def rest(self) -> int:
-        """The first sample, before the probe touches."""
-        return 0
+    # (K,) m² by vessel, in the same planes of the tissue at rest; NaN where it is hardly cut
+    at_rest: dict[str, NDArray[np.float64]]
 
     @property
     def pressed(self) -> int:
         """The first sample within 1 % of the deepest press."""
         return int(np.argmax(self.depth >= 0.99 * self.depth.max()))
 
+    def fraction(self, vessel: str) -> NDArray[np.float64]:
+        """(K,) area over that of the same plane at rest; NaN where there is nothing to compare."""
+        return np.asarray(self.area[vessel] / self.at_rest[vessel])
+
     def change(self, vessel: str, sample: int) -> float:
         """Relative change of the area from rest; -0.5 is half closed."""
-        area = self.area[vessel]
-        return float(area[sample] / area[self.rest] - 1.0)
+        return float(self.fraction(vessel)[sample] - 1.0)
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,8 @@ class Session:
     ) -> LumenAreas | None:
         """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
 
-        A vessel that the first image does not cut has none.
+        Where the probe slides or tilts it sees other cross-sections, so each is compared with that
+        of the same plane at rest, from the skin on. A vessel that no image cuts has none.
 
         Args:
             scene: that was recorded.
@@ -130,21 +135,26 @@ class Session:
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
         chosen = [stamps[i] for i in picked]
         pixel = float(np.prod(scanner.probe.pixel_spacing))
-        area: dict[str, list[float]] = {name: [] for name in vessels}
-        for done, stamp in enumerate(chosen, start=1):
-            labels = scanner.labels(self.poses[stamp], self.nodes[stamp])
-            for name in vessels:
-                area[name].append(label_area(labels, numbers[name], pixel))
+        found = np.empty((2, len(vessels), len(chosen)))  # m², now and at rest
+        for k, stamp in enumerate(chosen):
+            pose = self.poses[stamp]
+            seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
+            for i, labels in enumerate(seen):
+                found[i, :, k] = [label_area(labels, numbers[name], pixel) for name in vessels]
             if progress is not None:
-                progress(done / len(chosen))
-        area = {name: values for name, values in area.items() if values[0] > 0.0}
-        if not area:
+                progress((k + 1) / len(chosen))
+        now, rest = found
+        hardly = rest < _HARDLY_CUT * rest.max(axis=1, keepdims=True)
+        rest = np.where(hardly, np.nan, rest)
+        cut = [i for i in range(len(vessels)) if np.isfinite(rest[i]).any()]
+        if not cut:
             return None
         first = min(self.poses)
         return LumenAreas(
             time=np.array([(stamp - first) * 1e-9 for stamp in chosen]),
             depth=np.array([self.poses[stamp].position[2] for stamp in chosen]),
-            area={name: np.array(values) for name, values in area.items()},
+            area={vessels[i]: now[i] for i in cut},
+            at_rest={vessels[i]: rest[i] for i in cut},
         )
 
     def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, int], BMode | None]:
@@ -178,7 +188,7 @@ class Session:
         summary: dict[str, Any] = {
             "poses_in": poses,
             "images_out": len(stamps),
-            "dropped": poses - len(stamps),
+            "dropped": max(poses - len(stamps), 0),
             "images_per_second": (len(stamps) - 1) / seconds if seconds else 0.0,
             "latency_ms": latency,
             "nodes": self.reports,
@@ -206,6 +216,12 @@ class Session:
         }
 
 
+def _lifted(pose: Pose) -> Pose:
+    """Where the probe would be in the same plane if it did not press."""
+    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
+    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
+
+
 def _areas(areas: LumenAreas) -> dict[str, Any]:
     result: dict[str, Any] = {
         "time_s": areas.time.round(4).tolist(),
@@ -213,8 +229,12 @@ def _areas(areas: LumenAreas) -> dict[str, Any]:
     }
     for name, area in areas.area.items():
         result[f"{name}_mm2"] = (area * 1e6).round(4).tolist()
-        result[f"{name}_change_at_full_press"] = areas.change(name, areas.pressed)
-        result[f"{name}_change_after_release"] = areas.change(name, len(areas.time) - 1)
+        at_rest = (areas.at_rest[name] * 1e6).round(4)
+        result[f"{name}_at_rest_mm2"] = [None if np.isnan(x) else float(x) for x in at_rest]
+        moments = {"at_full_press": areas.pressed, "after_release": len(areas.time) - 1}
+        for moment, sample in moments.items():
+            change = areas.change(name, sample)
+            result[f"{name}_change_{moment}"] = None if np.isnan(change) else change
     return result
 
 

@@ -288,10 +288,19 @@ def _report(
     if tracked is not None:
         print(tracked)
     for vessel in areas.area if areas is not None else ():
+        pressed, released = (
+            summary["areas"][f"{vessel}_change_{moment}"]
+            for moment in ("at_full_press", "after_release")
+        )
         print(
-            f"{vessel}: {summary['areas'][f'{vessel}_change_at_full_press']:+.0%} at full press, "
-            f"{summary['areas'][f'{vessel}_change_after_release']:+.1%} after release"
+            f"{vessel}: {_change(pressed, '+.0%')} at full press, "
+            f"{_change(released, '+.1%')} after release"
         )
     recorded = [file.name for file in outcome.files]
     for name in (*recorded, "contact_sheet.png", "summary.json", "nodes.log"):
         print(out / name)
+
+
+def _change(change: float | None, form: str) -> str:
+    """A change for a person."""
+    return "not in the image" if change is None else format(change, form)

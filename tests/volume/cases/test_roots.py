@@ -45,6 +45,16 @@ def test_an_unknown_name_is_told_those_that_are_known():
         find_case("")
 
 
+@pytest.mark.usefixtures("roots")
+def test_what_is_there_but_no_case_is_said(tmp_path):
+    (tmp_path / "plain").mkdir()
+    (tmp_path / "file.nrrd").touch()
+    with pytest.raises(CaseError, match=r"plain: is a folder without a case\.yaml"):
+        find_case(tmp_path / "plain")
+    with pytest.raises(CaseError, match=r"file\.nrrd: is a file"):
+        find_case(tmp_path / "file.nrrd")
+
+
 def test_without_the_variable_cases_are_in_the_users_data(monkeypatch):
     monkeypatch.delenv("US_SIM_CASES", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", "/home/me/data")

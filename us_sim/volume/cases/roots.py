@@ -23,7 +23,7 @@ import platformdirs
 
 from us_sim.errors import CaseError
 from us_sim.settings.spelling import nearest
-from us_sim.volume.cases.case import is_case
+from us_sim.volume.cases.case import CASE, is_case
 
 __all__ = ["case_roots", "cases_in", "find_case"]
 
@@ -72,6 +72,10 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
                 known.setdefault(case.name, case)
     if str(name) in known:
         return known[str(name)].resolve()
+    for folder in (*folders, Path.cwd()):
+        if str(name) and (folder / path).exists():
+            kind = f"folder without a {CASE}" if (folder / path).is_dir() else "file"
+            raise CaseError(f"{name}: is a {kind}, and there is no case of that name")
     like = nearest(name, known)
     there = f"cases are {', '.join(known)}" if known else "there is none"
     raise CaseError(

@@ -79,6 +79,12 @@ class SweepSettings(Settings):
         """Refuse a place that cannot be written to, which is worth knowing before the work."""
         if self.out.exists():
             raise self.refused("out", f"{self.out}: exists already; choose another name")
+        if not self.is_volume and 1 < len(self.out.suffix) <= 5:
+            raise self.refused(
+                "out",
+                f"{self.out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, or a "
+                f"folder's name without an ending for a case",
+            )
         if self.is_volume and not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
         if self.is_volume and self.picture.exists():

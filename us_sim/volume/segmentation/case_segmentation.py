@@ -101,6 +101,10 @@ def _segment_case(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Pr
 
 
 def _segment_file(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Progress) -> str:
+    if not asked.case.exists():
+        raise VolumeError(
+            f"{asked.case}: there is no such case or volume file; `us-sim cases` lists cases"
+        )
     if asked.out is None:
         raise VolumeError(
             f"{asked.case}: is a volume file, not a case: say with --out which folder to make"

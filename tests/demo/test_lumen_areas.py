@@ -1,0 +1,74 @@
+"""A vessel's area is compared with that of the same plane at rest."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from us_sim.demo.session import LumenAreas, Session
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
+
+MM = 1e-3
+BLOCK = box_mesh(
+    uniform_planes(-0.03, 0.03, 7), uniform_planes(-0.02, 0.02, 5), uniform_planes(0.0, 0.06, 7)
+)
+PROBE = LinearProbe(aperture=0.05, depth=0.05, columns=100, rows=100)
+
+
+def cone():
+    """A vessel along y that gets wider, 30 mm below the skin: 2 mm at y = -20 mm, 10 at 20."""
+    x, y, z = np.meshgrid(*(np.arange(n) for n in (61, 41, 61)), indexing="ij")
+    inside = np.hypot(x - 30, z - 30) <= 2 + 8 * y / 40
+    to_patient = np.diag([MM, MM, MM, 1.0])
+    to_patient[:3, 3] = [-0.03, -0.02, 0.0]
+    labels = inside.astype(np.uint8)
+    return Volume(np.ones_like(labels), to_patient, labels, {0: "tissue", 1: "vein"})
+
+
+def measured(monkeypatch, poses, nodes):
+    """The areas of a session in which the tissue was at ``nodes``, one array a pose."""
+    stamps = range(len(poses))
+    sent = {"/ultrasound/image": [(stamp, stamp, stamp) for stamp in stamps]}
+    session = Session(
+        SimpleNamespace(),
+        dict(zip(stamps, poses, strict=True)),
+        dict(zip(stamps, nodes, strict=True)),
+        BLOCK.nodes,
+        BLOCK.tetrahedra,
+        sent,
+        {},
+    )
+    scanner = BMode(cone(), PROBE)
+    scanner.carry(BLOCK.nodes, BLOCK.tetrahedra)
+    monkeypatch.setattr(Session, "scanner_of_vessels", lambda *_: ({"vein": 1}, scanner))
+    areas = session.lumen_areas(None, 100)
+    assert isinstance(areas, LumenAreas)
+    return areas
+
+
+def test_sliding_along_a_cone_without_pressing_it_changes_nothing(monkeypatch):
+    poses = [Pose([0.0, y, 0.004]) for y in np.linspace(-0.015, 0.015, 7)]
+    areas = measured(monkeypatch, poses, [BLOCK.nodes] * 7)
+    assert areas.area["vein"][-1] > 4 * areas.area["vein"][0]
+    cut = np.isfinite(areas.fraction("vein"))
+    assert cut.sum() >= 5
+    np.testing.assert_allclose(areas.fraction("vein")[cut], 1.0, atol=0.06)
+
+
+def test_tissue_pressed_to_half_its_height_halves_the_area_wherever_it_is_cut(monkeypatch):
+    poses = [Pose([0.0, y, 0.0]) for y in (0.0, 0.006, 0.012)]
+    half = BLOCK.nodes * [1.0, 1.0, 0.5]
+    areas = measured(monkeypatch, [Pose([0, 0, 0]), *poses], [BLOCK.nodes, half, half, half])
+    np.testing.assert_allclose(areas.fraction("vein"), [1.0, 0.5, 0.5, 0.5], atol=0.03)
+    assert areas.change("vein", 2) == pytest.approx(-0.5, abs=0.03)
+
+
+def test_a_plane_that_hardly_cuts_the_vessel_is_compared_with_nothing(monkeypatch):
+    poses = [Pose([0.0, 0.015, 0.0]), Pose([0.0, -0.0199, 0.0]), Pose([0.05, 0.0, 0.0])]
+    areas = measured(monkeypatch, poses, [BLOCK.nodes] * 3)
+    assert areas.fraction("vein")[0] == 1.0
+    assert np.isnan(areas.fraction("vein")[1:]).all()
