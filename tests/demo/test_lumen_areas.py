@@ -72,3 +72,8 @@ def test_a_plane_that_hardly_cuts_the_vessel_is_compared_with_nothing(monkeypatc
     areas = measured(monkeypatch, poses, [BLOCK.nodes] * 3)
     assert areas.fraction("vein")[0] == 1.0
     assert np.isnan(areas.fraction("vein")[1:]).all()
+
+
+def test_a_vessel_that_no_image_cuts_is_not_told(monkeypatch):
+    with pytest.raises(AssertionError):  # None
+        measured(monkeypatch, [Pose([0.05, 0.0, 0.0])] * 2, [BLOCK.nodes] * 2)

@@ -144,7 +144,7 @@ class Session:
             if progress is not None:
                 progress((k + 1) / len(chosen))
         now, rest = found
-        hardly = rest < _HARDLY_CUT * rest.max(axis=1, keepdims=True)
+        hardly = rest <= _HARDLY_CUT * rest.max(axis=1, keepdims=True)
         rest = np.where(hardly, np.nan, rest)
         cut = [i for i in range(len(vessels)) if np.isfinite(rest[i]).any()]
         if not cut:
