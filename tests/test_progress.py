@@ -1,9 +1,13 @@
 """Bars that are drawn late, and what the domain tells them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from us_sim import progress
+from us_sim.command import main
+from us_sim.errors import UsSimError
 from us_sim.tissue.linear_algebra import compliance
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
@@ -33,6 +37,25 @@ def test_long_work_draws_a_bar_to_its_end_and_later_work_another(clock, capsys):
         drawn = capsys.readouterr().err
         assert drawn.count("solving: 100 %") == 1
         assert drawn.endswith("the rest\n")
+
+
+def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
+    clock, capsys, monkeypatch
+):
+    def fails(_):
+        show = progress.late_progress("solving")
+        for clock[0], fraction in ((0.0, 0.0), (1.5, 0.25)):
+            show(fraction, "half")
+        raise UsSimError("there is no such thing")
+
+    parser = SimpleNamespace(parse_args=lambda _: SimpleNamespace(command=fails))
+    monkeypatch.setattr(main, "_parser", lambda: parser)
+    assert main.main([]) == 1
+    drawn = capsys.readouterr().err
+    assert "solving:  25 %" in drawn
+    assert drawn.endswith("\nus-sim: there is no such thing\n")
+    progress.end_late_bars()
+    assert capsys.readouterr().err == ""
 
 
 def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):

@@ -10,9 +10,10 @@ from types import TracebackType
 
 from tqdm import tqdm
 
-__all__ = ["Progress", "late_progress"]
+__all__ = ["Progress", "end_late_bars", "late_progress"]
 
 _PATIENCE = 1.0  # s, for which work goes on without a bar
+_late: list[Progress] = []  # bars that are drawn and not at their end
 
 
 class Progress:
@@ -75,11 +76,20 @@ def late_progress(description: str) -> Callable[[float, str], None]:
         begun = time.monotonic() if begun is None else begun
         if bar is None and fraction < 1.0 and time.monotonic() - begun > _PATIENCE:
             bar = Progress(description, 100, "%")
+            _late.append(bar)
         if bar is not None:
             bar.update(100 * fraction, text)
         if fraction >= 1.0:
             if bar is not None:
                 bar.__exit__(None, None, None)
+                if bar in _late:
+                    _late.remove(bar)
             begun = bar = None
 
     return show
+
+
+def end_late_bars() -> None:
+    """End the lines of bars whose work was broken off, so that a sentence begins on its own."""
+    while _late:
+        _late.pop().__exit__(None, None, None)

@@ -31,7 +31,7 @@ def main(args: Sequence[str] | None = None) -> int:
         parsed = _parser().parse_args(args)
         return int(parsed.command(parsed) or 0)
     except UsSimError as error:
-        print(f"us-sim: {error}", file=sys.stderr)
+        _say(str(error))
         return 1
     except KeyboardInterrupt:
         return _interrupted()
@@ -39,11 +39,11 @@ def main(args: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 0
     except MemoryError:
-        print("us-sim: there is not enough memory", file=sys.stderr)
+        _say("there is not enough memory")
         return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"us-sim: {where}{error.strerror or error}", file=sys.stderr)
+        _say(f"{where}{error.strerror or error}")
         return 1
     except Exception:
         if not ended:
@@ -97,5 +97,13 @@ def _parser() -> ChosenParser:
 
 
 def _interrupted() -> int:
-    print("us-sim: interrupted", file=sys.stderr)
+    _say("interrupted")
     return 130
+
+
+def _say(sentence: str) -> None:
+    """On stderr, on a line of its own below bars of work that was broken off."""
+    progress = sys.modules.get("us_sim.progress")  # which costs time to import
+    if progress is not None:
+        progress.end_late_bars()
+    print(f"us-sim: {sentence}", file=sys.stderr)

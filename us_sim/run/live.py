@@ -6,6 +6,7 @@ import contextlib
 import os
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,14 +128,11 @@ def demo(
     source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     if source == "path":
         path_of(scene, file)  # before anything is made for what cannot be played
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    video = _prepared_video(scene, file) if source == "camera" else None
-    played = file if video is None else None
-    plan = plan_of(scene, parameters, record=recording, path=played, video=video)
-    prepare_volume(scene, played)
+    with _made_unless_refused(out):
+        video = _prepared_video(scene, file) if source == "camera" else None
+        played = file if video is None else None
+        plan = plan_of(scene, parameters, record=recording, path=played, video=video)
+        prepare_volume(scene, played)
     started = time.monotonic()
     outcome = follow(plan, out / "nodes.log", supervision)
     try:
@@ -149,6 +147,24 @@ def demo(
         raise UsSimError(f"{lost}; {error}") from error
     _require_nothing_lost(outcome)
     return 0
+
+
+@contextlib.contextmanager
+def _made_unless_refused(out: Path) -> Iterator[None]:
+    """Make a folder before the work that fills it; on any error remove what was made, if empty."""
+    place = out.absolute()
+    made = [folder for folder in (place, *place.parents) if not folder.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # something is in it
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:

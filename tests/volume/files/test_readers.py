@@ -375,3 +375,23 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
         read_volume(tmp_path / "nowhere.mha")
     with pytest.raises(VolumeError, match="is not a file"):
         read_volume(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+@pytest.mark.parametrize(
+    ("slope", "intercept"), [(2.0, -10.0), (0.5, 0.0), (1.0, 3.0), (-1.0, 255.0)]
+)
+@pytest.mark.parametrize("kind", [np.uint8, np.int16])
+def test_stored_numbers_of_nifti_that_stand_for_others_are_read_as_those(
+    tmp_path, suffix, slope, intercept, kind
+):
+    plain = tmp_path / f"a{suffix}"
+    ramp = np.arange(256, dtype=kind).reshape(4, 8, 8)
+    sitk.WriteImage(sitk.GetImageFromArray(ramp), str(plain))
+    data = plain.read_bytes()
+    data = bytearray(gzip.decompress(data) if suffix == ".nii.gz" else data)
+    struct.pack_into("<2f", data, 112, slope, intercept)
+    plain.write_bytes(gzip.compress(data) if suffix == ".nii.gz" else data)
+    read = read_volume(plain).intensities
+    expected = ramp if slope > 0 else 255 - ramp  # stretched over all grey values
+    np.testing.assert_array_equal(read, expected.T)

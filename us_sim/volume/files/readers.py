@@ -28,6 +28,7 @@ from us_sim.volume.files.dicom.header import is_dicom
 from us_sim.volume.files.frame_sequence import holds_sequence
 from us_sim.volume.files.placement import checked_placement
 from us_sim.volume.files.stored_size import check_stored_size
+from us_sim.volume.files.stored_voxels import check_claim
 from us_sim.volume.volume import Volume
 
 __all__ = ["open_image", "read_placement", "read_volume", "stored_voxels_of"]
@@ -165,11 +166,23 @@ def open_image(
         ) from error
     placement = _placement(path, header, layers=layers)
     value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
-    if stored.expected != math.prod(header.GetSize()) * header.GetNumberOfComponents() * value:
+    numbers = math.prod(header.GetSize()) * header.GetNumberOfComponents()
+    if _is_scaled(path, header) and stored.expected == numbers * stored.value:
+        check_claim(path, stored.size, value)
+    elif stored.expected != numbers * value:
         raise VolumeError(
             f"{path}: its header says more than one thing about its size; export it again"
         )
     return header, placement
+
+
+def _is_scaled(path: Path, header: sitk.ImageFileReader) -> bool:
+    """Whether a NIfTI file stores whole numbers for others: ITK makes them floating-point ones.
+
+    Its ``scl_slope`` is then neither 0 nor 1, or its ``scl_inter`` not 0.
+    """
+    floating = header.GetPixelID() in (sitk.sitkFloat32, sitk.sitkFloat64)
+    return floating and path.name.lower().endswith((".nii", ".nii.gz"))
 
 
 def _placement(path: Path, header: sitk.ImageFileReader, *, layers: bool) -> NDArray[np.float64]:
