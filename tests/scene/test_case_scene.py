@@ -150,6 +150,19 @@ def test_tissue_is_made_once_and_made_anew_when_what_it_is_made_from_changes(cas
     assert len(tissue_model_of(finer, volume).mesh.nodes) > 1000
 
 
+def test_a_kept_grid_is_not_used_for_a_case_that_wants_a_conforming_mesh(cases, tmp_path):
+    shutil.copytree(cases / "block", tmp_path / "block")
+    scene = load_scene(f"case:{tmp_path / 'block'}")
+    assert scene.tissue.mesh.kind == "grid"
+    keep_tissue(scene, volume_of(scene))
+    case = tmp_path / "block" / "case.yaml"
+    case.write_text(case.read_text() + "mesh: conforming\n")
+    conforming = load_scene(f"case:{tmp_path / 'block'}")
+    assert conforming.tissue.mesh.kind == "conforming"
+    assert kept_tissue(scene) is not None
+    assert kept_tissue(conforming) is None
+
+
 def test_a_case_that_cannot_be_written_is_used_all_the_same(cases, tmp_path, monkeypatch, caplog):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")

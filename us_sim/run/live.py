@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.progress import Progress
+from us_sim.progress import Progress, late_progress
 from us_sim.run.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
 from us_sim.run.losses import Outcome
 from us_sim.run.monitored import Monitored
@@ -228,7 +228,7 @@ def prepare_volume(scene: Scene, path: Path | None = None) -> None:
         volume = volume_of(scene, show)
         if path is not None:
             check_path_in_volume(scene, path, volume)
-        keep_tissue(scene, volume)
+        keep_tissue(scene, volume, late_progress("making the tissue"))
     finally:
         for shown in bar:
             shown.__exit__(None, None, None)

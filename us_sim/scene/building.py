@@ -168,7 +168,7 @@ def tissue_model_of(
             note(f"tissue mesh: {remark}")
     from us_sim.tissue.mesh.node_selection import face_nodes, facing_nodes
 
-    touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top")
+    touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top", 0.0)
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
     return TissueModel(
         mesh=mesh,
@@ -295,7 +295,8 @@ def _fixed_nodes(
     remarks = []
     for name in section.fixed:
         if name in FACES:
-            held = face_nodes(mesh, name, section.mesh.margin)
+            margin = section.mesh.margin if section.mesh.file else 0.0  # a box has faces
+            held = face_nodes(mesh, name, margin)
         elif name in numbers and fractions is not None:
             held = nodes_in_label(mesh, fractions, numbers[name])
         else:

@@ -113,7 +113,9 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     cut[0, 2] = 0.0
     thin = cut[1] - cut[0] < _THINNEST
     box = np.where(thin, box, cut)
-    document = {"lower": _rounded(box[0]), "upper": _rounded(box[1])}
+    document: dict[str, Any] = {"lower": _rounded(box[0]), "upper": _rounded(box[1])}
+    if case.settings.mesh != "grid":
+        document["kind"] = case.settings.mesh
     return document | {"nodes": case.settings.nodes}
 
 

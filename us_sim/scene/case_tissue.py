@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,29 +47,50 @@ def kept_tissue(scene: Scene) -> CaseTissue | None:
     return kept if kept.made_from == _made_from(scene) else None
 
 
-def keep_tissue(scene: Scene, volume: Volume) -> None:
-    """Make the tissue and keep it in the scene's case, unless it is there or cannot be kept."""
+def keep_tissue(
+    scene: Scene, volume: Volume, progress: Callable[[float, str], None] | None = None
+) -> None:
+    """Make the tissue and keep it in the scene's case, unless it is there or cannot be kept.
+
+    Args:
+        progress: called with the fraction done and what is being done.
+
+    Raises:
+        MeshError: no mesh can be made.
+    """
     if scene.volume.case is None or not _is_fitted(scene) or kept_tissue(scene) is not None:
         return
     try:
-        write_tissue(Path(scene.volume.case) / TISSUE, box_tissue(scene, volume))
+        write_tissue(Path(scene.volume.case) / TISSUE, box_tissue(scene, volume, progress))
     except CaseError as error:
         _logger.warning("%s; it is made in every run", error)
 
 
-def box_tissue(scene: Scene, volume: Volume) -> CaseTissue:
-    """The box of a scene whose planes are put where they count, and the labels in it."""
+def box_tissue(
+    scene: Scene, volume: Volume, progress: Callable[[float, str], None] | None = None
+) -> CaseTissue:
+    """The box of a scene whose nodes are put where they count, and the labels in it.
+
+    Raises:
+        MeshError: no mesh can be made of so few nodes, or by fTetWild.
+    """
+    assert scene.tissue is not None
+    made_from = _made_from(scene) if scene.volume.case is not None else {}
+    if scene.tissue.mesh.kind == "conforming":
+        from us_sim.scene.conforming_tissue import conforming_tissue
+
+        mesh, fractions_by_label = conforming_tissue(scene, volume, progress)
+        return CaseTissue(mesh, *fractions_by_label, made_from)
     mesh = box_mesh(*box_planes(scene, volume))
     if volume.labels is None:
         labels, fractions = np.zeros(1, np.uint8), np.ones((len(mesh.tetrahedra), 1))
     else:
         labels, fractions = label_fractions(mesh, volume.labels, volume.patient_to_index)
-    made_from = _made_from(scene) if scene.volume.case is not None else {}
     return CaseTissue(mesh, labels, fractions, made_from)
 
 
 def _is_fitted(scene: Scene) -> bool:
-    """Whether planes are put where they count."""
+    """Whether nodes are put where they count."""
     tissue = scene.tissue
     return tissue is not None and not tissue.mesh.file and isinstance(tissue.mesh.nodes, int)
 
@@ -84,7 +106,8 @@ def _made_from(scene: Scene) -> dict[str, Any]:
     if (folder / LABELS).is_file():
         with (folder / LABELS).open("rb") as stream:
             checksum = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {
+    kind = {} if mesh.kind == "grid" else {"kind": mesh.kind}
+    return kind | {
         "lower": list(mesh.lower or ()),
         "upper": list(mesh.upper or ()),
         "nodes": mesh.nodes,

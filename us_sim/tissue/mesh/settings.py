@@ -12,8 +12,10 @@ from us_sim.geometry.placement import PLACE, Placement
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["MeshSettings"]
+__all__ = ["KINDS", "MeshSettings"]
 
+KINDS = ("grid", "conforming")
+"""Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures."""
 
 _LEAST_NODES = 64
 _MOST_ALONG = 400
@@ -26,7 +28,7 @@ class MeshSettings(Settings):
     section = "mesh"
     error = MeshError
     alternatives = MappingProxyType(
-        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes")}
+        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes", "kind")}
     )
 
     lower: tuple[float, float, float] | None = setting(
@@ -46,6 +48,12 @@ class MeshSettings(Settings):
         "coordinates of the box's nodes along x, y or z one by one, to put them where they count",
         default_factory=dict,
     )
+    kind: str = setting(
+        description="of the box: cells between planes, or tetrahedra whose faces follow the "
+        "structures' surfaces, which needs the extra `conforming` and one number of `nodes`",
+        choices=KINDS,
+        default="grid",
+    )
     file: str | None = setting(
         description="mesh in place of the box: Gmsh, VTK, or what else meshio reads",
         default=None,
@@ -64,7 +72,8 @@ class MeshSettings(Settings):
 
     def check(self) -> None:
         """A file, or a box whose corners and planes go together."""
-        box = {"lower": self.lower, "upper": self.upper, "planes": self.planes or None}
+        box: dict[str, object] = {"lower": self.lower, "upper": self.upper}
+        box |= {"planes": self.planes or None, "kind": self.kind if self.kind != "grid" else None}
         if self.file is not None:
             for key, value in box.items():
                 if value is not None:
@@ -77,6 +86,11 @@ class MeshSettings(Settings):
             )
         if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
             raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
+        if self.kind != "grid" and not isinstance(self.nodes, int):
+            raise self.refused(
+                "nodes",
+                f"must be one number, how many there are at most, where kind is {self.kind}",
+            )
         if isinstance(self.nodes, int):
             if self.planes:
                 raise self.refused(

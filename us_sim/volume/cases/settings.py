@@ -22,6 +22,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import shown, unknown
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
+from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
 __all__ = ["AROUND", "CaseSettings", "CaseStart", "CaseStructure", "check_name"]
@@ -114,6 +115,12 @@ class CaseSettings(Settings):
     )
     nodes: int = setting(
         Quantity("number", 64, 200_000), "that the mesh of its tissue has at most", default=3000
+    )
+    mesh: str = setting(
+        description="of its tissue: grid, or conforming, whose faces follow the structures' "
+        "surfaces (extra `conforming`)",
+        choices=KINDS_OF_MESH,
+        default=KINDS_OF_MESH[0],
     )
     fixed: tuple[str, ...] = setting(
         description="faces (bottom, sides, ...) and structures that are held; not given: the "

@@ -15,7 +15,7 @@ from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.smoothing import with_volume
 from us_sim.volume.surfaces.surface_distance import distances_to
 
-__all__ = ["decimated", "surface_distance"]
+__all__ = ["coarsened", "decimated", "surface_distance"]
 
 _FEWEST = 0.02  # of the triangles
 _TRIALS = 6
@@ -27,6 +27,9 @@ _SAMPLING = 2.0
 _CAREFUL = 3
 """How boldly fast-simplification collapses edges, 0 to 10; at 7, its
 default, errors are ten times as large."""
+
+_SAME_VOLUME = 0.01
+"""Part of a surface's volume up to which one of fewer triangles may enclose more or less."""
 
 _NO_GAIN = 0.9  # of the triangles; a surface that keeps more stays as it is
 
@@ -62,6 +65,30 @@ def decimated(surface: ClosedSurface, farthest: float) -> tuple[ClosedSurface, f
     if len(best.triangles) > _NO_GAIN * len(surface.triangles):
         return surface, 0.0
     return best, distance
+
+
+def coarsened(surface: ClosedSurface, triangles: int) -> ClosedSurface:
+    """The same shape in about so many triangles: closed, with the same volume, parts and genus.
+
+    It keeps more where fewer would change that.
+
+    Args:
+        surface: closed.
+        triangles: that it should have.
+
+    Raises:
+        VolumeError: fast-simplification is not installed.
+    """
+    fraction = triangles / len(surface.triangles)
+    while fraction < _NO_GAIN:
+        tried = _with_fraction(surface, fraction)
+        if tried is not None:
+            farthest = float(np.sqrt(tried.area / len(tried.triangles)))
+            tried = with_volume(tried, surface.volume, farthest)
+            if not tried.fault and abs(tried.volume / surface.volume - 1.0) < _SAME_VOLUME:
+                return tried
+        fraction *= 2.0
+    return surface
 
 
 def surface_distance(one: ClosedSurface, other: ClosedSurface) -> float:

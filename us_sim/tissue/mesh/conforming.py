@@ -1,0 +1,177 @@
+"""A box of tetrahedra whose faces follow closed surfaces in it, by the mesher fTetWild.
+
+Surfaces may reach beyond the box, which cuts them. Nodes on the box's faces lie in them exactly.
+fTetWild makes a somewhat different mesh in every run.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError
+from us_sim.geometry.mesh_faces import boundary_triangles
+from us_sim.tissue.mesh import wild_mesher
+from us_sim.tissue.mesh.repair import repair
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["EdgeLengths", "conforming_mesh", "require_mesher"]
+
+_SECONDS = 300.0
+"""After which fTetWild is given up; meshes of some thousand nodes take it seconds."""
+
+_LONGEST = 10.0
+"""Size of all over the longest edge asked for: fTetWild begins with a grid that reaches as far
+beyond the box as an edge is long, and joins its tetrahedra where they may be longer at the end."""
+
+_BOX = np.array(
+    [
+        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+    ],
+    dtype=np.int32,
+)
+"""Triangles of a box whose corner is 4 (x is high) + 2 (y is high) + (z is high)."""
+
+_GRID = "`mesh: grid` in the case, `kind: grid` in a scene's tissue.mesh"
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeLengths:
+    """How long edges should be, at the nodes of a coarse mesh and between them."""
+
+    mesh: TetrahedralMesh
+    lengths: NDArray[np.float64]  # (N,) m
+
+
+def require_mesher() -> None:
+    """Refuse at once where the mesher is not installed.
+
+    Raises:
+        MeshError: pytetwild is missing.
+    """
+    if importlib.util.find_spec("pytetwild") is None:
+        raise MeshError(
+            "a conforming mesh needs pytetwild; install it with `pip install "
+            f"'us_sim[conforming]'`, or say {_GRID}"
+        )
+
+
+def conforming_mesh(
+    box: NDArray[np.float64],
+    surfaces: Sequence[tuple[NDArray[np.float64], NDArray[np.int32]]],
+    edges: EdgeLengths,
+    tolerance: float,
+    *,
+    coarsen: bool = False,
+    seconds: float = _SECONDS,
+) -> TetrahedralMesh:
+    """Tetrahedra that fill a box, none of which crosses a surface by more than the tolerance.
+
+    Args:
+        box: (2, 3) m, lower and upper corner.
+        surfaces: (V, 3) m vertices and (T, 3) triangles of each.
+        edges: lengths that are aimed at.
+        tolerance: m, how far faces may lie from a surface.
+        coarsen: whether tetrahedra are joined wherever their shape allows it, for the fewest nodes.
+        seconds: after which it is given up.
+
+    Raises:
+        MeshError: pytetwild is missing, or fTetWild fails, or takes longer.
+    """
+    require_mesher()
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    vertices, triangles, count = [corners], [_BOX], len(corners)
+    for points, faces in surfaces:
+        vertices.append(points)
+        triangles.append(faces + count)
+        count += len(points)
+    soup = np.concatenate(vertices)
+    diagonal = float(np.linalg.norm(np.ptp(soup, axis=0)))
+    nodes, tetrahedra = _run(
+        {
+            "vertices": soup,
+            "triangles": np.concatenate(triangles).astype(np.int32),
+            "edge": np.array(min(edges.lengths.max(), diagonal / _LONGEST)),
+            "coarsen": np.array(coarsen),
+            "epsilon": np.array(tolerance / diagonal),
+            "size_nodes": edges.mesh.nodes,
+            "size_tetrahedra": edges.mesh.tetrahedra,
+            "sizes": np.minimum(edges.lengths, diagonal / _LONGEST),
+        },
+        seconds,
+    )
+    return _within(box, nodes, tetrahedra, tolerance)
+
+
+def _run(
+    arrays: dict[str, NDArray[np.generic]], seconds: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """What fTetWild makes of it, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder, "given.npz"), Path(folder, "made.npz")
+        np.savez(given, allow_pickle=False, **arrays)
+        # -P: this folder is no place to import from.
+        command = [sys.executable, "-P", str(Path(wild_mesher.__file__)), str(given), str(made)]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise MeshError(
+                f"fTetWild made no mesh of these structures in {seconds:g} s: allow fewer nodes, "
+                f"smooth their labels, or say {_GRID}"
+            ) from error
+        if done.returncode != 0 or not made.is_file():
+            words = done.stderr.decode(errors="replace").strip().splitlines()
+            why = words[-1] if words else f"it ended with status {done.returncode}"
+            raise MeshError(
+                f"fTetWild made no mesh of these structures ({why[:200]}): smooth their labels, "
+                f"or say {_GRID}"
+            )
+        with np.load(made, allow_pickle=False) as stored:
+            return stored["nodes"].astype(np.float64), stored["tetrahedra"].astype(np.int32)
+
+
+def _within(
+    box: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    tetrahedra: NDArray[np.int32],
+    tolerance: float,
+) -> TetrahedralMesh:
+    """The tetrahedra in the box, with the nodes of its faces moved into them.
+
+    Raises:
+        MeshError: they do not fill the box, or cannot be used.
+    """
+    if len(tetrahedra):
+        middle = nodes[tetrahedra].mean(axis=1)
+        tetrahedra = tetrahedra[((middle > box[0]) & (middle < box[1])).all(axis=1)]
+    if not len(tetrahedra):
+        raise MeshError(f"fTetWild made no tetrahedra of this box: say {_GRID}")
+    on_boundary = np.unique(boundary_triangles(tetrahedra))
+    flat = np.zeros(len(tetrahedra), dtype=bool)
+    for axis in range(3):
+        for end in box[:, axis]:
+            near = on_boundary[np.abs(nodes[on_boundary, axis] - end) <= tolerance]
+            nodes[near, axis] = end
+            in_face = np.zeros(len(nodes), dtype=bool)
+            in_face[near] = True
+            flat |= in_face[tetrahedra].all(axis=1)
+    tetrahedra = tetrahedra[~flat]
+    try:
+        mesh, _ = repair(nodes, tetrahedra)
+    except MeshError as error:
+        raise MeshError(f"the mesh that fTetWild made cannot be used ({error}): say {_GRID}") from (
+            error
+        )
+    filled = mesh.volumes.sum() / np.prod(box[1] - box[0])
+    if abs(filled - 1.0) > 1e-6:
+        raise MeshError(f"fTetWild filled {100 * filled:.4g} % of the box: say {_GRID}")
+    return mesh
