@@ -114,7 +114,7 @@ def _of_nodes(
     scale = 1.0
     for trial in range(_TRIALS):
         if progress is not None:
-            progress(trial / _TRIALS, f"a mesh that follows {len(structures)} structures")
+            progress(trial / _TRIALS, "a mesh that follows the structures")
         mesh = _at_scale(scale, box, structures, pressed)
         count = len(mesh.nodes)
         tried.append((math.log(scale), math.log(count)))
@@ -127,7 +127,7 @@ def _of_nodes(
         progress(1.0, "")
     if best is None:
         raise MeshError(
-            f"a mesh that follows these {len(structures)} structures has "
+            "a mesh that follows these structures has "
             f"{round(math.exp(min(count for _, count in tried)))} nodes or more, and {nodes} are "
             f"allowed: raise `nodes`, leave structures out, or say `mesh: grid` in the case, "
             f"`kind: grid` in a scene's tissue.mesh"
