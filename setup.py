@@ -75,7 +75,7 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
-        "conforming": ["fast-simplification>=0.1.7", "pytetwild>=0.4"],
+        "conforming": ["fast-simplification>=0.1.7", "pytetwild>=0.4,<0.5"],
         "dicom": ["pydicom>=3.0", "pillow>=10", "python-gdcm>=3.0.20"],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
@@ -92,7 +92,7 @@ setup(
             "pytest>=7.4",
             "pytest-timeout>=2.2",
             "pytest-xdist>=3.6",
-            "pytetwild>=0.4",
+            "pytetwild>=0.4,<0.5",
             "python-gdcm>=3.0.20",
             "ruff>=0.12",
             "scikit-fem>=10",

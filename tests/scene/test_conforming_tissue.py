@@ -95,7 +95,7 @@ def test_it_gives_way_as_a_grid_does(conforming, volume, monkeypatch):
         weight = model.mesh.volumes * ball
         moved.append(weight @ shift[:, 2] / weight.sum())
     assert moved[1] > 1e-3
-    assert moved[0] == pytest.approx(moved[1], rel=0.06)
+    assert moved[0] == pytest.approx(moved[1], rel=0.1)
 
 
 def test_what_the_mesher_cannot_do_is_said_in_a_sentence(volume, monkeypatch):
