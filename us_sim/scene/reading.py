@@ -21,7 +21,6 @@ from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.settings.reading import Reader
 from us_sim.settings.spelling import nearest, shown
 from us_sim.share import shared_roots
-from us_sim.volume.cases.roots import find_case
 
 __all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_volume"]
 
@@ -76,7 +75,7 @@ def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
     if str(name).startswith(CASE_PREFIX):
         case = str(name).removeprefix(CASE_PREFIX)
         try:
-            folder = find_case(case)
+            folder = _find_case(case)
         except CaseError as error:
             raise SceneError(str(error)) from error
         return {"case": str(folder)}, [folder.parent], f"{CASE_PREFIX}{folder}"
@@ -122,7 +121,7 @@ def _with_case(document: object, origin: str, folders: Sequence[Path]) -> object
     from us_sim.scene.case_document import case_document
 
     try:
-        return merged(case_document(find_case(case, folders)), document)
+        return merged(case_document(_find_case(case, folders)), document)
     except UsSimError as error:
         raise SceneError(f"{origin}: case: {error}") from error
 
@@ -144,11 +143,18 @@ def _with_named_structures(document: object, origin: str) -> object:
     return document | {"structures": given}
 
 
+def _find_case(name: str, folders: Sequence[Path] = ()) -> Path:
+    """As `find_case`, imported only where a scene names a case: it brings kinds of tissue along."""
+    from us_sim.volume.cases.roots import find_case
+
+    return find_case(name, folders)
+
+
 def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
     """The absolute path of a file named in a scene."""
     if key in ("case", "volume.case"):
         try:
-            return str(find_case(name, folders))
+            return str(_find_case(name, folders))
         except CaseError as error:
             raise SceneError(f"{origin}: {key}: {error}") from error
     path = Path(name).expanduser()
