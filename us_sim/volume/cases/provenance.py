@@ -105,6 +105,8 @@ class Step:
         _check_text("what", self.what)
         _check_text("version", self.version)
         for name in ("settings", "counts"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise CaseError(f"provenance: {name}: must be keys with values")
             object.__setattr__(self, name, _checked(name, getattr(self, name)))
         for key, value in self.counts.items():
             if isinstance(value, bool) or not isinstance(value, int | float):
@@ -172,6 +174,8 @@ def _document(step: Step) -> dict[str, Any]:
 
 
 def _step(document: Mapping[str, Any]) -> Step:
+    if not isinstance(document, Mapping):
+        raise CaseError("a step must be keys with values")
     sources = tuple(Source(s["kind"], s["sha256"]) for s in document.get("sources", ()))
     settings, counts = document.get("settings", {}), document.get("counts", {})
     return Step(document["what"], settings, counts, sources, document["us_sim"])
