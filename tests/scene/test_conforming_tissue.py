@@ -1,5 +1,6 @@
 """A mesh that follows a ball in a box: its volumes, its interface, and how it gives way."""
 
+import contextlib
 import subprocess
 
 import numpy as np
@@ -50,8 +51,19 @@ def scene(nodes, kind):
 
 
 @pytest.fixture(scope="module")
-def conforming(volume):
-    return conforming_tissue(scene(1000, "conforming"), volume)
+def folder(tmp_path_factory):
+    """Where the mesher is called."""
+    return tmp_path_factory.mktemp("called_here")
+
+
+@pytest.fixture(scope="module")
+def conforming(volume, folder):
+    with contextlib.chdir(folder):
+        return conforming_tissue(scene(1000, "conforming"), volume)
+
+
+def test_it_leaves_no_files_where_it_is_called(conforming, folder):
+    assert not list(folder.iterdir())
 
 
 def test_it_fills_the_box_and_the_ball_within_two_percent(conforming):

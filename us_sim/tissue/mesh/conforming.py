@@ -117,12 +117,16 @@ def _run(
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """What fTetWild makes of it, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        given, made = Path(folder, "given.npz"), Path(folder, "made.npz")
+        place = Path(folder).resolve()
+        given, made = place / "given.npz", place / "made.npz"
         np.savez(given, allow_pickle=False, **arrays)
         # -P: this folder is no place to import from.
         command = [sys.executable, "-P", str(Path(wild_mesher.__file__)), str(given), str(made)]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+            # fTetWild leaves files of its own where it runs.
+            done = subprocess.run(
+                command, capture_output=True, timeout=seconds, check=False, cwd=place
+            )
         except subprocess.TimeoutExpired as error:
             raise MeshError(
                 f"fTetWild made no mesh of these structures in {seconds:g} s: allow fewer nodes, "
