@@ -62,7 +62,8 @@ def conforming(volume, folder):
         return conforming_tissue(scene(1000, "conforming"), volume)
 
 
-def test_it_leaves_no_files_where_it_is_called(conforming, folder):
+@pytest.mark.usefixtures("conforming")
+def test_it_leaves_no_files_where_it_is_called(folder):
     assert not list(folder.iterdir())
 
 

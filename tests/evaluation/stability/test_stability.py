@@ -139,6 +139,18 @@ def test_a_solver_that_fails_for_ever_is_caught():
 HELD = StabilityCase("held", depth=0.2, contrast=10.0, held=HOLD)
 
 
+@pytest.mark.parametrize(
+    ("method", "number", "why"),
+    [
+        ("fem", 13, "moduli a million apart: a few pushes are rounded far more than most"),
+        ("fem_nonlinear", 52, "flung out of the probe's way, it has never been pushed"),
+    ],
+)
+def test_what_is_hard_to_tell_is_told(method, number, why):
+    trial = try_case(method, sampled_cases(64)[number])
+    assert trial.truthful, why
+
+
 @pytest.fixture
 def judged(monkeypatch):
     """The method that is broken here is one that must come to balance."""

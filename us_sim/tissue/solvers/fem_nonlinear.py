@@ -143,8 +143,8 @@ class FemNonlinear(TissueSolver):
     """Stable neo-Hookean finite elements under a probe, by Newton's method.
 
     The residual is the norm of the unbalanced nodal forces, of tissue and contact together, over
-    the norm of the contact forces (without any, over the largest since rest), in double precision
-    and of the displacement that is returned.
+    the norm of the contact forces (without any, over the largest since rest, and before there are
+    any, over the first unbalanced), in double precision and of the displacement that is returned.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -231,7 +231,7 @@ class FemNonlinear(TissueSolver):
 
     def _restore(self, state: TissueState) -> None:
         self._newton.rest()
-        self._heaviest = 0.0  # N, norm of the contact forces, the largest since rest
+        self._heaviest = 0.0  # N, largest contact forces since rest; before there are, unbalanced
         self._aimed: Pose | None = None  # the pose that the tissue is at or on its way to
         self._still = 0  # frames in a row with the probe at rest
         self._balanced = False  # whether the last frame's forces were
@@ -370,8 +370,8 @@ class FemNonlinear(TissueSolver):
             self._inverted += 1
             actions.append("still inside out, so the last upright state is shown")
             newton.put(self._upright)
-        self._heaviest = max(self._heaviest, newton.load)
-        reference = self._reference() or newton.imbalance
+        self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
+        reference = self._reference()
         residual = newton.imbalance / reference if reference else 0.0
         sunk = -float(contact.gap.min(initial=np.inf))
         if sunk > self._sinks:
