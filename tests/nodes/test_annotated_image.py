@@ -1,6 +1,9 @@
 """The annotated image: drawn for those who subscribe, frozen and marked when no pose comes."""
 
 import time
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,9 +13,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
+from us_sim.errors import MeshError, SettingsError
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.building import probe_of
+from us_sim.slicing.drawing.overlay import ColourScale, Overlay
 
 TOPIC = "ultrasound/image_annotated"
 LABELS = {5: "artery", 6: "vein"}
@@ -29,12 +34,51 @@ structures: [vein, artery]
 """
 
 
+@dataclass
+class Shown:
+    """What an annotated image takes of a frame."""
+
+    pixels: np.ndarray
+    labels: np.ndarray | None = None
+
+
+class Asked:
+    """A frame that cannot be shown, and knows what it was asked for."""
+
+    called: ClassVar[list[str]] = []
+
+    @property
+    def pixels(self):
+        self.called.append("pixels")
+        raise MeshError("no slice can be cut")
+
+    labels = pixels
+
+
+class Reds:
+    """Red over the right half, half opaque."""
+
+    overlay_name = "strain"
+
+    def overlay(self, frame):
+        values = np.full(frame.pixels.shape, np.nan)
+        values[:, 80:] = 1.0
+        return Overlay(values, ColourScale("all", 0.0, 1.0, "", colours=((0, 0, 0), (255, 0, 0))))
+
+
+class Broken(Reds):
+    """Colours that cannot be made."""
+
+    def overlay(self, _):
+        raise MeshError("there is no tissue")
+
+
 class Show(SceneNode):
     """A node with nothing but an annotated image."""
 
-    def __init__(self, **kwargs):
+    def __init__(self, streams=(), **kwargs):
         super().__init__("show", **kwargs)
-        self.annotated = AnnotatedImage(self, probe_of(self.scene), LABELS)
+        self.annotated = AnnotatedImage(self, probe_of(self.scene), LABELS, streams)
 
     def stamp(self, age=0.0):
         """Of a pose that is so many seconds old."""
@@ -47,8 +91,8 @@ def show(bench, tmp_path):
     file = tmp_path / "bare.yaml"
     file.write_text(SCENE)
 
-    def make(**parameters):
-        return bench.make(Show, scene=str(file), **parameters)
+    def make(streams=(), **parameters):
+        return bench.make(partial(Show, streams), scene=str(file), **parameters)
 
     return make
 
@@ -77,7 +121,7 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
     labels = np.zeros((120, 160), np.uint8)
     labels[40:80, 40:100] = 6
     node.annotated.pose_came(stamp)
-    node.annotated.show(GREY_IMAGE, stamp, lambda: labels)
+    node.annotated.show(Shown(GREY_IMAGE, labels), stamp)
     bench.spin_until(lambda: any(message.header.stamp.sec for message in pictures))
     message = pictures[-1]
     assert (message.encoding, message.step) == ("rgb8", 480)
@@ -93,10 +137,52 @@ def test_a_fresh_image_is_sent_with_its_stamp_and_outlines(bench, show):
 def test_nothing_is_drawn_and_no_label_is_cut_for_nobody(bench, show):
     node = show()
     node.annotated.pose_came(node.stamp())
-    called = []
-    node.annotated.show(GREY_IMAGE, node.stamp(), lambda: called.append(1) or GREY_IMAGE)
+    node.annotated.show(Asked(), node.stamp())
     bench.spin_for(40)
-    assert not called
+    assert not Asked.called
+
+
+def test_a_frame_without_a_picture_leaves_the_one_before(bench, show):
+    node = show(lockstep=True)
+    pictures = subscribed(bench, node)
+    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    with pytest.raises(MeshError, match="no slice"):
+        node.annotated.show(Asked(), node.stamp())
+    assert Asked.called == ["pixels"]
+    Asked.called.clear()
+    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    bench.spin_until(lambda: len(pictures) == 2)
+
+
+def test_colours_are_laid_over_the_image_and_others_are_refused(bench, show):
+    node = show(lockstep=True, streams=[Reds()])
+    pictures = subscribed(bench, node)
+    assert node.set_parameters([Parameter("overlay", value="strain")])[0].successful
+    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    assert node.set_parameters([Parameter("overlay", value="none")])[0].successful
+    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    bench.spin_until(lambda: len(pictures) == 2)
+    assert picture(pictures[0])[90, 100].tolist() == [172, 45, 45]
+    assert picture(pictures[0])[90, 20].tolist() == [90, 90, 90]
+    assert picture(pictures[1])[90, 100].tolist() == [90, 90, 90]
+
+
+def test_colours_that_the_scene_cannot_provide_are_refused(show):
+    node = show()
+    result = node.set_parameters([Parameter("overlay", value="strain")])[0]
+    assert not result.successful
+    assert "bare has nothing for 'strain'; it has none" in result.reason
+    with pytest.raises(SettingsError, match="bare has nothing for 'strain'"):
+        show(overlay="strain")
+
+
+def test_colours_that_cannot_be_made_are_said_and_the_image_is_shown(bench, show):
+    node = show(lockstep=True, streams=[Broken()], overlay="strain")
+    pictures = subscribed(bench, node)
+    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
+    bench.spin_until(lambda: pictures)
+    assert node.health.problems("overlay") == 1
+    assert picture(pictures[0])[90, 100].tolist() == [90, 90, 90]
 
 
 def test_before_the_first_pose_a_black_picture_says_so(bench, show):
@@ -114,7 +200,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     pictures = subscribed(bench, node)
     stamp = node.stamp()
     node.annotated.pose_came(stamp)
-    node.annotated.show(GREY_IMAGE, stamp)
+    node.annotated.show(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: pictures and frame(pictures[-1]) == AMBER)
     assert node.annotated.state == "stale"
     bench.spin_until(lambda: frame(pictures[-1]) == RED)
@@ -124,7 +210,7 @@ def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(b
     assert all((picture(message)[60, 20:100] == 90).all() for message in marked)
     fresh = node.stamp()
     node.annotated.pose_came(fresh)
-    node.annotated.show(GREY_IMAGE, fresh)
+    node.annotated.show(Shown(GREY_IMAGE), fresh)
     bench.spin_until(lambda: pictures[-1].header.stamp == fresh)
     assert frame(pictures[-1]) == [90, 90, 90]
     assert node.annotated.state == "live"
@@ -167,7 +253,7 @@ def test_poses_of_another_clock_are_live_when_they_come_and_missed_when_they_do_
     pictures = subscribed(bench, node)
     stamp = node.stamp(age)
     node.annotated.pose_came(stamp)
-    node.annotated.show(GREY_IMAGE, stamp)
+    node.annotated.show(Shown(GREY_IMAGE), stamp)
     assert node.annotated.state == "live"
     bench.spin_until(lambda: pictures and pictures[-1].header.stamp == stamp)
     assert frame(next(p for p in pictures if p.header.stamp == stamp)) == [90, 90, 90]
@@ -187,7 +273,7 @@ def test_an_image_that_lags_behind_live_poses_is_marked(bench, show):
     pictures = subscribed(bench, node)
     first = node.stamp()
     node.annotated.pose_came(first)
-    node.annotated.show(GREY_IMAGE, first)
+    node.annotated.show(Shown(GREY_IMAGE), first)
 
     def is_marked():
         node.annotated.pose_came(node.stamp())
@@ -218,7 +304,7 @@ def test_in_lockstep_nothing_ages(bench, show):
     for second in (1, 2):  # 1970
         stamp = pose_at(0.0, second).header.stamp
         node.annotated.pose_came(stamp)
-        node.annotated.show(GREY_IMAGE, stamp)
+        node.annotated.show(Shown(GREY_IMAGE), stamp)
     bench.spin_until(lambda: len(pictures) == 2)
     bench.spin_for(40)
     assert [message.header.stamp.sec for message in pictures] == [1, 2]

@@ -23,8 +23,10 @@ from us_sim.nodes.conversions import (
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.scene.building import probe_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.slicing.cutting.resampling import sample_plane
+from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.volume import Volume
 
 BARE = """
 name: bare
@@ -223,3 +225,38 @@ def test_a_probe_in_the_air_shows_no_tissue_once_contact_matters(bench, rigid):
     air = pixels_from(images[-1])
     assert air[:6].max() > air[25:].max()  # reverberation near the face
     assert air[25:].mean() < 0.3 * seen[25:].mean()
+
+
+def test_labels_are_sent_to_those_who_ask_for_nothing_else(bench, small_scene):
+    node = bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
+    labels = bench.collect(Image, "ultrasound/labels")
+    scene = load_scene(small_scene)
+    mesh = tissue_model_of(scene, volume_of(scene)).mesh
+    for message_type, topic, message in (
+        (PointCloud2, "tissue/rest", cloud(mesh.nodes, pose_at(0.0, 1))),
+        (Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(mesh.tetrahedra)),
+    ):
+        bench.peer.create_publisher(message_type, topic, KEPT).publish(message)
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    nodes = bench.publisher(PointCloud2, "tissue/nodes")
+    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/labels") > 0)
+    poses.publish(pose_at(0.003, 1))
+    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 1)))
+    bench.spin_until(lambda: labels)
+    assert (labels[0].encoding, labels[0].header.frame_id) == ("mono8", "probe")
+    assert labels[0].header.stamp.sec == 1
+    plane = probe_of(scene).plane(pose_from(pose_at(0.003, 1)))
+    expected = sample_labels(volume_of(scene), plane)
+    assert len(np.unique(expected)) > 2
+    np.testing.assert_array_equal(pixels_from(labels[0]), expected)
+    assert "published ultrasound/image" not in node.health.values
+
+
+def test_without_labels_there_is_no_topic_of_them(bench, tmp_path):
+    plain = Volume(np.full((9, 9, 9), 40, np.uint8), np.diag([5e-3, 5e-3, 5e-3, 1.0]))
+    write_volume(tmp_path / "plain.nrrd", plain)
+    file = tmp_path / "plain.yaml"
+    file.write_text(BARE.replace("{phantom: upper_arm, voxel_size: 1 mm}", "{file: plain.nrrd}"))
+    bench.make(SliceInterpolator, scene=str(file), lockstep=True)
+    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image") > 0)
+    assert "/ultrasound/labels" not in dict(bench.peer.get_topic_names_and_types())

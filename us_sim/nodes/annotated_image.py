@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
-from us_sim.errors import UsSimError
+from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.conversions import colour_image_message
+from us_sim.nodes.frame_streams.stream import FrameStream
+from us_sim.nodes.image_settings import AnnotatedImageSettings
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.pose_age import PoseAge
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
+from us_sim.slicing.drawing.overlay import Overlay
+from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["AnnotatedImage"]
@@ -32,18 +37,31 @@ Pixels = NDArray[np.uint8]
 class AnnotatedImage:
     """``ultrasound/image_annotated``: the image, what is in it, and whether it is live.
 
-    A picture is drawn for each image while somebody subscribes. When no pose has come for a
-    while, the last image is sent again with a badge, under its own stamp; before the first pose
-    a black one. In lockstep nothing ages.
+    A picture is drawn for each image while somebody subscribes, with the colours of the stream
+    that the parameter ``overlay`` chooses. When no pose has come for a while, the last image is
+    sent again with a badge, under its own stamp; before the first pose a black one. In lockstep
+    nothing ages.
 
     Args:
         node: that publishes it.
         probe: whose images they are.
         label_names: of the volume's labels.
+        streams: those there are, some of which have colours to be laid over the image.
     """
 
-    def __init__(self, node: SceneNode, probe: Probe, label_names: Mapping[int, str]) -> None:
+    def __init__(
+        self,
+        node: SceneNode,
+        probe: Probe,
+        label_names: Mapping[int, str],
+        streams: Sequence[FrameStream] = (),
+    ) -> None:
         self._node = node
+        self._overlays = {each.overlay_name: each for each in streams if each.overlay_name}
+        self._settings = LiveSettings(
+            node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
+        )
+        self._require_overlay(self._settings.values)
         numbers = {name: number for number, name in label_names.items()}
         self._structures = {
             numbers[given.label or name]: (name, colour_of(node.scene, name))
@@ -52,9 +70,6 @@ class AnnotatedImage:
         }
         self._publisher = node.stream(Image, "ultrasound/image_annotated")
         self._came = self._missing = False
-        self._image: Pixels | None = None
-        self._labels: Callable[[], Pixels] | None = None
-        self._outlined: Pixels | None = None
         self._stamp = _NEVER
         self.show_probe(probe)
         self._age: PoseAge | None = None
@@ -78,7 +93,9 @@ class AnnotatedImage:
         """The images that come are of another probe; those before it are not shown again."""
         self._probe = probe
         self._annotation = Annotation(probe, self._structures)
-        self._image = self._labels = self._outlined = None
+        self._frame: Frame | None = None
+        self._labels: Pixels | None = None
+        self._is_outlined = False
         self._stamp = _NEVER
 
     def pose_came(self, stamp: TimeMessage) -> None:
@@ -87,19 +104,17 @@ class AnnotatedImage:
         if self._age is not None:
             self._age.came(stamp)
 
-    def show(
-        self, image: Pixels, stamp: TimeMessage, labels: Callable[[], Pixels] | None = None
-    ) -> None:
-        """Keep the (rows, columns) image of the pose with that stamp, and send it if wanted.
+    def show(self, frame: Frame, stamp: TimeMessage) -> None:
+        """Keep the frame of the pose with that stamp, and send its picture if wanted.
 
-        Args:
-            image: is kept, not copied: it must not be written to again.
-            labels: gives the labels of its pixels (rows, columns); called only when they are
-                drawn, once, perhaps later.
+        Raises:
+            UsSimError: there is no picture of it; then the one before is kept.
         """
-        self._image, self._stamp = image, stamp
-        self._labels = labels if self._structures else None
-        self._outlined = None
+        if self.is_wanted:
+            _ = frame.pixels
+        self._frame, self._stamp = frame, stamp
+        self._labels = None
+        self._is_outlined = not self._structures
         if self.is_wanted:
             self._send(self._badge())
 
@@ -135,7 +150,7 @@ class AnnotatedImage:
             return Badge("NO PROBE POSE", _GREY)
         if word == "lost":
             return Badge("LOST", _RED)
-        if self._image is None:
+        if self._frame is None:
             return Badge("NO IMAGE YET", _GREY)
         age = self._age.image(self._stamp)
         if self._age.word(age) == "live":
@@ -143,15 +158,45 @@ class AnnotatedImage:
         return Badge(f"STALE {age:.1f} s", _AMBER)
 
     def _send(self, badge: Badge | None) -> None:
-        if self._labels is not None:
-            labels, self._labels = self._labels, None
-            try:
-                self._outlined = labels()
-            except UsSimError as error:
-                self._node.health.problem("labels", f"{error}; nothing is outlined")
-        image = self._image
-        if image is None:
+        frame, overlay = self._frame, None
+        if frame is None:
             image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
-        picture = self._annotation.draw(image, self._outlined, badge)
+        else:
+            image = frame.pixels
+            self._outline(frame)
+            overlay = self._overlay(frame)
+        picture = self._annotation.draw(image, self._labels, badge, overlay)
         self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
         self._node.health.published("ultrasound/image_annotated")
+
+    def _outline(self, frame: Frame) -> None:
+        """Look up the labels to be outlined, once."""
+        if self._is_outlined:
+            return
+        self._is_outlined = True
+        try:
+            self._labels = frame.labels
+        except UsSimError as error:
+            self._node.health.problem("labels", f"{error}; nothing is outlined")
+
+    def _overlay(self, frame: Frame) -> Overlay | None:
+        """The colours that are chosen, if there are some."""
+        stream = self._overlays.get(self._settings.values["shown"].overlay)
+        try:
+            return stream.overlay(frame) if stream else None
+        except UsSimError as error:
+            self._node.health.problem("overlay", f"{error}; no colours are laid over the image")
+            return None
+
+    def _require_overlay(self, wanted: Mapping[str, AnnotatedImageSettings]) -> None:
+        """Refuse colours that this scene cannot provide.
+
+        Raises:
+            SettingsError: with what it can.
+        """
+        name = wanted["shown"].overlay
+        if name not in ("none", *self._overlays):
+            there = ", ".join(["none", *self._overlays])
+            raise SettingsError(
+                f"overlay: {self._node.scene.name} has nothing for {name!r}; it has {there}"
+            )

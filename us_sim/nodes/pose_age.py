@@ -8,8 +8,8 @@ from builtin_interfaces.msg import Time as TimeMessage
 
 from us_sim.nodes.conversions import nanoseconds_of
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.image_settings import PoseAgeSettings
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.settings import PoseAgeSettings
 
 __all__ = ["PoseAge"]
 

@@ -24,6 +24,7 @@ from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.recorder_services import RecorderEvents, offer_services
 from us_sim.nodes.session_attachments import session_attachments
 from us_sim.nodes.settings import SessionRecorderSettings
+from us_sim.nodes.topics import ON_DEMAND
 from us_sim.recording.losses import Loss, news
 from us_sim.recording.pre_roll import PreRoll
 from us_sim.recording.topic import MARKER
@@ -33,8 +34,6 @@ from us_sim.recording.writer import BagWriter
 __all__ = ["SessionRecorder", "main"]
 
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
-FOR_THE_EYE = ("tissue/structures", "ultrasound/image_annotated")
-"""What is not computed either where only a recorder would want it."""
 MARKERS = "session/marker"
 """What is said there marks a moment."""
 
@@ -43,8 +42,8 @@ class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
     Its parameters are those of `SessionRecorderSettings`; its services and events are those of
-    rosbag2's recorder. ``tissue/structures`` and ``ultrasound/image_annotated`` are recorded only
-    where ``topics`` names them: they are large, and follow from the other topics.
+    rosbag2's recorder. Topics that are made on demand, such as ``ultrasound/image_annotated``, are
+    recorded only where ``topics`` names them: they are large, and follow from the others.
 
     A text on ``session/marker`` marks a moment of the recording.
     """
@@ -56,7 +55,7 @@ class SessionRecorder(GuardedNode):
         self._chosen = set(settings.topics)
         self._excluded = {*settings.exclude, *NOT_THE_SESSION}
         self._excluded.add(self.resolve_topic_name(RecorderEvents.LOST))  # it is in the metadata
-        self._excluded |= {self.resolve_topic_name(name) for name in FOR_THE_EYE} - self._chosen
+        self._excluded |= {self.resolve_topic_name(name) for name in ON_DEMAND} - self._chosen
         self._marker_topic = self.resolve_topic_name(MARKERS)
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from us_sim.errors import SettingsError, UsSimError
+from us_sim.nodes.image_settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
@@ -29,7 +30,6 @@ __all__ = [
     "ImageWriterSettings",
     "OpenIGTLinkBridgeSettings",
     "PathPlayerSettings",
-    "PoseAgeSettings",
     "ProbeTrackerSettings",
     "SceneNodeSettings",
     "SessionPlayerSettings",
@@ -45,7 +45,6 @@ __all__ = [
 
 _SPEED = Quantity("number", 0.01, 100.0)
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
-_AGE = Quantity("time", 0.01, 3600.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
 _BEGUN = Quantity("time", 0.0, 1e10)
@@ -120,20 +119,6 @@ class SkinDeformerSettings(Settings):
     """Of ``skin_deformer``."""
 
     marker_rate: float = setting(_MARKERS, "markers are sent at most", default=20.0, live=True)
-
-
-@dataclass(frozen=True)
-class PoseAgeSettings(Settings):
-    """Of ``slice_interpolator``: when an image's pose is old."""
-
-    live = True
-
-    stale_after: float = setting(
-        _AGE, "without a new pose before the image is marked stale", default=0.5
-    )
-    lost_after: float = setting(
-        _AGE, "without a new pose before the probe counts as lost", default=2.0
-    )
 
 
 @dataclass(frozen=True)
@@ -303,7 +288,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "probe_tracker": (SceneNodeSettings, ProbeTrackerSettings),
     "tissue_deformer": (SceneNodeSettings, TissueDeformerSettings, StructureMarkersSettings),
     "skin_deformer": (SceneNodeSettings, SkinDeformerSettings),
-    "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, Imaging),
+    "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, AnnotatedImageSettings, Imaging),
     "haptic_renderer": (SceneNodeSettings,),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
     "path_player": (PathPlayerSettings, AwaitedSettings),

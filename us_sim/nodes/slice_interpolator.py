@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.conversions import (
     affine_message,
-    image_message,
     nanoseconds_of,
     pose_from,
     tetrahedra_from,
     vectors_from,
 )
+from us_sim.nodes.frame_streams import frame_streams
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
@@ -41,7 +40,8 @@ class SliceInterpolator(SceneNode):
 
     With tissue an image is made for every set of nodes, at the pose with the same stamp; without,
     for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
-    its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`; what a
+    its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`, and
+    `frame_streams` are further topics, each made of the same frame for those who subscribe. What a
     sonographer sets are parameters: the fields of `Imaging`, and the probe's depth and focus.
     """
 
@@ -59,10 +59,12 @@ class SliceInterpolator(SceneNode):
         self._carried = False
         self._poses: dict[int, Pose] = {}
         self._unpaired: PointCloud2 | None = None
-        self._images = self.stream(Image, "ultrasound/image")
+        self._streams = frame_streams(self, volume)
+        for stream in self._streams:
+            stream.prepare(probe)
         self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
         self._places.publish(affine_message(probe.image_to_probe))
-        self._annotated = AnnotatedImage(self, probe, volume.label_names)
+        self._annotated = AnnotatedImage(self, probe, volume.label_names, self._streams)
         if self.scene.tissue is None:
             self.newest(PoseStamped, "probe/pose", self._image_rigid)
         else:
@@ -80,10 +82,16 @@ class SliceInterpolator(SceneNode):
         console = LiveSettings(
             self,
             {"probe": Group(probe, names=live), "imaging": Group(self.scene.imaging)},
-            lambda wanted: self._scanner.prepare(**wanted),
+            lambda wanted: self._prepare(**wanted),
             lambda wanted: self._use(**wanted),
         )
         return console.values["probe"], console.values["imaging"]
+
+    def _prepare(self, probe: Probe, imaging: Imaging) -> None:
+        """Load what was set at the console, before it is used."""
+        self._scanner.prepare(probe, imaging)
+        for stream in self._streams:
+            stream.prepare(probe)
 
     def _use(self, probe: Probe, imaging: Imaging) -> None:
         """Go on with what was set at the console."""
@@ -137,16 +145,16 @@ class SliceInterpolator(SceneNode):
     def _image(
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
     ) -> None:
-        """Make and publish the image at ``pose``, under the stamp of what it is made from."""
-        if not (self._images.get_subscription_count() or self._annotated.is_wanted):
+        """Make and publish what is wanted at ``pose``, under the stamp of what it is made from."""
+        wanted = [stream for stream in self._streams if stream.is_wanted]
+        if not (wanted or self._annotated.is_wanted):
             return
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
-        pixels = self._scanner.image(pose, nodes)
-        if self._images.get_subscription_count():
-            self._images.publish(image_message(pixels, stamp, "probe"))
-            self.health.published("ultrasound/image", stamp)
-        self._annotated.show(pixels, stamp, partial(self._scanner.labels, pose, nodes))
+        frame = self._scanner.frame(pose, nodes)
+        for stream in wanted:
+            stream.show(frame, stamp)
+        self._annotated.show(frame, stamp)
         self.health.state = "imaging"
         self.health.values = {
             "probe_pose": self._annotated.state,

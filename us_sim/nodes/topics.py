@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["TOPICS", "Topic"]
+__all__ = ["ON_DEMAND", "TOPICS", "Topic"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Topic:
     publishers: tuple[str, ...] = ()  # nodes of this package; none where a driver publishes it
     subscribers: tuple[str, ...] = ()
     latched: bool = False  # kept for those who come later, else of each moment
+    on_demand: bool = False  # not recorded, and so not computed, unless the recorder names it
 
     @property
     def from_drivers(self) -> bool:
@@ -168,6 +169,7 @@ TOPICS = (
         "visualization_msgs/MarkerArray",
         "vessels, nerves and bones as deformed, where the scene names `structures`",
         publishers=("tissue_deformer",),
+        on_demand=True,
     ),
     Topic(
         "tissue/contact_model",
@@ -207,6 +209,14 @@ TOPICS = (
         "sensor_msgs/Image",
         "`rgb8`, for the eye: with a depth scale, outlines of structures, and its age",
         publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/labels",
+        "sensor_msgs/Image",
+        "`mono8`: the number of the volume's label at each pixel of the image, 0 for nothing",
+        publishers=("slice_interpolator",),
+        on_demand=True,
     ),
     Topic(
         "ultrasound/image_to_probe",
@@ -242,3 +252,6 @@ TOPICS = (
         subscribers=("session_monitor",),
     ),
 )
+
+ON_DEMAND = tuple(topic.name for topic in TOPICS if topic.on_demand)
+"""What is not computed either where only a recorder would want it."""

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,11 +23,10 @@ from us_sim.errors import MeshError
 from us_sim.geometry.mesh_faces import boundary_triangles
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
@@ -122,8 +122,20 @@ class BMode:
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
         self._surface = None
 
+    def frame(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> Frame:
+        """What is seen with the probe at ``pose``, as it is asked for.
+
+        Args:
+            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
+                copied.
+        """
+        form = partial(self._form, self._formation)
+        return Frame(
+            pose, nodes, self._probe, self._volume, self._slicer, form, threads=self._threads
+        )
+
     def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the probe at ``pose``.
+        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
 
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is.
@@ -133,12 +145,7 @@ class BMode:
             ProbeError: the pose is nowhere near.
             VolumeError: the volume has too many voxels.
         """
-        slices = [self._slice(plane, nodes) for plane in self._formation.planes(pose)]
-        if not self._formation.needs_contact:
-            return self._formation.form(slices)
-        surface = self._contact_surface(nodes is not None)
-        where = surface.rest_nodes if nodes is None else nodes
-        return self._formation.form(slices, *surface.contact(where, self._probe, pose))
+        return self.frame(pose, nodes).pixels
 
     def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
         """The volume's label at each pixel (rows, columns), 0 where there is nothing.
@@ -147,15 +154,16 @@ class BMode:
             VolumeError: the volume has no labels.
             MeshError: as for `image`.
         """
-        plane = self._probe.plane(pose)
-        if nodes is None or self._slicer is None:
-            return sample_labels(self._volume, plane, threads=self._threads)
-        return self._slicer.labels(nodes, plane)
+        return self.frame(pose, nodes).labels
 
-    def _slice(self, plane: SlicePlane, nodes: NDArray[np.float64] | None) -> NDArray[np.uint8]:
-        if nodes is None or self._slicer is None:
-            return sample_plane(self._volume, plane, threads=self._threads)
-        return self._slicer.image(nodes, plane)
+    def _form(self, formation: ImageFormation, frame: Frame) -> NDArray[np.uint8]:
+        """The picture of a frame."""
+        slices = [frame.slice(plane) for plane in formation.planes(frame.pose, frame.plane)]
+        if not formation.needs_contact:
+            return formation.form(slices)
+        surface = self._contact_surface(frame.nodes is not None)
+        where = surface.rest_nodes if frame.nodes is None else frame.nodes
+        return formation.form(slices, *surface.contact(where, frame.probe, frame.pose))
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
         """The surface that the face can touch: the tissue's, or a box around a volume without."""

@@ -49,6 +49,7 @@ class Cuts(NamedTuple):
     corners: NDArray[np.float64]  # (cuts, 4, 2) column and row, in turn around the polygon
     sides: NDArray[np.int8]  # (cuts,) 3 or 4, or 0 without a polygon
     inside: NDArray[np.bool_]  # (cuts,) the map leads to points among the voxels' centres
+    tetrahedra: NDArray[np.int32]  # (cuts,) which tetrahedron was cut
     outlines: NDArray[np.float64]  # (outlines, 3, 2) column and row
     points: NDArray[np.int8]  # (outlines,) how many of the three there are
     owner: NDArray[np.int32]  # (outlines,) which cut it closes
@@ -62,6 +63,7 @@ def room_for_cuts(count: int) -> Cuts:
         np.empty((many, 4, 2)),
         np.empty(many, dtype=np.int8),
         np.empty(many, dtype=np.bool_),
+        np.empty(many, dtype=np.int32),
         np.empty((many, 3, 2)),
         np.empty(many, dtype=np.int8),
         np.empty(many, dtype=np.int32),
@@ -122,6 +124,7 @@ def cut_tetrahedra(
             )
         cuts.sides[count] = sides
         cuts.inside[count] = within[e] and _is_gentle(cuts.maps[count])
+        cuts.tetrahedra[count] = e
         count += 1
     return count, pieces, skipped, corner_on_image and pieces == 0
 
@@ -287,6 +290,7 @@ def _close_around(
                     pieces = after
                     cuts.sides[count] = 0
                     cuts.inside[count] = False
+                    cuts.tetrahedra[count] = e
                     count += 1
                     break
     return pieces, count

@@ -24,12 +24,10 @@ from __future__ import annotations
 import numpy as np
 
 from us_sim.kernels import njit
+from us_sim.slicing.cutting.located import BLACK
 from us_sim.slicing.cutting.section import INSIDE, row_span
 
-__all__ = ["BLACK", "cells", "leave_black", "subdivide_rows"]
-
-BLACK = -1
-"""The element of a pixel that shows nothing, as where tissue moved away."""
+__all__ = ["cells", "leave_black", "subdivide_rows"]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -30,7 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.resampling import label_voxels
+from us_sim.slicing.cutting.located import BLACK, Located
+from us_sim.slicing.cutting.resampling import label_voxels, pixel_to_index
 from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
@@ -88,13 +89,30 @@ class PerPixel(Slicer):
 
     def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
         moved = finite_nodes(nodes, len(self._mesh.nodes))
-        covered, _ = self._place(self._mesh.nodes, plane)
-        rest, self.skipped = self._place(moved, plane)
+        covered, *_ = self._place(self._mesh.nodes, plane)
+        rest, *_ = self._place(moved, plane)
         outside = np.isnan(rest[..., 0])
         rest[outside] = plane.pixels()[outside]
         rest[outside & ~np.isnan(covered[..., 0])] = np.nan
         rest[~plane.is_shown()] = np.nan
         return rest
+
+    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
+        del cut  # nothing is kept
+        moved = finite_nodes(nodes, len(self._mesh.nodes))
+        covered, *_ = self._place(self._mesh.nodes, plane)
+        rest, kept, elements = self._place(moved, plane)
+        elements[elements < 0] = len(kept)
+        elements[np.isnan(rest[..., 0]) & ~np.isnan(covered[..., 0])] = BLACK
+        elements[~plane.is_shown()] = BLACK
+        corners = (
+            moved[self._mesh.tetrahedra[kept]] @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
+        )
+        index = self._mesh.rest_index[self._mesh.tetrahedra[kept]]
+        ones = np.ones((len(kept), 4, 1))
+        maps = np.linalg.solve(np.concatenate([ones, corners], axis=2), index).transpose(0, 2, 1)
+        rigid = pixel_to_index(self._volume, plane)[None]
+        return Located(elements, np.concatenate([maps[..., :3], rigid]), kept)
 
     def _voxels(
         self, nodes: ArrayLike, plane: SlicePlane
@@ -110,8 +128,12 @@ class PerPixel(Slicer):
 
     def _place(
         self, nodes: NDArray[np.float64], plane: SlicePlane
-    ) -> tuple[NDArray[np.float64], int]:
-        """Rest positions (rows, columns, 3) m, NaN outside the mesh, and the number skipped."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.int32]]:
+        """Where each pixel lies at rest, (rows, columns, 3) m, NaN outside the mesh.
+
+        Also the tetrahedra (E,) on the image, and which of them each pixel is in (rows, columns),
+        -1 outside all.
+        """
         now, places = nodes[self._mesh.tetrahedra], self._mesh.nodes[self._mesh.tetrahedra]
         corners = now @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
         first, last = _boxes(corners)
@@ -122,9 +144,11 @@ class PerPixel(Slicer):
         kept = met & valid
         first, last = (np.clip(x[kept], -1, 1e6).astype(np.int64) for x in (first, last))
         rest = np.full((plane.rows, plane.columns, 3), np.nan)
-        locate = partial(_locate, corners[kept], places[kept], first, last, rest)
+        elements = np.full(rest.shape[:2], -1, dtype=np.int32)
+        locate = partial(_locate, corners[kept], places[kept], first, last, rest, elements)
         parallel_rows(self._threads, plane.rows, locate)
-        return rest, int((met & ~valid).sum())
+        self.skipped = int((met & ~valid).sum())
+        return rest, np.flatnonzero(kept), elements
 
 
 def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -147,13 +171,14 @@ def _boxes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _locate(corners, places, first, last, rest, first_row, end_row):
+def _locate(corners, places, first, last, rest, elements, first_row, end_row):
     """Rest positions of the pixels of some rows; a pixel in several tetrahedra takes the first.
 
     Args:
         corners: (E, 4, 3) column, row and height of the tetrahedra's nodes.
         places: (E, 4, 3) m, the nodes at rest. first, last: (E, 2) columns and rows.
         rest: (rows, columns, 3) m, NaN, filled here where a tetrahedron is.
+        elements: (rows, columns), likewise set to its number.
     """
     weights = np.empty(4)
     pixel = np.zeros(3)
@@ -176,6 +201,7 @@ def _locate(corners, places, first, last, rest, first_row, end_row):
                 if weights.min() >= INSIDE:
                     for a in range(3):
                         rest[row, column, a] = (weights * places[e, :, a]).sum()
+                    elements[row, column] = e
 
 
 @njit(inline="always", error_model="numpy")

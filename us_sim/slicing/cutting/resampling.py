@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.location import BLACK
+from us_sim.slicing.cutting.located import BLACK
 from us_sim.slicing.cutting.rest_outline import NO_OUTLINE
 from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans

@@ -37,13 +37,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.slicing.cutting.location import BLACK, cells, leave_black, subdivide_rows
-from us_sim.slicing.cutting.resampling import (
-    label_voxels,
-    pixel_to_index,
-    sample_nearest,
-    voxels_of,
-)
+from us_sim.slicing.cutting.located import BLACK, Located
+from us_sim.slicing.cutting.location import cells, leave_black, subdivide_rows
+from us_sim.slicing.cutting.resampling import pixel_to_index, voxels_of
 from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
@@ -98,39 +94,22 @@ class RowSubdivision(Slicer):
         )
         self._regions = (settings or RowSubdivisionSettings()).regions
         self._threads = threads
+        self._latest: Located | None = None
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         voxels, shape = voxels_of(self._volume.intensities)
-        elements, maps = self._locate(nodes, plane)
+        elements, maps, _ = self.locate(nodes, plane)
         image = np.empty(elements.shape, dtype=np.uint8)
         self._in_bands(
             plane, lambda a, b: sample_linear(voxels, shape, maps, elements, a, b, image)
         )
         return image
 
-    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        voxels, shape = label_voxels(self._volume)
-        elements, maps = self._locate(nodes, plane)
-        image = np.empty(elements.shape, dtype=np.uint8)
-        self._in_bands(
-            plane, lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image)
-        )
-        return image
-
-    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
-        elements, maps = self._locate(nodes, plane)
-        column, row = np.meshgrid(np.arange(plane.columns), np.arange(plane.rows))
-        pixel = np.stack([np.ones(column.shape), column, row], axis=-1)
-        index = np.einsum("rcij,rcj->rci", maps[elements], pixel)
-        index[elements == BLACK] = np.nan
-        to_patient = self._volume.index_to_patient
-        return index @ to_patient[:3, :3].T + to_patient[:3, 3]
-
-    def _locate(
-        self, nodes: ArrayLike, plane: SlicePlane
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
+    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
+        if cut and cut == self.cuts and self._latest is not None:
+            return self._latest
         moved = finite_nodes(nodes, len(self._mesh.nodes))
+        self.cuts += 1
         section = self._mesh.cut(moved, plane)
         self.skipped = section.skipped
         section.rest_index[-1] = pixel_to_index(self._volume, plane)
@@ -150,7 +129,8 @@ class RowSubdivision(Slicer):
             leave_black(rest.barycentric, rest.bounds, len(section.bounds), outside, elements)
         if plane.spans is not None:
             elements[~plane.is_shown()] = BLACK
-        return elements, section.rest_index
+        self._latest = Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
+        return self._latest
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
         """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""

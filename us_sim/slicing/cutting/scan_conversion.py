@@ -32,14 +32,8 @@ from us_sim.geometry.mesh_faces import face_order
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.clusters import Clusters
 from us_sim.slicing.cutting.cut_polygons import cut_tetrahedra, room_for_cuts
-from us_sim.slicing.cutting.location import BLACK
-from us_sim.slicing.cutting.resampling import (
-    full_runs,
-    grey_voxels,
-    label_voxels,
-    pixel_to_index,
-    sample_nearest,
-)
+from us_sim.slicing.cutting.located import BLACK, Located
+from us_sim.slicing.cutting.resampling import full_runs, grey_voxels, pixel_to_index
 from us_sim.slicing.cutting.rest_outline import NO_OUTLINE, Outline, RestSurface
 from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.cutting.section import RestMesh, finite_nodes
@@ -90,14 +84,18 @@ class ScanConversion(Slicer):
         self._spans = np.empty((0, 0), dtype=np.int64)
         self._used = np.empty(0, dtype=np.int32)
         self._full = np.empty((0, 2, 2), dtype=np.int32)
+        self._drawn: tuple[int, Outline] | None = None  # of the latest cut, if its spans are there
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         count, pieces, outline, is_covered = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
+        self._drawn = count, outline
 
         def draw(first_row: int, end_row: int) -> None:
             spans = self._convert(count, pieces, runs, first_row, end_row)
+            if spans is not self._spans:
+                self._drawn = None
             sample_spans(
                 self._voxels, self._shape, self._cuts.maps, self._cuts.inside, count, spans,
                 self._used, runs, is_covered, *outline, first_row, end_row, image,
@@ -106,36 +104,18 @@ class ScanConversion(Slicer):
         parallel_rows(self._threads, plane.rows, draw)
         return image
 
-    def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
-        voxels, shape = label_voxels(self._volume)
-        elements, maps = self._locate(nodes, plane)
-        image = np.empty(elements.shape, dtype=np.uint8)
-        parallel_rows(
-            self._threads,
-            plane.rows,
-            lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
-        )
-        return image
-
-    def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
-        elements, maps = self._locate(nodes, plane)
-        column, row = np.meshgrid(np.arange(plane.columns), np.arange(plane.rows))
-        pixel = np.stack([np.ones(column.shape), column, row], axis=-1)
-        index = np.einsum("rcij,rcj->rci", maps[elements], pixel)
-        index[elements == BLACK] = np.nan
-        to_patient = self._volume.index_to_patient
-        return index @ to_patient[:3, :3].T + to_patient[:3, 3]
-
-    def _locate(
-        self, nodes: ArrayLike, plane: SlicePlane
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Which map holds at each pixel (rows, columns), and the maps to voxels (E + 1, 3, 3)."""
-        count, pieces, outline, _ = self._cut(nodes, plane)
-        runs = self._shown(plane)
-        spans = self._convert(count, pieces, runs, 0, plane.rows)
+    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
+        if cut and cut == self.cuts and self._drawn is not None:
+            runs, spans = self._shown(plane), self._spans
+            count, outline = self._drawn
+        else:
+            count, pieces, outline, _ = self._cut(nodes, plane)
+            runs = self._shown(plane)
+            spans = self._convert(count, pieces, runs, 0, plane.rows)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
-        return elements, self._cuts.maps[: count + 1]
+        tetrahedra = self._clusters.order[self._cuts.tetrahedra[:count]]
+        return Located(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
 
     def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline, bool]:
         """Fills the cuts, followed by the rigid map.
@@ -145,6 +125,8 @@ class ScanConversion(Slicer):
             known to cover the image, so that the mesh at rest does not matter.
         """
         moved = self._as_kernels_take(nodes)
+        self.cuts += 1
+        self._drawn = None
         near = self._clusters.near(moved, plane)
         if 4 * len(near) >= len(self._cuts.sides):
             self._cuts = room_for_cuts(2 * len(near))

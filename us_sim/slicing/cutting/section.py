@@ -44,6 +44,7 @@ class Section(NamedTuple):
     barycentric: NDArray[np.float64]  # (E, 4, 3)
     rest_index: NDArray[np.float64]  # (E + 1, 3, 3), voxels; the last is left for the rigid map
     bounds: NDArray[np.float64]  # (E, 4), pixels: least and greatest column, least and greatest row
+    tetrahedra: NDArray[np.int32]  # (E,) their numbers in the mesh
     skipped: int  # tetrahedra on the plane that are inverted or flat
 
 
@@ -144,7 +145,7 @@ def row_span(barycentric, element, row, first, last):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(nodes, tetrahedra, rest_index, determinants, to_pixel, pixel_volume, columns, rows):
-    """Barycentric maps, rest maps, bounds and the number skipped, of tetrahedra on the image.
+    """Barycentric maps, rest maps, bounds, numbers and the number skipped, of tetrahedra.
 
     Args:
         nodes: (N, 3) m. tetrahedra: (M, 4) int32. rest_index: (N, 3) voxels.
@@ -199,8 +200,9 @@ def _cut(nodes, tetrahedra, rest_index, determinants, to_pixel, pixel_volume, co
         bounds[count, 1] = box[1]
         bounds[count, 2] = box[2]
         bounds[count, 3] = box[3]
+        crossing[count] = e  # which is not read again, as no more are kept than came
         count += 1
-    return barycentric[:count], maps[: count + 1], bounds[:count], skipped
+    return barycentric[:count], maps[: count + 1], bounds[:count], crossing[:count], skipped
 
 
 @njit(inline="always", error_model="numpy")

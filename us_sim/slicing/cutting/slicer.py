@@ -11,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.settings.setting import Settings
+from us_sim.slicing.cutting.resampling import label_voxels, sample_nearest
+from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
+    from us_sim.slicing.cutting.located import Located
     from us_sim.volume.volume import Volume
 
 __all__ = ["Slicer", "create_slicer", "warm_up"]
@@ -34,6 +37,12 @@ class Slicer(ABC):
 
     skipped: int = 0
     """Inverted or flat tetrahedra on the latest image, which were left out."""
+
+    cuts: int = 0
+    """How often the mesh was cut: the number of the latest cut, for `locate`."""
+
+    _volume: Volume
+    _threads: int
 
     Settings: ClassVar[type[Settings]] = Settings
     """The class of this method's settings."""
@@ -65,6 +74,17 @@ class Slicer(ABC):
         """
 
     @abstractmethod
+    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
+        """Where each pixel lies in the mesh.
+
+        Args:
+            cut: what `cuts` was after an image, if it was of these nodes and this plane: while that
+                is the latest cut, it is not made again. 0 is none.
+
+        Raises:
+            MeshError: as for `image`.
+        """
+
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
 
@@ -72,8 +92,25 @@ class Slicer(ABC):
             VolumeError: the volume has no labels.
             MeshError: as for `image`.
         """
+        label_voxels(self._volume)  # refuses before the work
+        return self.labels_at(self.locate(nodes, plane))
 
-    @abstractmethod
+    def labels_at(self, located: Located) -> NDArray[np.uint8]:
+        """The label image (rows, columns) of pixels that `locate` has found.
+
+        Raises:
+            VolumeError: the volume has no labels.
+        """
+        voxels, shape = label_voxels(self._volume)
+        elements, maps = located.elements, located.maps
+        image = np.empty(elements.shape, dtype=np.uint8)
+        parallel_rows(
+            self._threads,
+            len(elements),
+            lambda a, b: sample_nearest(voxels, shape, maps, elements, a, b, image),
+        )
+        return image
+
     def rest_coordinates(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.float64]:
         """Where each pixel's tissue lies at rest: (rows, columns, 3) m, frame ``patient``.
 
@@ -82,6 +119,9 @@ class Slicer(ABC):
         Raises:
             MeshError: as for `image`.
         """
+        to_patient = self._volume.index_to_patient
+        index = self.locate(nodes, plane).rest_index()
+        return np.asarray(index @ to_patient[:3, :3].T + to_patient[:3, 3])
 
 
 def create_slicer(

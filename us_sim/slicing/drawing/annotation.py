@@ -19,10 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.slicing.drawing.colour_bar import ColourBar
 from us_sim.slicing.drawing.label_outlines import label_outlines
 from us_sim.slicing.drawing.lettering import Colour, Label, lettering
 
 if TYPE_CHECKING:
+    from us_sim.slicing.drawing.overlay import Overlay
     from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["Annotation", "Badge"]
@@ -79,6 +81,7 @@ class Annotation:
         pixels: NDArray[np.uint8],
         labels: NDArray[np.uint8] | None = None,
         badge: Badge | None = None,
+        overlay: Overlay | None = None,
     ) -> NDArray[np.uint8]:
         """A new (rows, columns, 3) picture of red, green and blue.
 
@@ -86,10 +89,20 @@ class Annotation:
             pixels: (rows, columns) grey.
             labels: (rows, columns), where outlines are wanted.
             badge: for an image that is not live.
+            overlay: colours over the grey, below all else, and their bar.
         """
         picture = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+        bar = None
+        if overlay is not None:
+            overlay.lay_over(picture)
+            bar = ColourBar(overlay.scale, self._text, overlay.note)
+            if overlay.outline is not None:
+                corners = np.rint(overlay.outline * (1 << _FINE)).astype(np.int32)
+                cv2.polylines(picture, [corners], True, _SCALE, self._line, cv2.LINE_AA, _FINE)
         if labels is not None:
-            self._outline(picture, labels)
+            self._outline(picture, labels, [bar.box] if bar else [])
+        if bar is not None:
+            bar.draw(picture)
         cv2.polylines(picture, self._ticks, False, _SHADOW, self._line + 2)
         cv2.polylines(picture, self._ticks, False, _SCALE, self._line)
         if self._focus is not None:
@@ -154,7 +167,9 @@ class Annotation:
             self._labels.append((label, column, row))
             self._occupied.append(box)
 
-    def _outline(self, picture: NDArray[np.uint8], labels: NDArray[np.uint8]) -> None:
+    def _outline(
+        self, picture: NDArray[np.uint8], labels: NDArray[np.uint8], drawn: list[Box]
+    ) -> None:
         """Thin outlines of the structures, and the name of each once, at its longest outline."""
         named: list[tuple[Label, Box]] = []
         for number, (name, colour) in self._structures.items():
@@ -166,7 +181,7 @@ class Annotation:
             left, top = np.floor(outlines[0].min(axis=0)).astype(int).tolist()
             right, bottom = np.ceil(outlines[0].max(axis=0)).astype(int).tolist()
             named.append((lettering(name, self._text, colour), (left, top, right, bottom)))
-        taken = list(self._occupied)
+        taken = [*self._occupied, *drawn]
         around = [box for _, box in named]
         for label, outline in named:
             places = self._beside(label, outline)

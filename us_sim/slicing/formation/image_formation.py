@@ -79,13 +79,16 @@ class ImageFormation:
         """Whether `form` asks how each line meets the skin."""
         return self._reverberation is not None
 
-    def planes(self, pose: Pose) -> list[SlicePlane]:
+    def planes(self, pose: Pose, plane: SlicePlane | None = None) -> list[SlicePlane]:
         """The planes to cut with the probe at ``pose``, from the lowest y of the probe on.
+
+        Args:
+            plane: the probe's own at that pose, where it is there already.
 
         Raises:
             ProbeError: the pose is nowhere near.
         """
-        plane = self._probe.plane(pose)
+        plane = plane or self._probe.plane(pose)
         if self._resolution is not None and plane.spans is not None:
             # Beside a fan's edge there is tissue too, which its outer beams see.
             plane = dataclasses.replace(plane, spans=None)
