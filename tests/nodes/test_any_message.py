@@ -268,7 +268,7 @@ def test_no_mesh_and_no_pose_end_the_slicing(bench, small_scene, lockstep):
     node = bench.make(SliceInterpolator, scene=str(small_scene), lockstep=lockstep)
     images = bench.collect(Image, "ultrasound/image")
     bench.collect(Image, "ultrasound/image_annotated")
-    bench.spin_until(lambda: node._images.get_subscription_count() > 0)
+    bench.spin_until(lambda: node._streams[0].is_wanted)
     tetrahedra = conversions.tetrahedra_message(mesh.tetrahedra)
     inputs = {
         "probe/pose": pose,

@@ -110,7 +110,12 @@ def test_players_drivers_and_writers_do_too(bench, tmp_path):
     bag = str(shared_path("bags/press_and_slide.mcap"))
     nodes = [
         bench.make(PathPlayer, path=bag, lockstep=True),
-        bench.make(ImageWriter, folder=str(tmp_path / "images")),
+        bench.make(
+            ImageWriter,
+            folder=str(tmp_path / "images"),
+            labels=str(tmp_path / "labels"),
+            displacement=str(tmp_path / "displacement"),
+        ),
         bench.make(CameraDriver, source="/dev/no_camera"),
         bench.make(SpaceMouseDriver),
         bench.add(SessionMonitor(context=bench.context)),

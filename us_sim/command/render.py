@@ -20,6 +20,11 @@ def add_render(commands: Any) -> None:
         "--path", type=find_bag, metavar="BAG", help="bag with the probe path; default: the scene's"
     )
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
+    render.add_argument(
+        "--truth",
+        action="store_true",
+        help="beside each image what is known of it: labels (PNG) and displacement (NumPy's .npy)",
+    )
     add_scene_options(render)
     render.set_defaults(command=_render)
 
@@ -29,4 +34,5 @@ def _render(args: argparse.Namespace) -> int:
     from us_sim.scene.reading import load_scene
 
     scene = load_scene(scene_name(args), volume=args.volume)
-    return render_scene(scene, args.path, args.out, node_parameters(args.param))
+    parameters = node_parameters(args.param)
+    return render_scene(scene, args.path, args.out, parameters, truth=args.truth)

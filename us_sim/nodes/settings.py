@@ -221,6 +221,15 @@ class ImageWriterSettings(Settings):
     """Of ``image_writer``."""
 
     folder: str = setting(description="where the PNG files go", default="images")
+    labels: str | None = setting(
+        description="folder for the labels of each image, as PNG files; none: not written",
+        default=None,
+    )
+    displacement: str | None = setting(
+        description="folder for the tissue's displacement in each image, as NumPy's .npy files of "
+        "rows, columns, and 2 (lateral and axial, m); none: not written",
+        default=None,
+    )
 
 
 @dataclass(frozen=True)

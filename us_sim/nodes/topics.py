@@ -216,6 +216,16 @@ TOPICS = (
         "sensor_msgs/Image",
         "`mono8`: the number of the volume's label at each pixel of the image, 0 for nothing",
         publishers=("slice_interpolator",),
+        subscribers=("image_writer",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/displacement",
+        "sensor_msgs/Image",
+        "`32FC2`: how far each pixel's tissue has moved since rest along +x and +z of `probe`, m; "
+        "NaN where there is no tissue",
+        publishers=("slice_interpolator",),
+        subscribers=("image_writer",),
         on_demand=True,
     ),
     Topic(

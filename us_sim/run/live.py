@@ -54,8 +54,8 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
     lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
     lines.append(
-        "on demand wrench, tf, markers, annotated image: nothing is computed for a topic nobody "
-        "subscribes"
+        "on demand wrench, tf, markers, annotated image, what is known of images: nothing is "
+        "computed for a topic nobody subscribes"
     )
     return "\n".join(lines)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,18 @@ from us_sim.run.graph import (
 from us_sim.run.in_process import node_in_process
 from us_sim.run.live import prepare_volume
 from us_sim.run.monitored import refuse_unknown
-from us_sim.scene.building import path_of
+from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
 
-__all__ = ["render", "render_scene"]
+__all__ = ["render", "render_scene", "truth_folders"]
 
 QUIET_S = 0.25
 """Silence after which everything that was sent has been taken."""
 
 
-def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Parameters) -> int:
+def render_scene(
+    scene: Scene, path: Path | None, out: Path, parameters: Parameters, *, truth: bool = False
+) -> int:
     """`us-sim render`: with checks of its arguments, and progress.
 
     Raises:
@@ -48,10 +51,41 @@ def render_scene(scene: Scene, path: Path | None, out: Path, parameters: Paramet
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
     prepare_volume(scene, path)
+    folders = truth_folders(scene, out) if truth else {}
     with Progress("rendering", len(path_of(scene, path)), "images") as bar:
-        count = render(scene, path, out, lambda done, _: bar.update(done), parameters)
+        count = render(scene, path, out, lambda done, _: bar.update(done), parameters, folders)
     print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
+    for what, folder in folders.items():
+        print(f"the {what} of each in {folder}")
     return 0
+
+
+def truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
+    """Folders in ``out`` for all that can be known of the scene's images.
+
+    Beside the labels goes a table of what their numbers mean, ``labels.csv``.
+
+    Raises:
+        UsSimError: nothing is known of them, or the table cannot be written.
+    """
+    volume = volume_of(scene)
+    folders = {}
+    if volume.labels is not None:
+        folders["labels"] = out / "labels"
+        names = {0: "nothing", **volume.label_names}
+        try:
+            with (out / "labels.csv").open("w", encoding="utf-8", newline="") as file:
+                csv.writer(file).writerows([("number", "name"), *sorted(names.items())])
+        except OSError as error:
+            raise UsSimError(f"--out {out}: cannot be written: {error.strerror}") from error
+    if scene.tissue is not None:
+        folders["displacement"] = out / "displacement"
+    if not folders:
+        raise UsSimError(
+            f"--truth: {scene.origin} has neither a volume with labels nor tissue, so there is "
+            f"nothing to know of its images"
+        )
+    return folders
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -61,6 +95,7 @@ def render(
     out: Path,
     progress: Callable[[int, int], None],
     parameters: Parameters | None = None,
+    truth: Mapping[str, Path] | None = None,
 ) -> int:
     """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
 
@@ -69,6 +104,7 @@ def render(
     Args:
         progress: called with the images done and the poses there are.
         parameters: more parameters by node, as YAML texts.
+        truth: folders for what is known of each image, as `truth_folders` gives them.
 
     Returns:
         The number of images, equal to the number of poses.
@@ -96,13 +132,13 @@ def render(
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
-        for name, settings in _nodes(scene, path, out, parameters or {}):
+        for name, settings in _nodes(scene, path, out, parameters or {}, truth or {}):
             nodes.append(node_in_process(name, settings, context))
             executor.add_node(nodes[-1])
         for process in simulation_nodes(scene, parameters, played=True):
             (node,) = (node for node in nodes if node.get_name() == process.node)
             refuse_unknown(process, node.list_parameters([], 0).names)
-        return _spin(executor, nodes, progress)
+        return _spin(executor, nodes, progress, [*(truth or {})])
     finally:
         for node in reversed(nodes):
             executor.remove_node(node)
@@ -112,10 +148,11 @@ def render(
 
 
 def _nodes(
-    scene: Scene, path: Path, out: Path, parameters: Parameters
+    scene: Scene, path: Path, out: Path, parameters: Parameters, truth: Mapping[str, Path]
 ) -> list[tuple[str, dict[str, object]]]:
     """Name and parameters of each node: listeners first, the player last."""
     common: dict[str, object] = {"lockstep": True}
+    writer = {what: str(folder) for what, folder in truth.items()}
     recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
         "compression": "zstd",
@@ -127,7 +164,7 @@ def _nodes(
     player = player_settings(scene, path, recorded=True) | {"lockstep": True}
     return [
         ("session_recorder", recorder),
-        ("image_writer", {"folder": str(out / "images")}),
+        ("image_writer", {"folder": str(out / "images"), **writer}),
         *(
             (process.node, {**common, **process.all_parameters})
             for process in simulation_nodes(scene, parameters, played=True)
@@ -136,7 +173,9 @@ def _nodes(
     ]
 
 
-def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None]) -> int:
+def _spin(
+    executor: Any, nodes: list[Any], progress: Callable[[int, int], None], truth: list[str]
+) -> int:
     """Until the path is at its end and nothing more arrives."""
     recorder, writer, player = nodes[0], nodes[1], nodes[-1]
     clock = player.get_clock()
@@ -147,16 +186,18 @@ def _spin(executor: Any, nodes: list[Any], progress: Callable[[int, int], None])
         failure = next(filter(None, (getattr(node, "last_failure", "") for node in nodes)), "")
         if failure:  # the node itself would go on
             raise UsSimError(failure)
-        state = (writer.count, recorder.health.received)
+        state = (writer.count, recorder.health.received + writer.truth.count)
         now = clock.now().nanoseconds
         if state != last:
             if state[0] != last[0]:
                 progress(state[0], total)
             changed, last = now, state
         silence = (now - changed) * 1e-9
-        if player.finished.done() and silence > QUIET_S:
+        is_complete = writer.truth.count == len(truth) * writer.count
+        if player.finished.done() and silence > QUIET_S and is_complete:
             return int(writer.count)
         if silence > 60.0:
+            what = "image" if is_complete else f"{' or '.join(truth)} of each image"
             raise UsSimError(
-                f"no image came for pose {writer.count} in a minute; the path is rendered up to it"
+                f"no {what} came for pose {writer.count} in a minute; the path is rendered up to it"
             )

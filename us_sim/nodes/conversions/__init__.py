@@ -15,6 +15,8 @@ from us_sim.nodes.conversions.images import (
     affine_message,
     bgr_image_message,
     colour_image_message,
+    field_from,
+    field_message,
     image_message,
     pixels_from,
 )
@@ -38,6 +40,8 @@ __all__ = [
     "colour_image_message",
     "contact_model_from",
     "contact_model_message",
+    "field_from",
+    "field_message",
     "image_message",
     "mesh_message",
     "nanoseconds_of",

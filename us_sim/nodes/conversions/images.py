@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
@@ -16,10 +19,13 @@ __all__ = [
     "affine_message",
     "bgr_image_message",
     "colour_image_message",
+    "field_from",
+    "field_message",
     "image_message",
     "pixels_from",
 ]
 
+_FIELD = re.compile(r"32FC([1-4])")
 _LARGEST = 1e6
 """m, of a pixel, or to the first one."""
 
@@ -39,7 +45,13 @@ def bgr_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Ima
     return _image(pixels, "bgr8", 3, stamp, frame)
 
 
-def _image(pixels: NDArray[np.uint8], encoding: str, size: int, stamp: Time, frame: str) -> Image:
+def field_message(values: NDArray[np.float32], stamp: Time, frame: str) -> Image:
+    """A ``32FC…`` image of (rows, columns) values, or of (rows, columns, K); NaN is none there."""
+    count = 1 if values.ndim == 2 else values.shape[2]
+    return _image(values, f"32FC{count}", 4 * count, stamp, frame)
+
+
+def _image(pixels: NDArray[Any], encoding: str, size: int, stamp: Time, frame: str) -> Image:
     message = Image()
     message.header.stamp = stamp
     message.header.frame_id = frame
@@ -68,6 +80,30 @@ def pixels_from(message: Image) -> NDArray[np.uint8]:
         )
     flat = np.frombuffer(message.data, dtype=np.uint8, count=rows * step)
     return flat.reshape(rows, step)[:, :columns]
+
+
+def field_from(message: Image) -> NDArray[np.float32]:
+    """The (rows, columns, K) values of a ``32FC…`` image, (rows, columns) where K is 1.
+
+    Raises:
+        VolumeError: another encoding, big-endian values, no pixels, or fewer bytes than the stated
+            size.
+    """
+    form = _FIELD.fullmatch(message.encoding)
+    if form is None or message.is_bigendian:
+        what = f"big-endian {message.encoding}" if message.is_bigendian else message.encoding
+        raise VolumeError(f"the image is {what}; it must be 32FC1 to 32FC4, little-endian")
+    count = int(form[1])
+    rows, columns = int(message.height), int(message.width)
+    step = int(message.step) or 4 * count * columns
+    if not rows or not columns or step < 4 * count * columns or len(message.data) < rows * step:
+        raise VolumeError(
+            f"the image holds {len(message.data)} bytes, but says it has {rows} rows of {columns} "
+            f"pixels of {4 * count} bytes in {step} bytes each"
+        )
+    lines = np.frombuffer(message.data, dtype=np.uint8, count=rows * step).reshape(rows, step)
+    values = np.ascontiguousarray(lines[:, : 4 * count * columns]).view("<f4")
+    return values.reshape((rows, columns) if count == 1 else (rows, columns, count))
 
 
 def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:

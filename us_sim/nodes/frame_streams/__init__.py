@@ -20,4 +20,8 @@ def frame_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
         from us_sim.nodes.frame_streams.label_stream import LabelStream
 
         streams.append(LabelStream(node))
+    if node.scene.tissue is not None:
+        from us_sim.nodes.frame_streams.displacement_stream import DisplacementStream
+
+        streams.append(DisplacementStream(node))
     return streams
