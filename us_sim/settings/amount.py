@@ -21,6 +21,8 @@ _HANDY = {
     "pressure": ("kPa", "Pa", "MPa", "GPa"),
     "time": ("s", "ms", "us"),
     "angle": ("deg", "rad"),
+    "frequency": ("Hz", "MHz"),
+    "acoustic impedance": ("MRayl", "Rayl"),
 }
 """Units that people use, the most usual first; of other dimensions it is the SI unit."""
 

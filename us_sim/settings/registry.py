@@ -130,6 +130,7 @@ EVALUATIONS = Choice(
         f"{_EVALUATION}.hand.settings:HandSettings",
     ),
     tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
+    image=Option(f"{_EVALUATION}.image.measure:evaluate_image", _NOTHING),
     latency=Option(f"{_EVALUATION}.latency.measure:evaluate_latency", _NOTHING),
 )
 

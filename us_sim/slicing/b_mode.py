@@ -30,6 +30,8 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
+    from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
+    from us_sim.slicing.acoustics.settings import Acoustics
     from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.volume.volume import Volume
 
@@ -49,6 +51,10 @@ class BMode:
         method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
         threads: number of threads that cut a slice.
         settings: of the method's own class, or None for the defaults.
+        acoustics: what sound meets along the beams; None for no more than the volume holds.
+
+    Raises:
+        ProbeError, VolumeError: the acoustics do not go with volume and probe, see `LiveAcoustics`.
     """
 
     def __init__(
@@ -56,6 +62,7 @@ class BMode:
         volume: Volume,
         probe: Probe,
         imaging: Imaging | None = None,
+        acoustics: Acoustics | None = None,
         *,
         method: str = "scan_conversion",
         threads: int = 1,
@@ -68,7 +75,8 @@ class BMode:
         self._mesh: tuple[NDArray[np.float64], NDArray[np.int32]] | None = None
         self._slicer: Slicer | None = None
         self._surface: ContactSurface | None = None
-        self.use(probe, imaging or Imaging())
+        self._acoustics: LiveAcoustics | None = None
+        self.use(probe, imaging or Imaging(), acoustics)
 
     @property
     def probe(self) -> Probe:
@@ -80,18 +88,29 @@ class BMode:
         """Inverted or flat tetrahedra that the latest slice left out."""
         return self._slicer.skipped if self._slicer else 0
 
-    def use(self, probe: Probe, imaging: Imaging) -> None:
-        """Use another probe, or other settings, from the next image on."""
+    def use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None) -> None:
+        """Use another probe, or other settings, from the next image on.
+
+        Raises:
+            ProbeError, VolumeError: as for the class.
+        """
+        self._acoustics = self._live_acoustics(probe, acoustics)
+        if self._acoustics is not None:
+            imaging = self._acoustics.resolved(imaging)
         self._probe = probe
         self._formation = ImageFormation(probe, imaging)
 
-    def prepare(self, probe: Probe, imaging: Imaging) -> None:
+    def prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None) -> None:
         """Load what images with these settings will use, so that the first is not late.
 
         Raises:
-            ProbeError: probe and settings do not go together.
+            ProbeError, VolumeError: volume, probe and settings do not go together.
         """
         warm_up(self._method, self._threads)
+        live = self._live_acoustics(probe, acoustics)
+        if live is not None:
+            live.warm_up()
+            imaging = live.resolved(imaging)
         formation = ImageFormation(probe, imaging)
         blank = np.zeros((probe.rows, probe.columns), dtype=np.uint8)
         blanks = [blank for _ in formation.planes(Pose())]
@@ -121,6 +140,8 @@ class BMode:
         self._slicer = slicer
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
         self._surface = None
+        if self._acoustics is not None:
+            self._acoustics.carry(*self._mesh)
 
     def frame(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> Frame:
         """What is seen with the probe at ``pose``, as it is asked for.
@@ -129,7 +150,7 @@ class BMode:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
         """
-        form = partial(self._form, self._formation)
+        form = partial(self._form, self._formation, self._acoustics)
         return Frame(
             pose, nodes, self._probe, self._volume, self._slicer, form, threads=self._threads
         )
@@ -156,14 +177,29 @@ class BMode:
         """
         return self.frame(pose, nodes).labels
 
-    def _form(self, formation: ImageFormation, frame: Frame) -> NDArray[np.uint8]:
+    def _form(
+        self, formation: ImageFormation, acoustics: LiveAcoustics | None, frame: Frame
+    ) -> NDArray[np.uint8]:
         """The picture of a frame."""
         slices = [frame.slice(plane) for plane in formation.planes(frame.pose, frame.plane)]
+        heard = None if acoustics is None else acoustics.heard(frame)
         if not formation.needs_contact:
-            return formation.form(slices)
+            return formation.form(slices, heard=heard)
         surface = self._contact_surface(frame.nodes is not None)
         where = surface.rest_nodes if frame.nodes is None else frame.nodes
-        return formation.form(slices, *surface.contact(where, frame.probe, frame.pose))
+        coupling, gap = surface.contact(where, frame.probe, frame.pose)
+        return formation.form(slices, coupling, gap, heard)
+
+    def _live_acoustics(self, probe: Probe, acoustics: Acoustics | None) -> LiveAcoustics | None:
+        """What follows the beams; imported only where it is asked for."""
+        if acoustics is None or not acoustics.is_live:
+            return None
+        from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
+
+        live = LiveAcoustics(self._volume, probe, acoustics, before=self._acoustics)
+        if self._mesh is not None:
+            live.carry(*self._mesh)
+        return live
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
         """The surface that the face can touch: the tissue's, or a box around a volume without."""

@@ -117,6 +117,17 @@ class Frame:
         assert self.nodes is not None
         return self._slicer.locate(self.nodes, self.plane, self._cut)
 
+    def locate_some(self, steps: tuple[int, int]) -> Located:
+        """Where every so many-th pixel lies in the mesh, see `Slicer.locate_some`.
+
+        Raises:
+            MeshError: as for `located`.
+        """
+        if self._slicer is None or "located" in self.__dict__:
+            return self.located.some(steps)
+        assert self.nodes is not None
+        return self._slicer.locate_some(self.nodes, self.plane, steps, self._cut)
+
     def slice(self, plane: SlicePlane) -> NDArray[np.uint8]:
         """The volume's grey values (rows, columns) on a plane, as the tissue carries them now.
 

@@ -43,6 +43,11 @@ class Located(NamedTuple):
         index[self.elements == BLACK] = np.nan
         return np.asarray(index)
 
+    def some(self, steps: tuple[int, int]) -> Located:
+        """Every so many-th row and column of the elements, with the same maps."""
+        elements = np.ascontiguousarray(self.elements[:: steps[0], :: steps[1]])
+        return Located(elements, self.maps, self.tetrahedra)
+
 
 def evaluate(
     maps: NDArray[np.float64], elements: NDArray[np.int32], *, threads: int = 1

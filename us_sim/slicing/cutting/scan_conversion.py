@@ -41,6 +41,7 @@ from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
     INNER_MARGIN,
     fill_elements,
+    fill_some_elements,
     sample_spans,
 )
 from us_sim.slicing.cutting.spans import convert_cuts
@@ -105,17 +106,37 @@ class ScanConversion(Slicer):
         return image
 
     def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
-        if cut and cut == self.cuts and self._drawn is not None:
-            runs, spans = self._shown(plane), self._spans
-            count, outline = self._drawn
-        else:
-            count, pieces, outline, _ = self._cut(nodes, plane)
-            runs = self._shown(plane)
-            spans = self._convert(count, pieces, runs, 0, plane.rows)
+        count, outline, runs, spans = self._spans_of(nodes, plane, cut)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
+        return self._located(elements, count)
+
+    def locate_some(
+        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int], cut: int = 0
+    ) -> Located:
+        count, outline, runs, spans = self._spans_of(nodes, plane, cut)
+        shape = -(-plane.rows // steps[0]), -(-plane.columns // steps[1])
+        elements = np.empty(shape, dtype=np.int32)
+        fill_some_elements(
+            spans, self._used, runs, count, BLACK, *outline, np.array(steps), plane.columns,
+            elements,
+        )  # fmt: skip
+        return self._located(elements, count)
+
+    def _located(self, elements: NDArray[np.int32], count: int) -> Located:
         tetrahedra = self._clusters.order[self._cuts.tetrahedra[:count]]
         return Located(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
+
+    def _spans_of(
+        self, nodes: ArrayLike, plane: SlicePlane, cut: int
+    ) -> tuple[int, Outline, NDArray[np.int32], NDArray[np.int64]]:
+        """How many cuts there are, the mesh at rest, and the runs and spans of the image."""
+        if cut and cut == self.cuts and self._drawn is not None:
+            count, outline = self._drawn
+            return count, outline, self._shown(plane), self._spans
+        count, pieces, outline, _ = self._cut(nodes, plane)
+        runs = self._shown(plane)
+        return count, outline, runs, self._convert(count, pieces, runs, 0, plane.rows)
 
     def _cut(self, nodes: ArrayLike, plane: SlicePlane) -> tuple[int, int, Outline, bool]:
         """Fills the cuts, followed by the rigid map.

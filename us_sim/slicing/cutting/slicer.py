@@ -85,6 +85,20 @@ class Slicer(ABC):
             MeshError: as for `image`.
         """
 
+    def locate_some(
+        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int], cut: int = 0
+    ) -> Located:
+        """Where every so many-th pixel lies in the mesh, for what need not know all of them.
+
+        Args:
+            steps: rows and columns from one pixel to the next; the first is in row and column 0.
+            cut: as for `locate`.
+
+        Raises:
+            MeshError: as for `image`.
+        """
+        return self.locate(nodes, plane, cut).some(steps)
+
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.
 

@@ -19,7 +19,14 @@ from us_sim.slicing.cutting.simd import LANES, load_pairs, write_ramp
 from us_sim.slicing.cutting.spans import CUT_SHIFT, END_SHIFT
 from us_sim.slicing.cutting.trilinear import SLACK
 
-__all__ = ["INNER_MARGIN", "MOST_VOXELS", "MOST_VOXELS_A_SIDE", "fill_elements", "sample_spans"]
+__all__ = [
+    "INNER_MARGIN",
+    "MOST_VOXELS",
+    "MOST_VOXELS_A_SIDE",
+    "fill_elements",
+    "fill_some_elements",
+    "sample_spans",
+]
 
 _FRACTION = 17  # bits behind the point of a coordinate
 _DROPPED = 2  # number of these bits that a blend leaves out
@@ -122,6 +129,47 @@ def fill_elements(
             for i in range(columns):
                 if elements[row, i] == rigid and covered[i]:
                     elements[row, i] = black
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_some_elements(
+    spans, used, runs, rigid, black, outlines, points, turns, outline_number, steps, columns,
+    elements,
+):  # fmt: skip
+    """As `fill_elements`, of every so many-th row and column of an image.
+
+    Args:
+        steps: (2,) rows and columns of the image from one element to the next.
+        columns: of the image.
+    """
+    rows, places = elements.shape
+    row_step = steps[0]
+    step = steps[1]
+    winding = np.empty(columns + 1, dtype=np.int32)
+    covered = np.empty(columns, dtype=np.bool_)
+    for number in range(rows):
+        row = number * row_step
+        line = elements[number]
+        line[:] = black
+        for k in range(2):
+            first = (runs[row, k, 0] + step - 1) // step
+            end = (runs[row, k, 1] + step - 1) // step
+            for i in range(first, end):
+                line[i] = rigid
+        for k in range(used[row]):
+            span = spans[row, k]
+            first = ((span & _COLUMN) + step - 1) // step
+            end = ((span >> END_SHIFT & _COLUMN) + step - 1) // step
+            for i in range(first, end):
+                line[np.uint64(i)] = span >> CUT_SHIFT
+        open_places = 0
+        for i in range(places):
+            open_places += line[i] == rigid
+        if open_places:
+            mark_covered(outlines, points, turns, outline_number, row, winding, covered)
+            for i in range(places):
+                if line[i] == rigid and covered[i * step]:
+                    line[i] = black
 
 
 @njit(inline="always", error_model="numpy")

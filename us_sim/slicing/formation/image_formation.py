@@ -15,7 +15,7 @@ array([126, 126, 126, 126], dtype=uint8)
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,9 +39,9 @@ __all__ = ["ImageFormation"]
 class ImageFormation:
     """The stages between slices and the picture, in the order in which echoes meet them.
 
-    They are the beam's thickness, the layer of gel at the face, the beam's width and the pulse's
-    length; then air in front of the face; then gain, dynamic range and grey map. The result depends
-    on settings and arguments only.
+    They are the beam's thickness, the layer of gel at the face, what sound meets on its way, the
+    beam's width and the pulse's length; then air in front of the face; then gain, dynamic range and
+    grey map. The result depends on settings and arguments only.
 
     Args:
         probe: its geometry.
@@ -105,6 +105,7 @@ class ImageFormation:
         images: Sequence[NDArray[np.uint8]],
         coupling: NDArray[np.float32] | None = None,
         gap: NDArray[np.float64] | None = None,
+        heard: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None,
     ) -> NDArray[np.uint8]:
         """The picture (rows, columns); the first image itself when nothing is to be done.
 
@@ -112,12 +113,15 @@ class ImageFormation:
             images: the slices on `planes`, (rows, columns) each.
             coupling: (lines,) from 0 in air to 1 in full contact; None is full contact.
             gap: (lines,) m, from the face to what carries the volume; None is none.
+            heard: makes of echoes (rows, columns) what is left of them on their way; None is all.
         """
         image = images[0]
         if self._elevation is not None:
             image = self._elevation.average(images)
         if self._gel_layer is not None and coupling is not None and gap is not None:
             image = self._gel_layer.filled(image, gap, coupling)
+        if heard is not None:
+            image = heard(image)
         if self._resolution is not None:
             image = self._resolution.spread(image)
         if self._reverberation is not None and coupling is not None:

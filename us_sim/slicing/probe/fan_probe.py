@@ -25,6 +25,7 @@ from us_sim.settings.setting import setting
 from us_sim.slicing.probe.probe import (
     Probe,
     beam_focus,
+    beam_frequencies,
     beam_lines,
     beam_samples,
     image_depth,
@@ -54,6 +55,7 @@ class ConvexProbe(Probe):
     lines: int = beam_lines(192)
     samples: int = beam_samples()
     focus: float | None = beam_focus()
+    frequencies: tuple[float, float] = beam_frequencies(1.5e6, 6e6)
 
     @property
     def _outline(self) -> tuple[float, float, float]:
@@ -100,6 +102,7 @@ class SectorProbe(Probe):
     lines: int = beam_lines(128)
     samples: int = beam_samples()
     focus: float | None = beam_focus()
+    frequencies: tuple[float, float] = beam_frequencies(1e6, 5e6)
     radius: float = setting(
         Quantity("length", 0.0, 0.05),
         "how far behind the face is the apex from which beams radiate",

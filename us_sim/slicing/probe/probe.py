@@ -30,7 +30,15 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
 
-__all__ = ["LinearProbe", "Probe", "beam_focus", "beam_lines", "beam_samples", "image_depth"]
+__all__ = [
+    "LinearProbe",
+    "Probe",
+    "beam_focus",
+    "beam_frequencies",
+    "beam_lines",
+    "beam_samples",
+    "image_depth",
+]
 
 
 def image_depth() -> Any:
@@ -61,6 +69,16 @@ def beam_focus() -> Any:
     )
 
 
+def beam_frequencies(low: float, high: float) -> Any:
+    """The setting of which frequencies the transducer has."""
+    return setting(
+        Quantity("frequency", 0.5e6, 50e6),
+        "lowest and highest that the pulse's middle can have",
+        default=(low, high),
+        kw_only=True,
+    )
+
+
 _ROUNDING = 1e-9
 """Tolerance for pixel centres on the outline, over the depth and over the number of lines."""
 
@@ -84,6 +102,7 @@ class Probe(Settings, ABC):
     error = ProbeError
 
     depth: float  # m, along the beams from the face
+    frequencies: tuple[float, float]  # Hz, lowest and highest
     columns: int  # pixels along the array
     rows: int  # pixels along the depth
     lines: int  # beams
@@ -127,6 +146,14 @@ class Probe(Settings, ABC):
     @abstractmethod
     def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Start (n, 2) m and unit direction (n, 2), as x and z, of the beams at parts (n,)."""
+
+    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Start (n, 2) m and unit direction (n, 2), as x and z, of beams between the probe's own.
+
+        Args:
+            part: (n,) of the face, or of the opening angle where beams spread: 0 to 1.
+        """
+        return self._rays(part)
 
     @cached_property
     def width(self) -> float:
@@ -242,6 +269,11 @@ class Probe(Settings, ABC):
         Raises:
             ProbeError: with the key, the value and the range.
         """
+        low, high = self.frequencies
+        if low > high:
+            raise self.refused(
+                "frequencies", f"{low:g} to {high:g} Hz go down: give the lower one first"
+            )
         try:
             require_pixel_counts(self.columns, self.rows)
         except ProbeError as error:
@@ -267,6 +299,7 @@ class LinearProbe(Probe):
     lines: int = beam_lines(192)
     samples: int = beam_samples()
     focus: float | None = beam_focus()
+    frequencies: tuple[float, float] = beam_frequencies(4e6, 16e6)
 
     @property
     def _outline(self) -> tuple[float, float, float]:

@@ -1,0 +1,1 @@
+"""Error of what an image shows of sound, strain and flow against closed forms, and its run time."""

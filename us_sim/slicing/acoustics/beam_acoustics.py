@@ -1,0 +1,219 @@
+"""What sound does along the beams as they are now, put on a slice: the room's facade.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
+>>> from us_sim.slicing.acoustics.settings import Acoustics
+>>> from us_sim.slicing.frame import Frame
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.volume.volume import Volume
+>>> liver = np.ones((40, 4, 40), np.uint8)
+>>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+>>> volume = Volume(100 * liver, placed, liver, {1: "liver"})
+>>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=8, rows=60)
+>>> sound = BeamAcoustics(
+...     volume, probe, Acoustics(artefacts="live", frequency=5e6, compensation=0.0))
+>>> frame = Frame(Pose([0.02, 0.001, 0.0]), None, probe, volume, None, lambda frame: liver)
+>>> gain = sound.gain(frame)
+>>> np.round(gain[:, 0] / sound.grid.distance / 1e2, 3)[:3]  # dB/cm: 2 × 0.45 × 5
+array([-4.5, -4.5, -4.5])
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.kernels import njit
+from us_sim.slicing.acoustics.beam_grid import BeamGrid
+from us_sim.slicing.acoustics.fibres import Fibres
+from us_sim.slicing.acoustics.media import media_of, surface_levels
+from us_sim.slicing.acoustics.noise import Noise
+from us_sim.slicing.acoustics.path_loss import follow_beams, room_for_crossings, sharpen_borders
+from us_sim.slicing.acoustics.penumbra import AMPLITUDES, cast_shadows
+from us_sim.slicing.acoustics.settings import Acoustics
+from us_sim.slicing.acoustics.surface_echo import ANGLES, GRAIN, draw_surfaces
+from us_sim.slicing.acoustics.surface_normals import SurfaceNormals
+from us_sim.slicing.cutting.located import Located
+from us_sim.slicing.cutting.resampling import full_runs, label_voxels, pixel_to_index
+from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
+from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import Probe
+from us_sim.volume.volume import Volume
+
+__all__ = ["SPEED_OF_SOUND", "BeamAcoustics", "decibels_per_metre"]
+
+SPEED_OF_SOUND = 1540.0
+"""m/s, that scanners take for all soft tissue."""
+
+_PULSE = 1.5  # wavelengths, the length of a surface's echo
+_CROSSINGS = 16  # of each beam there is room for
+
+
+def decibels_per_metre(attenuation: float, frequency: float) -> float:
+    """dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
+    return 2.0 * attenuation * 100.0 * frequency * 1e-6
+
+
+class BeamAcoustics:
+    """Loss, shadows, surfaces and fibres, as one probe's beams meet them in one volume.
+
+    Args:
+        volume: its labels say what is where.
+        probe: its geometry, and the frequencies that it has.
+        acoustics: the settings.
+
+    Raises:
+        ProbeError: a label without constants, constants of a label that there is not, or a
+            frequency that the probe does not have.
+        VolumeError: the volume has no labels.
+    """
+
+    def __init__(self, volume: Volume, probe: Probe, acoustics: Acoustics) -> None:
+        self._volume, self._acoustics = volume, acoustics
+        self._voxels, self._shape = label_voxels(volume)
+        self.grid = grid = BeamGrid(probe)
+        self._probe = probe
+        frequency = frequency_of(acoustics, probe)
+        self._media, self._constants, directions = media_of(volume, acoustics, frequency, grid.step)
+        rise = decibels_per_metre(acoustics.compensation, frequency)
+        if not acoustics.attenuation:
+            rise = 0.0
+        self._time_gain = (rise * grid.distance).astype(np.float32)
+        self._rise = np.float32(rise * grid.step)
+        self._steps = np.array(grid.steps)
+        self._fibres = Fibres(directions) if len(directions) else None
+        self._no_fibres = np.zeros((1, 1, 2), dtype=np.float32)
+        self._pulse = _PULSE * SPEED_OF_SOUND / frequency
+        self._noise = None
+        if acoustics.noise is not None:
+            self._noise = Noise(probe, acoustics.noise, rise)
+        self._surface = surface_levels(self._constants)
+        self._normals: SurfaceNormals | None = None
+        self._rest_index = np.empty((0, 3))
+        self._corners = np.empty((0, 4), dtype=np.int32)
+        self._gain = np.empty((grid.samples, grid.beams), dtype=np.float32)
+        self._blocked, self._blocker = np.empty_like(self._gain), np.empty_like(self._gain)
+        self._crossings = room_for_crossings(_CROSSINGS * grid.beams)
+        self._across, self._along = (
+            np.ascontiguousarray(grid.directions[:, axis], dtype=np.float32) for axis in (0, 1)
+        )
+        self._found = 0
+        self._at: tuple[Located, NDArray[np.float64]]
+        self._lines = grid.lines
+        self._dither = _dither(probe.columns)
+
+    def keep(self, other: BeamAcoustics) -> None:
+        """Take over what another one found out about the same volume."""
+        if other._volume is self._volume:
+            self._normals = other._normals
+
+    def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
+        """Let a mesh carry the volume: (N, 3) m at rest and (M, 4)."""
+        to_index = self._volume.patient_to_index
+        self._rest_index = rest_nodes @ to_index[:3, :3].T + to_index[:3, 3]
+        self._corners = np.ascontiguousarray(corners, dtype=np.int32)
+        if self._fibres is not None:
+            self._fibres.carry(rest_nodes, self._corners)
+
+    def gain(self, frame: Frame) -> NDArray[np.float32]:
+        """(samples, beams) dB to add to the volume's echoes: time gain less all that is lost.
+
+        It is overwritten by the next one.
+        """
+        grid, fibre = self.grid, self._no_fibres
+        self._at = located, nodes = self._located(frame)
+        if self._fibres is not None:
+            fibre = self._fibres.now(located, nodes, frame.plane)
+        self._found, first = follow_beams(
+            located.elements.reshape(-1), located.maps, self._voxels, self._shape, grid.places,
+            self._lines, self._across, self._along, self._media, self._time_gain, fibre,
+            self._gain, self._blocked, self._blocker, self._crossings,
+        )  # fmt: skip
+        cast_shadows(
+            first, self._blocked, self._blocker, grid.distance, grid.aperture, grid.spacing,
+            AMPLITUDES, self._gain,
+        )  # fmt: skip
+        return self._gain
+
+    def heard(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
+        """A slice of echoes (rows, columns) as the frame's beams bring them."""
+        gain = self.grid.on_pixels(self.gain(frame))
+        if self.grid.is_linear:
+            sharpen_borders(
+                self._found, self._crossings, self._gain, self._blocked, self._media, self._rise,
+                self._steps, gain,
+            )  # fmt: skip
+        out = np.empty_like(image)
+        _add_gain(image, gain, np.float32(GREYS_PER_DECIBEL), self._dither, out)
+        if self._acoustics.surfaces:
+            self._draw(frame, out)
+        if self._noise is not None:
+            np.maximum(out, self._noise.at(frame.pose), out=out)
+        return out
+
+    def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
+        """Where pixels lie in the mesh, and the mesh; without one all are rigid."""
+        if frame.nodes is not None:
+            return frame.locate_some(self.grid.steps), frame.nodes
+        plane, (row_step, step) = frame.plane, self.grid.steps
+        shape = -(-plane.rows // row_step), -(-plane.columns // step)
+        elements = np.zeros(shape, dtype=np.int32)
+        maps = np.ascontiguousarray(pixel_to_index(self._volume, plane)[None])
+        return Located(elements, maps, np.empty(0, dtype=np.intp)), np.empty((0, 3))
+
+    def _draw(self, frame: Frame, out: NDArray[np.uint8]) -> None:
+        assert self._volume.labels is not None
+        if self._normals is None:
+            self._normals = SurfaceNormals(self._volume.labels)
+        grid, plane = self.grid, frame.plane
+        located, nodes = self._at
+        lateral, axial = self._probe.pixel_spacing
+        origin = self._probe.image_to_probe[[0, 2], 3]
+        axes = np.stack([plane.column_step / lateral, plane.row_step / axial])
+        rigid = np.ascontiguousarray(self._volume.patient_to_index[:3, :3])
+        runs = full_runs(plane) if plane.spans is None else plane.spans
+        draw_surfaces(
+            self._found, self._crossings, self._surface, self._normals.normals,
+            self._normals.blocks, self._shape, self._rest_index, located.tetrahedra,
+            self._corners, nodes, rigid, axes, grid.step, grid.spacing, grid.starts,
+            grid.directions, lateral, axial, -origin / [lateral, axial], self._pulse,
+            GREYS_PER_DECIBEL, ANGLES, GRAIN, runs, out,
+        )  # fmt: skip
+
+
+def frequency_of(acoustics: Acoustics, probe: Probe) -> float:
+    """Hz: the frequency that is set, or the middle of the probe's.
+
+    Raises:
+        ProbeError: the probe cannot have it.
+    """
+    low, high = probe.frequencies
+    if acoustics.frequency is None:
+        return float(np.sqrt(low * high))
+    if not low <= acoustics.frequency <= high:
+        raise acoustics.refused(
+            "frequency",
+            f"{acoustics.frequency * 1e-6:g} MHz is not one that this probe has, which are "
+            f"{low * 1e-6:g} to {high * 1e-6:g} MHz (probe.frequencies)",
+        )
+    return acoustics.frequency
+
+
+def _dither(columns: int) -> NDArray[np.float32]:
+    """(8, columns) thresholds from 0 to 1, even along rows: means of rounded greys are right."""
+    row, column = np.arange(8)[:, None], np.arange(columns)[None, :]
+    # Multiples of irrational numbers modulo 1 (Roberts, quasirandom sequences).
+    return np.asarray((0.5 + 0.7548776662 * column + 0.5698402910 * row) % 1.0, dtype=np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_gain(image, gain, greys, dither, out):
+    """Grey levels (rows, columns) with gain (rows, columns) dB; no echo stays none."""
+    for row in range(image.shape[0]):
+        line, add, result = image[row], gain[row], out[row]
+        threshold = dither[row & 7]
+        for i in range(len(line)):
+            level = np.float32(line[i]) + add[i] * greys + threshold[i]
+            level = min(max(level, np.float32(0.0)), np.float32(255.0))
+            result[i] = np.uint8(np.int32(level)) if line[i] > 0 else np.uint8(0)

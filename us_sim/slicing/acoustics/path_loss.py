@@ -1,0 +1,263 @@
+"""The loss along each beam, and where it crosses from one tissue into another.
+
+Sound goes there and back, so in a tissue of attenuation α (dB/cm/MHz, of the amplitude in one
+direction) an echo loses 2 α f dB each centimetre (Beer and Lambert). A border of impedances Z1 and
+Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude, and of an echo from behind it 1 - R² passes
+in both directions together (Szabo 2014, section 3.3). Where a beam crosses a border is found to a
+256th of a sample, so that the loss at each sample is that of the true path.
+
+What bone and gas take is kept apart: their shadows have soft edges (`penumbra`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.kernels import njit
+from us_sim.slicing.cutting.trilinear import SLACK
+
+__all__ = ["NOTHING", "Crossings", "Media", "follow_beams", "room_for_crossings", "sharpen_borders"]
+
+NOTHING = 0
+"""The medium where there is no tissue."""
+
+_BEGIN, _END = -0.5 - SLACK, -0.5 + SLACK  # of a volume, from its first index and its side
+_HALVINGS = 8  # of a sample, to find where a beam crosses a border
+_DARK = 30.0  # dB after which it does not matter where more is lost
+
+
+class Media(NamedTuple):
+    """What the labels of a volume are to sound at one frequency; medium 0 is `NOTHING`."""
+
+    of_label: NDArray[np.uint8]  # (256,) the medium of each label
+    loss: NDArray[np.float32]  # (media,) dB, of an echo in a sample's length
+    crossing: NDArray[np.float32]  # (media, media) dB, of an echo from behind the border
+    blocks: NDArray[np.bool_]  # (media,) whether it is bone or gas
+    scattering: NDArray[np.float32]  # (media,) dB
+    fibres: NDArray[np.int32]  # (media,) which direction its fibres have, -1 without
+    anisotropy: NDArray[np.float32]  # (media,) dB, most by which they fade
+    half_sine: NDArray[np.float32]  # (media,) square of the sine at which half of that is lost
+
+
+class Crossings(NamedTuple):
+    """Where beams enter another medium; of each array only the first entries are in use."""
+
+    beam: NDArray[np.int32]
+    distance: NDArray[np.float32]  # in samples from the first one
+    media: NDArray[np.uint8]  # (crossings, 2) before and behind
+    element: NDArray[np.int32]  # the map that holds there
+    voxel: NDArray[np.float32]  # (crossings, 3) voxel index just behind
+    level: NDArray[np.float32]  # dB of the soft loss and the time gain there
+
+
+def room_for_crossings(count: int) -> Crossings:
+    """Room for so many."""
+    return Crossings(
+        np.empty(count, np.int32),
+        np.empty(count, np.float32),
+        np.empty((count, 2), np.uint8),
+        np.empty(count, np.int32),
+        np.empty((count, 3), np.float32),
+        np.empty(count, np.float32),
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def follow_beams(
+    elements, maps, voxels, shape, places, lines, across, along, media, time_gain, fibre,
+    gain, blocked, blocker, crossings,
+):  # fmt: skip
+    """Fills gain, blocked and blocker; returns the numbers of crossings and of clear samples.
+
+    Args:
+        elements: (pixels,) as `Located.elements`, flat; maps: as there. voxels: (I*J*K,) uint8
+            labels, shape: (3,) its sides.
+        places: (beams, samples) int32, of the element at each sample.
+        lines: (beams, 4) column and row of the first sample, and from each to the next.
+        across, along: (beams,) float32, the beams' directions as x and z.
+        time_gain: (samples,) float32 dB.
+        fibre: (E + 1, directions, 2) float32, x and z of the unit fibres of each map.
+        gain: (samples, beams) float32 dB, all but what blocks.
+        blocked, blocker: (samples, beams) float32 dB lost to what blocks, and the mean sample at
+            which it is lost.
+    """
+    beams, samples = places.shape
+    room = len(crossings.beam)
+    found = 0
+    first_blocked = samples
+    half = np.float32(0.5)
+    one = np.float32(1.0)
+    nothing = np.float32(0.0)
+    of_label = media.of_label
+    sides = (shape[0], shape[1], shape[2])
+    ends = (sides[0] + _END, sides[1] + _END, sides[2] + _END)
+    for k in range(beams):
+        soft = nothing
+        hard = nothing
+        where = nothing
+        was = np.uint8(NOTHING)
+        px = py = pz = 0.0
+        x = y = z = 0.0
+        gx = gy = gz = 0.0
+        column = lines[k, 0]
+        row = lines[k, 1]
+        to_column = lines[k, 2]
+        to_row = lines[k, 3]
+        held = np.int32(-2)  # the element whose gradient is gx, gy, gz
+        for s in range(samples):
+            element = elements[np.uint64(places[k, s])]
+            medium = np.uint8(NOTHING)
+            px, py, pz = x, y, z
+            if element >= 0:
+                if element == held:
+                    x += gx
+                    y += gy
+                    z += gz
+                else:
+                    m = maps[np.uint64(element)]
+                    c = column + s * to_column
+                    r = row + s * to_row
+                    x = m[0, 0] + m[0, 1] * c + m[0, 2] * r
+                    y = m[1, 0] + m[1, 1] * c + m[1, 2] * r
+                    z = m[2, 0] + m[2, 1] * c + m[2, 2] * r
+                    gx = m[0, 1] * to_column + m[0, 2] * to_row
+                    gy = m[1, 1] * to_column + m[1, 2] * to_row
+                    gz = m[2, 1] * to_column + m[2, 2] * to_row
+                medium = _medium_at(x, y, z, voxels, sides, ends, of_label)
+            held = element
+            length = half if s == 0 else one
+            if medium == was:
+                loss = length * media.loss[medium]
+                if media.blocks[medium]:
+                    where = _blocked_at(where, hard, loss, s)
+                    hard += loss
+                else:
+                    soft += loss
+            else:
+                low = 0.0
+                high = 1.0
+                if s == 0:
+                    high = 0.0
+                elif was != NOTHING and medium != NOTHING:
+                    for _ in range(_HALVINGS):
+                        middle = 0.5 * (low + high)
+                        there = _medium_at(
+                            px + middle * (x - px), py + middle * (y - py), pz + middle * (z - pz), voxels, sides,
+                            ends, of_label,
+                        )  # fmt: skip
+                        if there == was:
+                            low = middle
+                        else:
+                            high = middle
+                t = np.float32(0.5 * (low + high))
+                before = t * media.loss[was]
+                behind = (length - t) * media.loss[medium]
+                border = media.crossing[was, medium]
+                if media.blocks[was]:
+                    where = _blocked_at(where, hard, before, s)
+                    hard += before
+                else:
+                    soft += before
+                if was != NOTHING and medium != NOTHING and found < room:
+                    crossings.beam[found] = k
+                    crossings.distance[found] = np.float32(s) - one + t
+                    crossings.media[found, 0] = was
+                    crossings.media[found, 1] = medium
+                    crossings.element[found] = element
+                    crossings.voxel[found, 0] = px + high * (x - px)
+                    crossings.voxel[found, 1] = py + high * (y - py)
+                    crossings.voxel[found, 2] = pz + high * (z - pz)
+                    crossings.level[found] = time_gain[s] - soft - hard
+                    found += 1
+                if media.blocks[was] or media.blocks[medium]:
+                    where = _blocked_at(where, hard, border, s)
+                    hard += border
+                else:
+                    soft += border
+                if media.blocks[medium]:
+                    where = _blocked_at(where, hard, behind, s)
+                    hard += behind
+                else:
+                    soft += behind
+                was = medium
+            level = time_gain[s] - soft + media.scattering[medium]
+            direction = media.fibres[medium]
+            if direction >= 0:
+                sine = (
+                    fibre[element, direction, 0] * across[k]
+                    + fibre[element, direction, 1] * along[k]
+                )
+                square = sine * sine
+                level -= media.anisotropy[medium] * square / (square + media.half_sine[medium])
+            gain[s, k] = level
+            blocked[s, k] = hard
+            if hard > nothing:
+                blocker[s, k] = where
+                first_blocked = min(first_blocked, s)
+    return found, first_blocked
+
+
+@njit(inline="always", error_model="numpy")
+def _blocked_at(where, hard, loss, s):
+    """The mean sample where a beam is blocked, with a further loss at sample ``s``."""
+    if hard < np.float32(_DARK) and loss > np.float32(0.0):
+        return np.float32((where * hard + loss * s) / (hard + loss))
+    return where
+
+
+@njit(inline="always", error_model="numpy")
+def _medium_at(x, y, z, voxels, sides, ends, of_label):
+    """The medium at a voxel index: of the nearest voxel, `NOTHING` beyond the volume.
+
+    Args:
+        sides: of the volume, three int64. ends: where its last voxels end, three float64.
+    """
+    # Without `and`, whose branches would take longer than the comparisons.
+    is_inside = (x >= _BEGIN) & (x <= ends[0])
+    is_inside &= (y >= _BEGIN) & (y <= ends[1])
+    is_inside &= (z >= _BEGIN) & (z <= ends[2])
+    if not is_inside:
+        return np.uint8(NOTHING)
+    # Half a voxel further, the whole part is the nearest; at the very faces it may be one too far.
+    ix = min(np.int64(x + 0.5), sides[0] - 1)
+    iy = min(np.int64(y + 0.5), sides[1] - 1)
+    iz = min(np.int64(z + 0.5), sides[2] - 1)
+    return of_label[voxels[np.uint64((ix * sides[1] + iy) * sides[2] + iz)]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sharpen_borders(found, crossings, gain, blocked, media, rise, steps, pixels):
+    """Sets the gain of pixels between the two samples around a border as if on its beam alone.
+
+    Between samples a gain is interpolated, which would smear what a border takes and where another
+    tissue begins.
+
+    Args:
+        gain, blocked: (samples, beams) dB. rise: dB, of the time gain in a sample's length.
+        steps: (2,) rows a sample and columns a beam. pixels: (rows, columns) float32 dB, changed.
+    """
+    rows, columns = pixels.shape
+    per_sample = steps[0]
+    for f in range(found):
+        k = crossings.beam[f]
+        at = crossings.distance[f]
+        above = int(np.floor(at))
+        below = above + 1
+        if above < 0 or below >= len(gain) or blocked[below, k] > 0.0:
+            continue
+        before = rise - media.loss[crossings.media[f, 0]]
+        behind = rise - media.loss[crossings.media[f, 1]]
+        for row in range(
+            above * per_sample + per_sample // 2, below * per_sample + per_sample // 2
+        ):
+            place = np.float32((row + 0.5) / per_sample - 0.5)
+            if place < at:
+                level = gain[above, k] + (place - np.float32(above)) * before
+            else:
+                level = gain[below, k] - (np.float32(below) - place) * behind
+            for column in range(k * steps[1], (k + 1) * steps[1]):
+                if row < rows and column < columns:
+                    pixels[row, column] = level

@@ -1,0 +1,163 @@
+"""The settings of what sound does on its way: per tissue, and of all.
+
+>>> from us_sim.slicing.acoustics.settings import Acoustics
+>>> Acoustics(artefacts="live", frequency="8 MHz").frequency
+8000000.0
+>>> Acoustics(frequency="80 MHz")
+Traceback (most recent call last):
+...
+us_sim.errors.ProbeError: imaging.acoustics.frequency: 8e+07 Hz is outside 500000 to 5e+07 Hz
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from us_sim.errors import ProbeError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.slicing.acoustics.tissue_table import table_constants
+
+__all__ = ["Acoustics", "TissueAcoustics"]
+
+_FREQUENCY = Quantity("frequency", 0.5e6, 50e6)
+
+
+@dataclass(frozen=True)
+class TissueAcoustics(Settings):
+    """The acoustic constants of the tissue with one label.
+
+    Raises:
+        ProbeError: a constant is out of its range.
+    """
+
+    section = "imaging.acoustics.tissues"
+    error = ProbeError
+    live = True
+
+    attenuation: float | None = setting(
+        Quantity("attenuation", 1e-4, 100.0),
+        "of the amplitude; not given: the textbook's for this name",
+        default=None,
+    )
+    impedance: float | None = setting(
+        Quantity("acoustic impedance", 100.0, 1e8),
+        "characteristic; not given: the textbook's for this name",
+        default=None,
+    )
+    reflection: float | None = setting(
+        Quantity("level", -60.0, 20.0),
+        "echo of its surface at a right angle, where the strongest shown is 0; not given: what the "
+        "two impedances make",
+        default=None,
+    )
+    scattering: float = setting(
+        Quantity("level", -60.0, 60.0), "added to the echoes that the volume holds", default=0.0
+    )
+    fibres: tuple[float, ...] = setting(
+        Quantity("number", -1.0, 1.0), "x, y, z in `patient` of its fibres at rest", default=()
+    )
+    anisotropy: float = setting(
+        Quantity("level", 0.0, 60.0), "most by which echoes fall along the fibres", default=12.0
+    )
+    half_angle: float = setting(
+        Quantity("angle", 0.01, 1.5),
+        "between the beam and the fibres' perpendicular at which they fall by half of that",
+        default=0.35,
+    )
+
+    def check(self) -> None:
+        """Fibres have a direction of three numbers, or none."""
+        if any(self.fibres) and len(self.fibres) != 3:
+            raise self.refused("fibres", f"needs 3 values, not {len(self.fibres)}")
+
+    @property
+    def has_fibres(self) -> bool:
+        """Whether its echoes depend on a direction."""
+        return any(self.fibres) and self.anisotropy > 0.0
+
+    def resolved(self, name: str) -> TissueAcoustics:
+        """With the textbook's constants of a label's name where none are given.
+
+        Raises:
+            ProbeError: the textbook has none for that name; ``key`` says which.
+        """
+        found = table_constants(name)
+        values: dict[str, Any] = {}
+        for place, key in enumerate(("attenuation", "impedance")):
+            if getattr(self, key) is None:
+                if found is None:
+                    error = self.refused(
+                        f"{name}.{key}",
+                        f"is missing, and the textbook's table has no tissue of the name `{name}`: "
+                        f"give one",
+                    )
+                    raise error
+                values[key] = found[place]
+        return dataclasses.replace(self, **values) if values else self
+
+
+@dataclass(frozen=True)
+class Acoustics(Settings):
+    """Artefacts of sound along the current beams; each part costs nothing where it is off.
+
+    Raises:
+        ProbeError: a value is out of range, with its name and the range.
+    """
+
+    section = "imaging.acoustics"
+    error = ProbeError
+    live = True
+
+    artefacts: str = setting(
+        description="baked: the volume holds the shadows of its own sweep; live: it holds echoes "
+        "without loss, and its labels say what beams meet",
+        choices=("baked", "live"),
+        default="baked",
+    )
+    frequency: float | None = setting(
+        _FREQUENCY,
+        "of the pulse's middle; not given: the middle of what the probe has",
+        default=None,
+    )
+    volume_frequency: float | None = setting(
+        _FREQUENCY,
+        "at which the volume's speckle was made, which lower ones blur; not given: any",
+        default=None,
+    )
+    compensation: float = setting(
+        Quantity("attenuation", 0.0, 10.0),
+        "of the nominal tissue that the time gain makes up for",
+        default=0.54,
+    )
+    attenuation: bool = setting(
+        description="loss along the beams: shadows, and enhancement behind fluid", default=True
+    )
+    surfaces: bool = setting(
+        description="echoes of surfaces between tissues, by their angle", default=True
+    )
+    anisotropy: bool = setting(description="fading of fibres off the perpendicular", default=True)
+    noise: float | None = setting(
+        Quantity("level", -160.0, -20.0),
+        "of the electronics at the face, which the time gain lifts; not given: none",
+        default=None,
+    )
+    tissues: Mapping[str, TissueAcoustics] = setting(
+        description="constants by label; of what is not said, the textbook's", default_factory=dict
+    )
+
+    @property
+    def is_live(self) -> bool:
+        """Whether artefacts are made along the beams."""
+        return self.artefacts == "live"
+
+    def of(self, name: str) -> TissueAcoustics:
+        """The constants of the tissue with a label of that name.
+
+        Raises:
+            ProbeError: it has none.
+        """
+        return self.tissues.get(name, TissueAcoustics()).resolved(name)

@@ -1,0 +1,219 @@
+"""Echoes of the surfaces between tissues, as bright as their angle to the beam lets them be.
+
+A smooth border of impedances Z1 and Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude at a
+right angle. Borders of tissue are rough on the scale of the image: their facets have slopes with a
+standard deviation m, and only those that face the beam send an echo back to it. So the amplitude
+falls with the angle θ between beam and normal as exp(-tan²θ / (2 m²)) (Beckmann and Spizzichino,
+The Scattering of Electromagnetic Waves from Rough Surfaces, 1963, chapter 5), down to what
+the roughness scatters in all directions.
+
+The normal is that of the border as deformed now, also out of the image's plane: normals at rest are
+covectors of voxel indices, which the tetrahedron's map carries into the patient.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from us_sim.kernels import njit
+from us_sim.slicing.acoustics.surface_normals import BLOCK
+
+__all__ = ["GRAIN", "MIRROR", "angle_loss", "draw_surfaces"]
+
+MIRROR = 11.0
+"""dB: echo of a plane that reflects everything at a right angle, where the strongest shown is 0."""
+
+ROUGHNESS = 0.35
+"""Standard deviation of the slopes of a border's facets."""
+
+_DIFFUSE = -25.0  # dB, of what a rough border sends in all directions, at a right angle
+_GRAZING = 0.3  # least cosine for the slope with which an echo is drawn
+_GRAIN_SIDE = 32
+_LONGEST = 1.5  # pulse lengths on either side of a border that are drawn
+_FLAT = 1e-30
+
+
+def angle_loss(cosine: Any) -> Any:
+    """dB by which a border is fainter, seen at an angle with that cosine (any shape)."""
+    square = np.maximum(np.square(cosine), 1e-6)
+    facets = np.exp(-(1.0 - square) / square / (2.0 * ROUGHNESS**2))
+    floor = 10.0 ** (_DIFFUSE / 20.0) * np.sqrt(square)
+    return -20.0 * np.log10(np.maximum(facets, floor))
+
+
+def _angle_table() -> np.ndarray:
+    """(257,) float32 `angle_loss` at evenly spaced cosines from 0 to 1."""
+    return np.asarray(angle_loss(np.arange(257) / 256.0), dtype=np.float32)
+
+
+def _grain() -> np.ndarray:
+    """(32, 32, 32) float32 dB: borders are patchy, as the tissue at them is."""
+    random = np.random.Generator(np.random.PCG64(11))
+    noise = random.standard_normal((_GRAIN_SIDE,) * 3) + 1j * random.standard_normal(
+        (_GRAIN_SIDE,) * 3
+    )
+    frequency = np.fft.fftfreq(_GRAIN_SIDE)
+    square = sum(np.square(f) for f in np.meshgrid(frequency, frequency, frequency, indexing="ij"))
+    smooth = np.fft.ifftn(np.fft.fftn(noise) * np.exp(-square / (2 * 0.12**2)))
+    # A smooth echo of one phase, and a weaker one that speckles.
+    echo = np.abs(1.0 + 0.5 * smooth / np.sqrt(np.mean(np.abs(smooth) ** 2)))
+    level = 20.0 * np.log10(np.maximum(echo, 0.1))
+    return np.asarray(level - level.mean(), dtype=np.float32)
+
+
+ANGLES = _angle_table()
+GRAIN = _grain()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_surfaces(
+    found, crossings, surface, normals, blocks, shape, rest_index, tetrahedra, corners,
+    nodes, rigid, beam_axes, step, spacing, starts, directions, across, down, to_pixel, pulse,
+    greys, angles, grain, runs, image,
+):  # fmt: skip
+    """Draws the echoes of the first ``found`` crossings where they are brighter than the image.
+
+    Args:
+        crossings: as `path_loss.Crossings`.
+        surface: (media, media) float32 dB, of a border at a right angle.
+        normals, blocks: as `SurfaceNormals`. shape: (3,) of the volume.
+        rest_index: (N, 3) voxels, where the nodes are at rest. nodes: (N, 3) m, where they are.
+        tetrahedra: as `Located`. corners: (M, 4) nodes of the mesh's tetrahedra.
+        rigid: (3, 3) from m to voxels, of tissue as at rest.
+        beam_axes: (2, 3) unit vectors along the image's columns and rows, in ``patient``.
+        step: m between samples. spacing: (samples,) m between beams.
+        starts, directions: (beams, 2) m. across, down: m from column to column, and row to row.
+        to_pixel: (2,) column and row of the origin of ``probe``.
+        pulse: m, length of an echo. greys: grey values a dB.
+        runs: (rows, 2, 2) columns that show something. image: (rows, columns) uint8, changed.
+    """
+    rows, columns = image.shape
+    gradient = np.empty(3)
+    for f in range(found):
+        k = np.uint64(crossings.beam[f])
+        at = crossings.distance[f]
+        before = np.uint64(at) if at > 0.0 else np.uint64(0)
+        level = surface[crossings.media[f, 0], crossings.media[f, 1]] + crossings.level[f]
+        if level * greys + 255.0 < 1.0:
+            continue
+        i = min(max(np.int64(crossings.voxel[f, 0] + 0.5), 0), shape[0] - 1)
+        j = min(max(np.int64(crossings.voxel[f, 1] + 0.5), 0), shape[1] - 1)
+        m = min(max(np.int64(crossings.voxel[f, 2] + 0.5), 0), shape[2] - 1)
+        block = blocks[i // BLOCK, j // BLOCK, m // BLOCK]
+        if block < 0:
+            continue
+        within = ((i % BLOCK) * BLOCK + j % BLOCK) * BLOCK + m % BLOCK
+        normal = normals[block, within]
+        if not _carry_normal(
+            normal, crossings.element[f], rest_index, tetrahedra, corners, nodes, rigid, gradient
+        ):
+            continue
+        length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
+        nx = (
+            gradient[0] * beam_axes[0, 0]
+            + gradient[1] * beam_axes[0, 1]
+            + gradient[2] * beam_axes[0, 2]
+        ) / length
+        nz = (
+            gradient[0] * beam_axes[1, 0]
+            + gradient[1] * beam_axes[1, 1]
+            + gradient[2] * beam_axes[1, 2]
+        ) / length
+        dx = directions[k, 0]
+        dz = directions[k, 1]
+        cosine = nx * dx + nz * dz
+        size = abs(cosine)
+        level -= angles[np.uint64(min(size * 256.0, 256.0))]
+        level += grain[i % _GRAIN_SIDE, j % _GRAIN_SIDE, m % _GRAIN_SIDE]
+        if level * greys + 255.0 < 1.0:
+            continue
+        slope = max(size, _GRAZING) * (1.0 if cosine >= 0.0 else -1.0)
+        away = (at + 0.5) * step
+        x = starts[k, 0] + away * dx
+        z = starts[k, 1] + away * dz
+        half = 0.5 * spacing[min(before, np.uint64(len(spacing) - 1))] + 1e-9
+        longest = _LONGEST * pulse
+        wide = abs(dz) * half + abs(dx) * (longest + half)
+        high = abs(dx) * half + abs(dz) * longest + half * min(abs(nx / slope), 3.0)
+        top, bottom = _within(
+            to_pixel[1] + (z - high) / down, to_pixel[1] + (z + high) / down, rows
+        )
+        left, right = _within(
+            to_pixel[0] + (x - wide) / across, to_pixel[0] + (x + wide) / across, columns
+        )
+        for row in range(top, bottom):
+            qz = (row - to_pixel[1]) * down - z
+            for column in range(left, right):
+                qx = (column - to_pixel[0]) * across - x
+                lateral = qx * dz - qz * dx
+                if abs(lateral) > half:
+                    continue
+                # Along the beam, to the border's tangent.
+                t = (nx * qx + nz * qz) / slope
+                if abs(t) > longest:
+                    continue
+                fainter = 6.0206 * (2.0 * t / pulse) ** 2  # 6 dB at half the pulse's length
+                grey = np.int64(255.5 + (level - fainter) * greys)
+                if grey > image[row, column] and (
+                    runs[row, 0, 0] <= column < runs[row, 0, 1]
+                    or runs[row, 1, 0] <= column < runs[row, 1, 1]
+                ):
+                    image[row, column] = min(grey, 255)
+
+
+@njit(inline="always", error_model="numpy")
+def _within(low, high, count):
+    """First and end of the whole numbers from one place to another, of 0 to ``count - 1``."""
+    first = int(np.ceil(low))
+    end = int(np.floor(high)) + 1
+    return first if first > 0 else 0, end if end < count else count
+
+
+@njit(inline="always", error_model="numpy")
+def _carry_normal(normal, element, rest_index, tetrahedra, corners, nodes, rigid, out):
+    """The covector of voxel indices as one of the patient now; whether there is one.
+
+    The edges d of a tetrahedron now, and e of it at rest in voxels, fulfil c · d = normal · e.
+    """
+    a = np.float64(normal[0])
+    b = np.float64(normal[1])
+    c = np.float64(normal[2])
+    if a == 0.0 and b == 0.0 and c == 0.0:
+        return False
+    if element >= len(tetrahedra):
+        for axis in range(3):
+            out[axis] = a * rigid[0, axis] + b * rigid[1, axis] + c * rigid[2, axis]
+        return True
+    e = np.uint32(tetrahedra[element])
+    n0 = np.uint32(corners[e, 0])
+    n1 = np.uint32(corners[e, 1])
+    n2 = np.uint32(corners[e, 2])
+    n3 = np.uint32(corners[e, 3])
+    base = a * rest_index[n0, 0] + b * rest_index[n0, 1] + c * rest_index[n0, 2]
+    p = a * rest_index[n1, 0] + b * rest_index[n1, 1] + c * rest_index[n1, 2] - base
+    q = a * rest_index[n2, 0] + b * rest_index[n2, 1] + c * rest_index[n2, 2] - base
+    r = a * rest_index[n3, 0] + b * rest_index[n3, 1] + c * rest_index[n3, 2] - base
+    ux = nodes[n1, 0] - nodes[n0, 0]
+    uy = nodes[n1, 1] - nodes[n0, 1]
+    uz = nodes[n1, 2] - nodes[n0, 2]
+    vx = nodes[n2, 0] - nodes[n0, 0]
+    vy = nodes[n2, 1] - nodes[n0, 1]
+    vz = nodes[n2, 2] - nodes[n0, 2]
+    wx = nodes[n3, 0] - nodes[n0, 0]
+    wy = nodes[n3, 1] - nodes[n0, 1]
+    wz = nodes[n3, 2] - nodes[n0, 2]
+    determinant = ux * (vy * wz - vz * wy) + uy * (vz * wx - vx * wz) + uz * (vx * wy - vy * wx)
+    if abs(determinant) < _FLAT:
+        return False
+    out[0] = (
+        p * (vy * wz - vz * wy) + q * (wy * uz - wz * uy) + r * (uy * vz - uz * vy)
+    ) / determinant
+    out[1] = (
+        p * (vz * wx - vx * wz) + q * (wz * ux - wx * uz) + r * (uz * vx - ux * vz)
+    ) / determinant
+    out[2] = (
+        p * (vx * wy - vy * wx) + q * (wx * uy - wy * ux) + r * (ux * vy - uy * vx)
+    ) / determinant
+    return True
