@@ -39,6 +39,7 @@ def test_every_parameter_of_every_node_is_on_it():
     scene = load_scene("upper_arm")
     for node in NODES:
         told = keys_in(sections[node]) | keys_in(sections["scene_nodes"])
+        told |= {f"strain.{key}" for key in keys_in(sections["strain"])}
         told |= keys_in(sections["imaging"]) | keys_in(sections["probe.geometry.linear"])
         for name in SOLVERS:
             told |= {f"{name}.{key}" for key in keys_in(sections[f"tissue.settings.{name}"])}

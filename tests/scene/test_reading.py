@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from us_sim.errors import SceneError
+from us_sim.errors import SceneError, UsSimError
 from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
@@ -16,6 +16,7 @@ from us_sim.share import shared_path
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.strain.settings import Strain
 from us_sim.tissue.mesh.settings import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -388,3 +389,18 @@ def test_a_tracker_that_cannot_be_is_one_sentence(tmp_path, tracker, sentence):
     with pytest.raises(SceneError, match=sentence) as caught:
         load_scene(file)
     assert "\n" not in str(caught.value)
+
+
+def test_strain_needs_tissue():
+    bare = {
+        "name": "bare",
+        "volume": {"phantom": "upper_arm"},
+        "probe": {"aperture": 0.04, "depth": 0.04},
+    }
+    assert parse_scene(bare | {"strain": {}}).strain == Strain()
+    with pytest.raises(
+        SceneError, match="strain: needs `tissue` to be strained, and it is missing"
+    ):
+        parse_scene(bare | {"strain": {"since": "image"}})
+    with pytest.raises(UsSimError, match=r"strain\.interval: 0 is outside 1 to 60"):
+        parse_scene(bare | {"strain": {"interval": 0}})

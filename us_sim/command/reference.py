@@ -172,7 +172,8 @@ def _nodes() -> Iterator[Section]:
             if each is Imaging:
                 text.append(
                     f"The keys of [imaging](#imaging), and of the [probe](#probe) its "
-                    f"{_of_probe()}, while running. Their defaults are the scene's."
+                    f"{_of_probe()}, while running; where there is tissue `strain.KEY` for every "
+                    f"key of [strain](#strain). Their defaults are the scene's."
                 )
             elif each is not SceneNodeSettings:
                 about = first_sentence(each)

@@ -14,7 +14,7 @@ from us_sim.settings.setting import Settings, setting
 
 __all__ = ["OVERLAYS", "AnnotatedImageSettings", "PoseAgeSettings"]
 
-OVERLAYS = ("strain", "none")
+OVERLAYS = ("strain", "strain_estimate", "none")
 """Colours over the annotated image, by the names of the streams that they are of."""
 
 _AGE = Quantity("time", 0.01, 3600.0)

@@ -21,6 +21,7 @@ from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_
 from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.strain.settings import Strain
 from us_sim.volume.reconstruction.live import LiveBox, LiveVolume
 
 __all__ = [
@@ -332,6 +333,8 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
         return
     if node == "slice_interpolator":
         yield "", type(probe_of(scene))
+        if scene.tissue is not None:
+            yield "strain.", Strain
     if node == "tissue_deformer" and scene.tissue is not None:
         for solver in SOLVERS.importable:
             yield f"{solver}.", SOLVERS.settings(solver)

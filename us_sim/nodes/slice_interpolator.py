@@ -58,6 +58,7 @@ class SliceInterpolator(SceneNode):
         self._tetrahedra: Any = None
         self._carried = False
         self._poses: dict[int, Pose] = {}
+        self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
         self._streams = frame_streams(self, volume)
         for stream in self._streams:
@@ -146,17 +147,19 @@ class SliceInterpolator(SceneNode):
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
     ) -> None:
         """Make and publish what is wanted at ``pose``, under the stamp of what it is made from."""
+        self._number += 1
         wanted = [stream for stream in self._streams if stream.is_wanted]
         if not (wanted or self._annotated.is_wanted):
             return
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
-        frame = self._scanner.frame(pose, nodes)
+        frame = self._scanner.frame(pose, nodes, self._number)
+        self.health.values = {}  # what streams say is of this frame
         for stream in wanted:
             stream.show(frame, stamp)
         self._annotated.show(frame, stamp)
         self.health.state = "imaging"
-        self.health.values = {
+        self.health.values |= {
             "probe_pose": self._annotated.state,
             "skipped_tetrahedra": str(self._scanner.skipped),
         }

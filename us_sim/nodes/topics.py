@@ -229,6 +229,22 @@ TOPICS = (
         on_demand=True,
     ),
     Topic(
+        "ultrasound/strain",
+        "sensor_msgs/Image",
+        "`32FC1`: the tissue's strain along each pixel's beam, negative where it got shorter; NaN "
+        "where there is no tissue",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/strain_estimate",
+        "sensor_msgs/Image",
+        "`32FC1`: the same between two images, estimated from these alone; NaN where nothing was "
+        "found again",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
         "ultrasound/image_to_probe",
         "std_msgs/Float64MultiArray",
         "4 × 4, from (column, row, 0, 1) of a pixel to metres in frame `probe`",

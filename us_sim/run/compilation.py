@@ -48,6 +48,7 @@ def parts() -> Iterator[Part]:
     yield "skin", _use_skin
     for method in SLICERS:
         yield method, partial(_make_image, method)
+    yield "strain", _strain
     yield "camera", _track_marker
     yield "reconstruction", _reconstruct
 
@@ -111,6 +112,12 @@ def _make_image(method: str) -> None:
     )
     BMode(volume, probe, method=method).prepare(probe, Imaging(gain=3.0))
     BMode(volume, probe, imaging, method=method).prepare(probe, imaging)
+
+
+def _strain() -> None:
+    from us_sim.slicing.strain.warm_up import warm_up
+
+    warm_up()
 
 
 def _track_marker() -> None:

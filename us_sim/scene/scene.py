@@ -20,6 +20,7 @@ from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.strain.settings import Strain
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.settings import MeshSettings
 from us_sim.tracking.filter.settings import GateSettings
@@ -192,6 +193,9 @@ class Scene(Settings):
         description="how the image is cut", choice=SLICERS, default=Chosen("scan_conversion")
     )
     imaging: Imaging = setting(description="how echoes become grey values", default=Imaging())
+    strain: Strain = setting(
+        description="strain images, where there is tissue and somebody subscribes", default=Strain()
+    )
     tracker: TrackerSettings = setting(
         description="where poses come from", default=TrackerSettings()
     )
@@ -215,6 +219,8 @@ class Scene(Settings):
                 )
         if self.structures and self.tissue is None:
             raise self.refused("structures", "need `tissue` to carry them, and it is missing")
+        if self.strain != Strain() and self.tissue is None:
+            raise self.refused("strain", "needs `tissue` to be strained, and it is missing")
 
     def parts(self) -> list[Part]:
         """Every simulation node with the reason why it runs or is left out."""

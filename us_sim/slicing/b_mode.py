@@ -143,16 +143,24 @@ class BMode:
         if self._acoustics is not None:
             self._acoustics.carry(*self._mesh)
 
-    def frame(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> Frame:
+    def frame(self, pose: Pose, nodes: NDArray[np.float64] | None = None, number: int = 0) -> Frame:
         """What is seen with the probe at ``pose``, as it is asked for.
 
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
+            number: of the poses so far.
         """
-        form = partial(self._form, self._formation, self._acoustics)
         return Frame(
-            pose, nodes, self._probe, self._volume, self._slicer, form, threads=self._threads
+            pose,
+            nodes,
+            self._probe,
+            self._volume,
+            self._slicer,
+            partial(self._form, self._formation, self._acoustics),
+            mesh=self._mesh if nodes is not None else None,
+            number=number,
+            threads=self._threads,
         )
 
     def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:

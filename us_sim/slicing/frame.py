@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Frame"]
 
+Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
+
 
 class Frame:
     """What one image shows, and what is known of its pixels.
@@ -50,6 +52,8 @@ class Frame:
         volume: in frame ``patient``.
         slicer: of the mesh; needed where there are nodes.
         form: makes the picture of the frame.
+        mesh: rest nodes (N, 3) m and tetrahedra (M, 4) that carry the volume; None without nodes.
+        number: of the poses so far; frames with successive numbers follow one another.
         threads: number of threads.
     """
 
@@ -62,6 +66,8 @@ class Frame:
         slicer: Slicer | None,
         form: Callable[[Frame], NDArray[np.uint8]],
         *,
+        mesh: Mesh | None = None,
+        number: int = 0,
         threads: int = 1,
     ) -> None:
         self.pose = pose
@@ -70,6 +76,8 @@ class Frame:
         self.volume = volume
         self._slicer = slicer if nodes is not None else None
         self._form = form
+        self.mesh = mesh
+        self.number = number
         self.threads = threads
         self._cut = 0  # of the slicer, on this frame's plane
 

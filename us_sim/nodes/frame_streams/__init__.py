@@ -22,6 +22,7 @@ def frame_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
         streams.append(LabelStream(node))
     if node.scene.tissue is not None:
         from us_sim.nodes.frame_streams.displacement_stream import DisplacementStream
+        from us_sim.nodes.frame_streams.strain_streams import strain_streams
 
-        streams.append(DisplacementStream(node))
+        streams += [DisplacementStream(node), *strain_streams(node)]
     return streams

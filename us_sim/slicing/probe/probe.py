@@ -207,6 +207,17 @@ class Probe(Settings, ABC):
         return _kept(beams)
 
     @cached_property
+    def pixel_directions(self) -> NDArray[np.float32]:
+        """(2, rows, columns): x and z of the unit direction of the beam through each pixel.
+
+        NaN where no beam reaches.
+        """
+        part = (self.pixel_beams[0].ravel() + 0.5) / self.lines
+        directions = self._rays(part.astype(np.float64))[1]
+        directions[np.isnan(part)] = np.nan
+        return _kept(directions.T.reshape(2, self.rows, self.columns).astype(np.float32))
+
+    @cached_property
     def beam_pixels(self) -> NDArray[np.float32]:
         """(2, samples, lines): the column and row, fractional, of each sample of each beam."""
         lateral, axial = self.pixel_spacing

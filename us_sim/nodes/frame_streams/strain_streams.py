@@ -1,0 +1,131 @@
+"""Strain along the beams: the tissue's own, and an estimate made of two images."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+
+from us_sim.nodes.conversions import field_message
+from us_sim.nodes.frame_streams.stream import FrameStream
+from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.slicing.drawing.overlay import Overlay
+from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.strain.axial_strain import AxialStrain
+from us_sim.slicing.strain.colours import strain_scale
+from us_sim.slicing.strain.compression import compression
+from us_sim.slicing.strain.earlier import Earlier
+from us_sim.slicing.strain.estimate import Estimate, estimate_strain
+from us_sim.slicing.strain.settings import Strain
+from us_sim.slicing.strain.warm_up import warm_up
+
+__all__ = ["StrainEstimateStream", "StrainStream", "strain_streams"]
+
+
+def strain_streams(node: SceneNode) -> list[FrameStream]:
+    """Both, with the scene's settings as parameters ``strain.…`` that may change while running."""
+    parameters = LiveSettings(node, {"strain": Group(node.scene.strain, prefix="strain.")})
+    return [StrainStream(node, parameters), StrainEstimateStream(node, parameters)]
+
+
+class _StrainImages(FrameStream):
+    """What both have in common: values as a message, or as colours with a note."""
+
+    def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
+        super().__init__(node)
+        self._parameters = parameters
+        self._latest: tuple[Frame, Strain, NDArray[np.float32] | None] | None = None
+
+    @property
+    def _settings(self) -> Strain:
+        settings: Strain = self._parameters.values["strain"]
+        return settings
+
+    def _message(self, frame: Frame, stamp: Time) -> Image | None:
+        values = self._of(frame)
+        return None if values is None else field_message(values, stamp, "probe")
+
+    def overlay(self, frame: Frame) -> Overlay | None:
+        """The strain in colours, and what the compression is like."""
+        values = self._of(frame)
+        if values is None:
+            return None
+        scale = strain_scale(self.overlay_name, self._settings.colours)
+        return Overlay(values, scale, note=self._note(values))
+
+    def _of(self, frame: Frame) -> NDArray[np.float32] | None:
+        """The strain of a frame, once; None where there is nothing to compare it with."""
+        settings = self._settings
+        if self._latest is None or self._latest[:2] != (frame, settings):
+            self._latest = frame, settings, self._made(frame, settings)
+        return self._latest[2]
+
+    @abstractmethod
+    def _made(self, frame: Frame, settings: Strain) -> NDArray[np.float32] | None:
+        """The strain of a frame."""
+
+    @abstractmethod
+    def _note(self, values: NDArray[np.float32]) -> str:
+        """A line about it."""
+
+
+class StrainStream(_StrainImages):
+    """``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
+
+    topic = "ultrasound/strain"
+    overlay_name = "strain"
+
+    def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
+        super().__init__(node, parameters)
+        self._strain: AxialStrain | None = None
+        self._mesh: object = None
+        self._earlier = Earlier(lambda frame: frame.nodes)
+
+    def prepare(self, probe: Probe) -> None:
+        """Compile what strain needs, or load it."""
+        super().prepare(probe)
+        warm_up()
+
+    def _made(self, frame: Frame, settings: Strain) -> NDArray[np.float32] | None:
+        before = self._earlier.before(frame, settings.interval)
+        if settings.since == "image" and before is None:
+            return None
+        if self._strain is None or self._mesh is not frame.mesh:
+            self._mesh, self._strain = frame.mesh, AxialStrain.of(frame)
+        return self._strain.image(frame, before if settings.since == "image" else None)
+
+    def _note(self, values: NDArray[np.float32]) -> str:
+        pressed = compression(values)
+        mean, quality = f"{100 * pressed.mean:.2g} %", f"{pressed.quality:.2f}"
+        self._node.health.values |= {"strain_mean": mean, "compression_quality": quality}
+        return f"mean {mean}, even {quality}"
+
+
+class StrainEstimateStream(_StrainImages):
+    """``ultrasound/strain_estimate``: between two images, from what they show alone."""
+
+    topic = "ultrasound/strain_estimate"
+    overlay_name = "strain_estimate"
+
+    def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
+        super().__init__(node, parameters)
+        self._earlier = Earlier(lambda frame: frame.pixels)
+        self._correlation = 0.0
+
+    def _made(self, frame: Frame, settings: Strain) -> NDArray[np.float32] | None:
+        before = self._earlier.before(frame, settings.interval)
+        if before is None:
+            return None
+        found: Estimate = estimate_strain(before, frame.pixels, frame.probe, settings)
+        self._correlation = found.correlation
+        return found.strain
+
+    def _note(self, values: NDArray[np.float32]) -> str:
+        mean, found = f"{100 * compression(values).mean:.2g} %", f"{self._correlation:.2f}"
+        self._node.health.values |= {"strain_estimate_mean": mean, "strain_correlation": found}
+        return f"mean {mean}, found {found}"
