@@ -85,7 +85,7 @@ def test_a_shift_of_all_is_found_to_a_fraction_of_a_sample(shift, seed):
     whole = correlation > 0.0
     assert whole.mean() > 0.7
     np.testing.assert_allclose(np.median(moved[whole]), shift, atol=0.02)
-    assert np.abs(moved[whole] - shift).max() < 0.3
+    assert np.percentile(np.abs(moved[whole] - shift), 95) < 0.1
     assert correlation[whole].min() > 0.9
 
 
