@@ -503,6 +503,23 @@ def test_a_live_frame_that_is_far_from_balance_may_take_three_times_its_time(
     assert rest <= 0.03
 
 
+@pytest.mark.parametrize(("live", "anew"), [(0.0141, True), (None, False)])
+def test_tissue_inside_out_is_begun_anew_at_once_only_where_time_is_short(
+    nearly_incompressible, monkeypatch, live, anew
+):
+    solver = made_anew(nearly_incompressible)
+    solver.frame_limit = live
+    upright = solver.deform(at(z=0.005)).nodes
+    with monkeypatch.context() as patched:
+        patched.setattr(solver._newton.tissue, "smallest_volume_ratio", lambda _: -0.1)
+        shown = solver.deform(at(z=0.008))
+    np.testing.assert_array_equal(shown.nodes, upright)
+    assert "the last upright state is shown" in shown.action
+    assert ("begun anew from rest" in shown.action) == anew
+    solver.frame_limit = None
+    assert solver.deform(at(z=0.01)).residual < 0.01
+
+
 def test_a_single_tetrahedron_with_one_free_corner():
     nodes = np.array([[0.05, 0, 0.1], [-0.05, 0.05, 0.1], [-0.05, -0.05, 0.1], [0, 0, 0.0]])
     mesh = TetrahedralMesh(nodes, np.array([[0, 2, 1, 3]]))

@@ -82,7 +82,8 @@ _LOOSE, _STEPS = 0.2, 5
 """Residual with which a stride ends, and the most steps that it may take."""
 
 _PATIENCE = 10
-"""Frames in a row that may end inside out before the tissue is begun anew from rest."""
+"""Frames in a row that may end inside out before the tissue is begun anew from rest. None where
+time is short and the probe moves on: what is shown would stay behind ever farther."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ class FemNonlinear(TissueSolver):
         if stuck:
             actions.append(f"no step led any further: {self._obstacle()}")
         self._settled = stuck
-        return self._outcome(pose, shifted, actions)
+        return self._outcome(pose, shifted, actions, 0 if hurried else _PATIENCE)
 
     def _reference(self) -> float:
         """N, what unbalanced forces are measured by."""
@@ -361,7 +362,9 @@ class FemNonlinear(TissueSolver):
             "of its volume"
         )
 
-    def _outcome(self, pose: Pose | None, shifted: float, actions: list[str]) -> Deformation:
+    def _outcome(
+        self, pose: Pose | None, shifted: float, actions: list[str], patience: int
+    ) -> Deformation:
         newton, contact = self._newton, self._newton.contact
         reached = newton.displacement
         if newton.tissue.smallest_volume_ratio(reached) > 0.0:
@@ -386,7 +389,7 @@ class FemNonlinear(TissueSolver):
         if self._inverted == 0:
             balanced = residual <= self.settings.tolerance and shifted <= self._sunk
             self._settled = self._has_relaxed and (self._settled or balanced)
-        elif self._inverted > _PATIENCE:
+        elif self._inverted > patience:
             actions.append("begun anew from rest")
             self._restore(TissueState.at_rest(len(nodes)))
         else:
