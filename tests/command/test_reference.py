@@ -45,6 +45,10 @@ def test_every_parameter_of_every_node_is_on_it():
             told |= {f"{name}.{key}" for key in keys_in(sections[f"tissue.settings.{name}"])}
         material = keys_in(sections["tissue.materials.NAME"])
         told |= {f"materials.{label}.{key}" for label in scene.tissue.materials for key in material}
+        for name in ("colour", "spectrum", "m_mode"):
+            told |= {f"{name}.{key}" for key in keys_in(sections[name])}
+        flow = keys_in(sections["structures.NAME.flow"])
+        told |= {f"flow.{name}.{key}" for name in scene.flows for key in flow}
         for prefix, settings in parameters_of(node, scene):
             assert {prefix + name for name in rules_of(settings)} <= told
 

@@ -59,6 +59,7 @@ class Reds:
     """Red over the right half, half opaque."""
 
     overlay_name = "strain"
+    is_wanted = False
 
     def overlay(self, frame):
         values = np.full(frame.pixels.shape, np.nan)

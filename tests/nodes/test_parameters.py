@@ -23,9 +23,13 @@ BAG = shared_path("bags/press_and_slide.mcap")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory, small_scene):
-    """The small scene, with structures and a haptic arm, so that every node can be."""
+    """The small scene, with blood in a vein and a haptic arm, so that every node can be."""
     file = tmp_path_factory.mktemp("scene") / "all.yaml"
-    file.write_text(f"based_on: {small_scene}\nstructures: [vein]\ntracker: {{source: haptic}}\n")
+    file.write_text(
+        f"based_on: {small_scene}\ntracker: {{source: haptic}}\n"
+        "structures: {vein: {flow: {kind: venous, direction: [0, 1, 0], peak_velocity: 0.2, "
+        "mean_velocity: 0.07}}}\n"
+    )
     return file
 
 
@@ -120,7 +124,7 @@ def test_what_may_change_is_taken_in_its_range_and_refused_outside(bench, scene,
                 least = low if kind == kinds_of(settings)[field] else min(low, 0)  # 0 is none
                 assert f"Min: {kind(least)}" in refused.reason
         elif quantity is not None:  # a list of numbers
-            refused = attempt(node, parameter, [quantity.maximum + 1.0])
+            refused = attempt(node, parameter, [quantity.maximum + 1.0] * len(before))
             assert not refused.successful
             assert f"is outside {quantity.minimum:g} to {quantity.maximum:g}" in refused.reason
         elif rule.choice or rule.choices:

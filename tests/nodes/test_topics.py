@@ -35,14 +35,15 @@ TRACKER_KEYS = {
 
 @pytest.fixture
 def scenes(tmp_path, small_scene):
-    """The small scene with structures, for each source of poses."""
+    """The small scene with a vein and its flow, for each source of poses."""
 
     def scene(source):
         file = tmp_path / f"{source}.yaml"
         keys = TRACKER_KEYS.get(source)
         file.write_text(
             small_scene.read_text()
-            + "structures: [vein]\n"
+            + "structures: {vein: {flow: {kind: venous, direction: [0, 1, 0], "
+            + "peak_velocity: 0.2, mean_velocity: 0.07}}}\n"
             + f"tracker: {{source: {source}{', ' + keys if keys else ''}}}\n"
         )
         return str(file)

@@ -32,7 +32,9 @@ probe:
 tissue:
   mesh: {lower: [-20 mm, -20 mm, 0], upper: [20 mm, 20 mm, 40 mm], nodes: [3, 4, 5]}
   materials: {muscle: {young_modulus: 12 kPa}}
-structures: {vein: {}}
+structures:
+  vein: {}
+  artery: {flow: {kind: venous, direction: [0, 1, 0], peak_velocity: 0.3, mean_velocity: 0.1}}
 skin: {}
 """
 )

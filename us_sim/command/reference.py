@@ -178,6 +178,14 @@ def _nodes() -> Iterator[Section]:
             elif each is not SceneNodeSettings:
                 about = first_sentence(each)
                 text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
+        if node == "slice_interpolator":
+            text.append(
+                "`m_mode.KEY` for every key of [m_mode](#m_mode), and where the scene names a "
+                "flow `colour.KEY` and `spectrum.KEY` for those of [colour](#colour) and "
+                "[spectrum](#spectrum), and `flow.STRUCTURE.KEY`, such as `flow.vein.heart_rate`, "
+                "for those of [structures.NAME.flow](#structuresnameflow), while running. Their "
+                "defaults are the scene's."
+            )
         if node == "tissue_deformer":
             text.append(
                 "`SOLVER.KEY` for every key of every solver, such as `fem_cg.iterations`, see "

@@ -57,6 +57,7 @@ class AnnotatedImage:
         streams: Sequence[FrameStream] = (),
     ) -> None:
         self._node = node
+        self._streams = streams
         self._overlays = {each.overlay_name: each for each in streams if each.overlay_name}
         self._settings = LiveSettings(
             node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
@@ -165,7 +166,8 @@ class AnnotatedImage:
             image = frame.pixels
             self._outline(frame)
             overlay = self._overlay(frame)
-        picture = self._annotation.draw(image, self._labels, badge, overlay)
+        lines = [line for each in self._streams if each.is_wanted for line in each.lines]
+        picture = self._annotation.draw(image, self._labels, badge, overlay, lines)
         self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
         self._node.health.published("ultrasound/image_annotated")
 

@@ -7,14 +7,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+from us_sim.scene.building import probe_of
+from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["OVERLAYS", "AnnotatedImageSettings", "PoseAgeSettings"]
+__all__ = ["OVERLAYS", "AnnotatedImageSettings", "PoseAgeSettings", "image_parameters"]
 
-OVERLAYS = ("strain", "strain_estimate", "none")
+OVERLAYS = ("strain", "strain_estimate", "velocity", "none")
 """Colours over the annotated image, by the names of the streams that they are of."""
 
 _AGE = Quantity("time", 0.01, 3600.0)
@@ -45,3 +48,16 @@ class AnnotatedImageSettings(Settings):
         choices=OVERLAYS,
         default="none",
     )
+
+
+def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
+    """Settings of a scene that are parameters, too, each with what goes before their names."""
+    yield "", type(probe_of(scene))
+    yield "m_mode.", type(scene.m_mode)
+    if scene.tissue is not None:
+        yield "strain.", type(scene.strain)
+    if scene.flows:
+        yield "colour.", type(scene.colour)
+        yield "spectrum.", type(scene.spectrum)
+    for name, flow in scene.flows.items():
+        yield f"flow.{name}.", type(flow)

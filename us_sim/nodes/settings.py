@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from us_sim.errors import SettingsError, UsSimError
-from us_sim.nodes.image_settings import AnnotatedImageSettings, PoseAgeSettings
-from us_sim.scene.building import probe_of
+from us_sim.nodes.image_settings import (
+    AnnotatedImageSettings,
+    PoseAgeSettings,
+    image_parameters,
+)
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS, TRACKERS
@@ -21,7 +24,6 @@ from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_
 from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.strain.settings import Strain
 from us_sim.volume.reconstruction.live import LiveBox, LiveVolume
 
 __all__ = [
@@ -332,9 +334,7 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
     if scene is None:
         return
     if node == "slice_interpolator":
-        yield "", type(probe_of(scene))
-        if scene.tissue is not None:
-            yield "strain.", Strain
+        yield from image_parameters(scene)
     if node == "tissue_deformer" and scene.tissue is not None:
         for solver in SOLVERS.importable:
             yield f"{solver}.", SOLVERS.settings(solver)

@@ -153,7 +153,8 @@ class SliceInterpolator(SceneNode):
             return
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
-        frame = self._scanner.frame(pose, nodes, self._number)
+        time = 1e-9 * nanoseconds_of(stamp)
+        frame = self._scanner.frame(pose, nodes, number=self._number, time=time)
         self.health.values = {}  # what streams say is of this frame
         for stream in wanted:
             stream.show(frame, stamp)

@@ -245,6 +245,37 @@ TOPICS = (
         on_demand=True,
     ),
     Topic(
+        "ultrasound/velocity",
+        "sensor_msgs/Image",
+        "`32FC1`: velocity of blood along the beams of colour Doppler, m/s, towards the probe "
+        "positive, exact; NaN where none flows; where the scene names a `flow`",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/velocity_estimate",
+        "sensor_msgs/Image",
+        "`32FC1`: the same in the colour box as a scanner estimates it, aliased and noisy; NaN "
+        "where no colour is shown",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/spectrum",
+        "sensor_msgs/Image",
+        "`rgb8`, for the eye: velocities at the gate of pulsed-wave Doppler over time, in cm/s; "
+        "where the scene names a `flow`",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
+        "ultrasound/m_mode",
+        "sensor_msgs/Image",
+        "`rgb8`, for the eye: the image's echoes along a line over time",
+        publishers=("slice_interpolator",),
+        on_demand=True,
+    ),
+    Topic(
         "ultrasound/image_to_probe",
         "std_msgs/Float64MultiArray",
         "4 × 4, from (column, row, 0, 1) of a pixel to metres in frame `probe`",

@@ -49,6 +49,7 @@ def parts() -> Iterator[Part]:
     for method in SLICERS:
         yield method, partial(_make_image, method)
     yield "strain", _strain
+    yield "blood", _show_blood
     yield "camera", _track_marker
     yield "reconstruction", _reconstruct
 
@@ -90,6 +91,12 @@ def _use_skin() -> None:
     from us_sim.skin.surface import plane_surface
 
     SkinMembrane(plane_surface((0.04, 0.04), 0.01), Sphere(0.03)).warm_up()
+
+
+def _show_blood() -> None:
+    from us_sim.slicing.flow.warm_up import warm_up
+
+    warm_up()
 
 
 def _make_image(method: str) -> None:

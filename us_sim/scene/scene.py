@@ -19,7 +19,11 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
+from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.flow.settings import FlowSettings
+from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.strain.settings import Strain
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.settings import MeshSettings
@@ -74,7 +78,7 @@ class StructureSettings(Settings):
 
     section = "structures"
     error = SceneError
-    alternatives = MappingProxyType({"file": ("unit", "pose"), "label": ()})
+    alternatives = MappingProxyType({"file": ("unit", "pose"), "label": ("flow",)})
 
     label: str | None = setting(
         description="of the volume; not given: the structure's own name", default=None
@@ -87,9 +91,16 @@ class StructureSettings(Settings):
     colour: tuple[float, float, float] | None = setting(
         Quantity("number", 0.0, 1.0), "red, green, blue", default=None
     )
+    flow: FlowSettings | None = setting(
+        description="of the blood in the label, which must be a tube", default=None
+    )
 
     def check(self) -> None:
         """A label or a file."""
+        if self.file and self.flow:
+            raise self.refused(
+                "flow", "is for structures around a label, in which there is room for blood"
+            )
         if self.file and self.label:
             raise self.refused("", "has both `file` and `label`; keep one")
         if not self.file and (self.unit != 1.0 or self.pose != Placement()):
@@ -196,6 +207,15 @@ class Scene(Settings):
     strain: Strain = setting(
         description="strain images, where there is tissue and somebody subscribes", default=Strain()
     )
+    colour: ColourSettings = setting(
+        description="the box of colour Doppler, where a structure has a flow",
+        default=ColourSettings(),
+    )
+    spectrum: SpectrumSettings = setting(
+        description="the gate of pulsed-wave Doppler, where a structure has a flow",
+        default=SpectrumSettings(),
+    )
+    m_mode: MModeSettings = setting(description="the line of M-mode", default=MModeSettings())
     tracker: TrackerSettings = setting(
         description="where poses come from", default=TrackerSettings()
     )
@@ -233,6 +253,11 @@ class Scene(Settings):
         ]
 
     @property
+    def flows(self) -> dict[str, FlowSettings]:
+        """Of the blood in structures, by their names."""
+        return {name: given.flow for name, given in self.structures.items() if given.flow}
+
+    @property
     def ready_topics(self) -> list[str]:
         """Topics that are published once all of the scene's nodes are ready."""
         topics = ["probe/pose", "ultrasound/image"]
@@ -253,7 +278,8 @@ class Scene(Settings):
             if getattr(self.imaging, entry.name) != entry.default
         ]
         formed = f"formed with {', '.join(asked)}" if asked else "shown as they are cut"
-        return f"{self.probe.geometry} images are cut by `{self.slice.name}`, {formed}"
+        blood = f", with blood in {', '.join(self.flows)}" if self.flows else ""
+        return f"{self.probe.geometry} images are cut by `{self.slice.name}`, {formed}{blood}"
 
     def solver_settings(self, name: str) -> Any:
         """What the scene says of a solver, or None."""

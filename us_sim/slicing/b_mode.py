@@ -143,13 +143,21 @@ class BMode:
         if self._acoustics is not None:
             self._acoustics.carry(*self._mesh)
 
-    def frame(self, pose: Pose, nodes: NDArray[np.float64] | None = None, number: int = 0) -> Frame:
+    def frame(
+        self,
+        pose: Pose,
+        nodes: NDArray[np.float64] | None = None,
+        *,
+        number: int = 0,
+        time: float = 0.0,
+    ) -> Frame:
         """What is seen with the probe at ``pose``, as it is asked for.
 
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
             number: of the poses so far.
+            time: s since 1970, of the pose.
         """
         return Frame(
             pose,
@@ -160,6 +168,7 @@ class BMode:
             partial(self._form, self._formation, self._acoustics),
             mesh=self._mesh if nodes is not None else None,
             number=number,
+            time=time,
             threads=self._threads,
         )
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from us_sim.slicing.cutting.slicer import Slicer
     from us_sim.volume.volume import Volume
 
-__all__ = ["Frame"]
+__all__ = ["Frame", "Mesh"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 
@@ -54,6 +54,7 @@ class Frame:
         form: makes the picture of the frame.
         mesh: rest nodes (N, 3) m and tetrahedra (M, 4) that carry the volume; None without nodes.
         number: of the poses so far; frames with successive numbers follow one another.
+        time: s since 1970, of the pose; what moves by itself, as blood does, moves with it.
         threads: number of threads.
     """
 
@@ -68,6 +69,7 @@ class Frame:
         *,
         mesh: Mesh | None = None,
         number: int = 0,
+        time: float = 0.0,
         threads: int = 1,
     ) -> None:
         self.pose = pose
@@ -78,6 +80,7 @@ class Frame:
         self._form = form
         self.mesh = mesh
         self.number = number
+        self.time = time
         self.threads = threads
         self._cut = 0  # of the slicer, on this frame's plane
 

@@ -6,6 +6,7 @@ Only those are there that a scene and its volume can provide.
 from __future__ import annotations
 
 from us_sim.nodes.frame_streams.b_mode_stream import BModeStream
+from us_sim.nodes.frame_streams.m_mode_stream import MModeStream
 from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.volume.volume import Volume
@@ -25,4 +26,8 @@ def frame_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
         from us_sim.nodes.frame_streams.strain_streams import strain_streams
 
         streams += [DisplacementStream(node), *strain_streams(node)]
-    return streams
+    if node.scene.flows:
+        from us_sim.nodes.frame_streams.doppler_streams import doppler_streams
+
+        streams += doppler_streams(node, volume)
+    return [*streams, MModeStream(node)]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from us_sim.nodes.scene_node import SceneNode
@@ -58,6 +61,11 @@ class FrameStream(ABC):
     @abstractmethod
     def _message(self, frame: Frame, stamp: Time) -> Image | None:
         """What is sent of a frame; None where it has nothing to send."""
+
+    @property
+    def lines(self) -> Sequence[NDArray[np.float64]]:
+        """Lines (N, 2), column and row, that show in the annotated image where it looks."""
+        return ()
 
     def overlay(self, frame: Frame) -> Overlay | None:
         """The colours that it lays over the frame's picture; None where it has none."""

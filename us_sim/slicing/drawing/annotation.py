@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -82,6 +82,7 @@ class Annotation:
         labels: NDArray[np.uint8] | None = None,
         badge: Badge | None = None,
         overlay: Overlay | None = None,
+        lines: Sequence[NDArray[np.floating]] = (),
     ) -> NDArray[np.uint8]:
         """A new (rows, columns, 3) picture of red, green and blue.
 
@@ -90,6 +91,7 @@ class Annotation:
             labels: (rows, columns), where outlines are wanted.
             badge: for an image that is not live.
             overlay: colours over the grey, below all else, and their bar.
+            lines: (N, 2) column and row, such as a gate's.
         """
         picture = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
         bar = None
@@ -97,8 +99,11 @@ class Annotation:
             overlay.lay_over(picture)
             bar = ColourBar(overlay.scale, self._text, overlay.note)
             if overlay.outline is not None:
-                corners = np.rint(overlay.outline * (1 << _FINE)).astype(np.int32)
+                corners = _fine(overlay.outline)
                 cv2.polylines(picture, [corners], True, _SCALE, self._line, cv2.LINE_AA, _FINE)
+        drawn = [_fine(line) for line in lines]
+        cv2.polylines(picture, drawn, False, _SHADOW, self._line + 2, cv2.LINE_AA, _FINE)
+        cv2.polylines(picture, drawn, False, _FOCUS, self._line, cv2.LINE_AA, _FINE)
         if labels is not None:
             self._outline(picture, labels, [bar.box] if bar else [])
         if bar is not None:
@@ -176,7 +181,7 @@ class Annotation:
             outlines = label_outlines(labels, number, smoothing=self._text / 2.5)
             if not outlines:
                 continue
-            chains = [np.rint(outline * (1 << _FINE)).astype(np.int32) for outline in outlines]
+            chains = [_fine(outline) for outline in outlines]
             cv2.polylines(picture, chains, True, colour, self._line, cv2.LINE_AA, _FINE)
             left, top = np.floor(outlines[0].min(axis=0)).astype(int).tolist()
             right, bottom = np.ceil(outlines[0].max(axis=0)).astype(int).tolist()
@@ -215,6 +220,11 @@ class Annotation:
                 break
         picture[:width] = picture[-width:] = badge.colour
         picture[:, :width] = picture[:, -width:] = badge.colour
+
+
+def _fine(line: NDArray[np.floating]) -> NDArray[np.int32]:
+    """Column and row (N, 2) as OpenCV takes them with fractions of pixels."""
+    return np.rint(line * (1 << _FINE)).astype(np.int32)
 
 
 def _bright(colour: tuple[float, float, float]) -> Colour:

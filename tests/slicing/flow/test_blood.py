@@ -1,0 +1,198 @@
+"""Velocities in images: Poiseuille's rate through a plane, the angle's cosine, continuity."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tubes import ARTERY, RADIUS, SIDES, VEIN, block, tube_vessel, tube_volume
+
+from us_sim.errors import SceneError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.flow.blood import Blood, Window
+from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
+from us_sim.slicing.probe.probe import LinearProbe
+
+PROBE = LinearProbe(aperture=0.018, depth=0.025, columns=180, rows=250)
+LOWERED = -2e-3  # m, so that a tilted plane begins above the volume
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return tube_volume()
+
+
+@pytest.fixture(scope="module")
+def scanner(volume):
+    made = BMode(volume, PROBE)
+    made.carry(block().nodes, block().tetrahedra)
+    return made
+
+
+@pytest.fixture(scope="module")
+def vein(volume):
+    return tube_vessel(VEIN, volume)
+
+
+@pytest.fixture(scope="module")
+def artery(volume):
+    return tube_vessel(ARTERY, volume)
+
+
+def tilted(degrees, y=0.0):
+    """Upright over the tube, turned about the array, so that beams lean along it."""
+    half = np.radians(degrees) / 2
+    middle = 0.5 * SIDES[2] - LOWERED
+    return Pose([0.0, y + middle * np.tan(np.radians(degrees)), LOWERED],
+                [np.sin(half), 0.0, 0.0, np.cos(half)])  # fmt: skip
+
+
+def beams(probe=PROBE):
+    """All pixels, seen along beams that are not steered."""
+    return Window(probe, np.zeros((probe.rows, probe.columns)))
+
+
+def flow_through(frame, velocity, along):
+    """m³/s through the image's plane, of velocities along its beams and a known direction."""
+    rotation = frame.pose.rotation
+    speed = velocity / -(rotation[:, 2] @ along)
+    pixel = np.prod(frame.probe.pixel_spacing)
+    return np.nansum(speed) * (rotation[:, 1] @ along) * pixel
+
+
+@pytest.mark.parametrize("degrees", [10, 20, 40, -30])
+@pytest.mark.parametrize("squeezed", [1.0, 0.6])
+def test_the_rate_through_a_plane_is_that_of_poiseuille(scanner, artery, degrees, squeezed):
+    blood = Blood([artery])
+    nodes = block().nodes * [1.0, 1.0, squeezed] + [0.0, 0.0, 0.5 * SIDES[2] * (1 - squeezed)]
+    for time in (0.0, 0.2):  # at rest, and at another moment of the pulse
+        frame = scanner.frame(tilted(degrees), nodes, time=time)
+        velocity = blood.velocity(frame, beams())
+        rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
+        expected = artery.flow * float(artery.pulse(time))
+        assert rate == pytest.approx(expected, rel=0.03)
+        whole = ARTERY.mean_velocity * np.pi * RADIUS**2 * float(artery.pulse(time))
+        assert rate == pytest.approx(whole, rel=0.03)
+
+
+def test_the_profile_is_a_parabola(scanner, artery):
+    frame = scanner.frame(tilted(30), block().nodes, time=0.0)
+    velocity = Blood([artery]).mean_velocities(frame, beams())[0]
+    places = frame.plane.pixels() - [0.0, 0.0, 0.5 * SIDES[2]]
+    radial = np.hypot(places[..., 0], places[..., 2]) / RADIUS
+    expected = -2 * ARTERY.mean_velocity * (1 - radial**2) * (frame.pose.rotation[:, 2] @ [0, 1, 0])
+    inside = radial < 0.9
+    assert velocity[inside] == pytest.approx(expected[inside], abs=0.03 * np.abs(expected).max())
+    assert np.isnan(velocity[radial > 1.1]).all()
+
+
+def test_the_angle_between_beam_and_vessel_counts_by_its_cosine(scanner, artery):
+    blood, seen = Blood([artery]), {}
+    for degrees in (5, 15, 30, 45, 60):
+        frame = scanner.frame(tilted(degrees), block().nodes, time=0.0)
+        velocity, _ = blood.mean_velocities(frame, beams())
+        seen[degrees] = np.nanmax(np.abs(velocity))
+    axis = {degrees: peak / np.sin(np.radians(degrees)) for degrees, peak in seen.items()}
+    assert list(axis.values()) == pytest.approx([2 * ARTERY.mean_velocity] * 5, rel=0.02)
+    upright = scanner.frame(tilted(0), block().nodes, time=0.0)
+    across, _ = blood.mean_velocities(upright, beams())
+    assert np.nanmax(np.abs(across)) < 0.02 * 2 * ARTERY.mean_velocity
+
+
+def test_red_is_towards_the_probe(scanner, artery, vein):
+    """A probe tilted so that its beams lean along +y sees flow along +y go away."""
+    frame = scanner.frame(tilted(-30), block().nodes, time=0.1)
+    leans = frame.pose.rotation[1, 2] > 0
+    away, _ = Blood([artery]).mean_velocities(frame, beams())
+    towards, _ = Blood([vein]).mean_velocities(frame, beams())
+    assert leans == (np.nanmean(away) < 0.0) == (np.nanmean(towards) > 0.0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(squeeze=st.floats(0.45, 1.0), width=st.floats(5e-3, 12e-3), y=st.floats(-8e-3, 8e-3))
+def test_what_flows_in_at_a_narrowing_flows_out(scanner, artery, squeeze, width, y):
+    """Continuity: through every plane across the tube the same rate, wherever it is pressed."""
+    nodes = block().nodes.copy()
+    factor = 1.0 - (1.0 - squeeze) * np.exp(-0.5 * (nodes[:, 1] / width) ** 2)
+    nodes[:, 2] = 0.5 * SIDES[2] + (nodes[:, 2] - 0.5 * SIDES[2]) * factor
+    blood = Blood([artery])
+    frame = scanner.frame(tilted(15, y), nodes, time=0.0)
+    velocity, _ = blood.mean_velocities(frame, beams())
+    rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
+    assert rate == pytest.approx(artery.flow, rel=0.05)
+
+
+def test_an_artery_speeds_up_where_it_is_narrowed(scanner, artery):
+    nodes = block().nodes.copy()
+    factor = 1.0 - 0.5 * np.exp(-0.5 * (nodes[:, 1] / 5e-3) ** 2)
+    nodes[:, 2] = 0.5 * SIDES[2] + (nodes[:, 2] - 0.5 * SIDES[2]) * factor
+    blood = Blood([artery])
+    blood.at(scanner.frame(tilted(15), nodes, time=0.0))
+    speed = np.linalg.norm(artery.axis_velocity, axis=1)
+    narrow = artery.areas.argmin()
+    assert artery.areas[narrow] == pytest.approx(0.5 * artery.areas[2], rel=0.05)
+    assert speed[narrow] == pytest.approx(2.0 * speed[2], rel=0.05)
+
+
+def test_a_vein_under_a_full_press_shows_none_and_surges_when_it_is_let_go(scanner, vein):
+    blood = Blood([vein])
+    pressed = block().nodes.copy()
+    pressed[:, 2] = 0.5 * SIDES[2] + 0.2 * (pressed[:, 2] - 0.5 * SIDES[2])
+    blood.at(scanner.frame(tilted(30), block().nodes, time=0.0))
+    at_rest = vein.flow
+    for time in (1.0, 5.0, 20.0):
+        frame = scanner.frame(tilted(30), pressed, time=time)
+        velocity = blood.velocity(frame, beams())
+        assert np.nanmax(np.abs(velocity)) == 0.0
+    frame = scanner.frame(tilted(30), block().nodes, time=20.1)
+    assert np.nanmax(np.abs(blood.velocity(frame, beams()))) > 0.0
+    assert vein.flow > 2.5 * at_rest
+
+
+def test_all_that_ask_for_a_frame_get_the_same_and_it_is_made_once(scanner, vein):
+    blood = Blood([vein])
+    frame = scanner.frame(tilted(30), block().nodes, time=3.0)
+    first = blood.velocity(frame, beams())
+    flow = vein.flow
+    assert np.array_equal(first, blood.velocity(frame, beams()), equal_nan=True)
+    assert vein.flow == flow
+
+
+def test_without_tissue_it_flows_as_at_rest(volume, vein):
+    frame = BMode(volume, PROBE).frame(tilted(30), None, time=0.0)
+    velocity, which = Blood([vein]).mean_velocities(frame, beams())
+    rate = flow_through(frame, velocity, np.array([0.0, 1.0, 0.0]))
+    assert -rate == pytest.approx(VEIN.mean_velocity * np.pi * RADIUS**2, rel=0.03)
+    assert set(np.unique(which)) == {-1, 0}
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        ConvexProbe(radius=0.03, opening_angle=1.0, depth=0.025, columns=180, rows=200),
+        SectorProbe(aperture=0.01, opening_angle=1.2, depth=0.025, columns=180, rows=200),
+    ],
+)
+def test_beams_that_spread_see_what_flows_along_them(volume, artery, probe):
+    """With the tube in the image, across its middle: the sine of each beam's angle."""
+    from us_sim.slicing.probe.beam_places import beam_angles, fractions_and_depths
+
+    turned = Pose([0.0, 0.0, 0.0], [0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
+    frame = BMode(volume, probe).frame(turned, None, time=0.0)
+    angles = beam_angles(probe, fractions_and_depths(probe)[0])
+    velocity, _ = Blood([artery]).mean_velocities(frame, Window(probe, angles))
+    places = frame.plane.pixels()
+    x, z = places[..., 1], places[..., 2]  # lateral is along the tube
+    behind = probe.radius if isinstance(probe, ConvexProbe) else 0.0
+    expected = -0.2 * (1 - ((z - 0.01) / RADIUS) ** 2) * x / np.hypot(x, z + behind)
+    inner = (np.abs(z - 0.01) < 0.9 * RADIUS) & ~np.isnan(velocity)
+    assert np.count_nonzero(inner) > 3000
+    assert velocity[inner] == pytest.approx(expected[inner], abs=0.006)
+
+
+def test_a_flow_across_its_vessel_is_refused(vein):
+    import dataclasses
+
+    across = dataclasses.replace(VEIN, direction=(1.0, 0.1, 0.0))
+    with pytest.raises(SceneError, match=r"structures.vessel.flow.direction: .* is across the"):
+        vein.require(across)

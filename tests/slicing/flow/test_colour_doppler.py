@@ -1,0 +1,215 @@
+"""Colour Doppler against velocities that are known: aliasing, wall filter, noise, and its box."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.path import Path
+from tubes import ARTERY, SIDES, block, tube_vessel, tube_volume
+
+from us_sim.errors import ProbeError
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.flow.blood import Blood
+from us_sim.slicing.flow.colour_doppler import ColourDoppler
+from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import LinearProbe
+
+PROBE = LinearProbe(aperture=0.018, depth=0.02, columns=90, rows=100)
+TILT = np.radians(30)
+WIDE = ColourSettings(width=1.0, height=0.02, resolution=0.0, persistence=0.0, wall_filter=0.0)
+POSE = Pose(
+    [0.0, 0.5 * SIDES[2] * np.tan(TILT), 0.0], [np.sin(TILT / 2), 0.0, 0.0, np.cos(TILT / 2)]
+)
+SYSTOLE = 0.13 / 1.1
+
+
+@pytest.fixture(scope="module")
+def scanner():
+    made = BMode(tube_volume(), PROBE)
+    made.carry(block().nodes, block().tetrahedra)
+    return made
+
+
+@pytest.fixture(scope="module")
+def blood():
+    return Blood([tube_vessel(ARTERY)])
+
+
+def frame_at(scanner, time):
+    return scanner.frame(POSE, block().nodes, time=time)
+
+
+def wrapped(velocity, nyquist):
+    """What a scanner takes it for: between -nyquist and nyquist."""
+    return (velocity + nyquist) % (2 * nyquist) - nyquist
+
+
+def between(estimate, truth, nyquist):
+    """How far apart two velocities are on the circle that aliasing makes of them."""
+    return np.abs(wrapped(estimate - truth, nyquist))
+
+
+@pytest.mark.parametrize("nyquist", [0.1, 0.25, 0.6])
+def test_velocities_turn_over_at_the_nyquist_velocity(scanner, blood, nyquist):
+    settings = dataclasses.replace(WIDE, nyquist_velocity=nyquist, pulses=64)
+    doppler = ColourDoppler(PROBE, settings)
+    frame = frame_at(scanner, SYSTOLE)
+    truth, estimate = doppler.truth(blood, frame), doppler.estimate(blood, frame)
+    shown = ~np.isnan(estimate) & ~np.isnan(truth)
+    assert np.count_nonzero(shown) > 0.95 * np.count_nonzero(~np.isnan(truth))
+    assert np.nanmax(np.abs(truth)) == pytest.approx(0.4, rel=0.03)  # 0.8 m/s at 60 degrees
+    error = between(estimate, truth, nyquist)[shown]
+    assert np.sqrt(np.mean(error**2)) < 0.04 * nyquist
+    assert np.nanmax(np.abs(estimate)) <= nyquist * (1 + 1e-6)
+    assert (np.abs(estimate[shown] - truth[shown]) > nyquist).any() == (nyquist < 0.4)
+
+
+def test_noise_falls_with_the_root_of_the_number_of_pulses(scanner, blood):
+    spread = {}
+    for pulses in (4, 16, 64):
+        doppler = ColourDoppler(
+            PROBE, dataclasses.replace(WIDE, nyquist_velocity=1.0, pulses=pulses)
+        )
+        errors = []
+        for beat in range(20):
+            frame = frame_at(scanner, SYSTOLE + beat / 1.1)
+            errors.append(doppler.estimate(blood, frame) - doppler.truth(blood, frame))
+        spread[pulses] = np.nanstd(errors)
+    assert spread[4] / spread[16] == pytest.approx(2.0, rel=0.1)
+    assert spread[16] / spread[64] == pytest.approx(2.0, rel=0.1)
+
+
+def test_the_wall_filter_takes_what_is_slow(scanner, blood):
+    frame = frame_at(scanner, SYSTOLE)
+    truth = ColourDoppler(PROBE, WIDE).truth(blood, frame)
+    settings = dataclasses.replace(WIDE, nyquist_velocity=1.0, wall_filter=0.15, pulses=64)
+    estimate = ColourDoppler(PROBE, settings).estimate(blood, frame)
+    inside = ~np.isnan(truth)
+    assert np.isnan(estimate[inside & (np.abs(truth) < 0.07)]).all()
+    assert not np.isnan(estimate[inside & (np.abs(truth) > 0.2)]).any()
+
+
+def test_much_gain_shows_noise_and_little_shows_nothing(scanner, blood):
+    frame = frame_at(scanner, SYSTOLE)
+    truth = ColourDoppler(PROBE, WIDE).truth(blood, frame)
+    counts = []
+    for gain in (-20.0, 0.0, 25.0):
+        estimate = ColourDoppler(PROBE, dataclasses.replace(WIDE, gain=gain)).estimate(blood, frame)
+        counts.append(np.count_nonzero(~np.isnan(estimate) & np.isnan(truth)))
+        if gain == -20.0:
+            assert np.isnan(estimate).all()
+    assert counts[1] == 0
+    assert counts[2] > 0.5 * np.count_nonzero(np.isnan(truth))
+
+
+def test_the_resolution_spreads_colour_beyond_the_wall_by_less_than_itself(scanner, blood):
+    frame = frame_at(scanner, SYSTOLE)
+    settings = dataclasses.replace(WIDE, nyquist_velocity=1.0, resolution=2e-3, gain=6.0)
+    estimate = ColourDoppler(PROBE, settings).estimate(blood, frame)
+    truth = ColourDoppler(PROBE, WIDE).truth(blood, frame)
+    columns = [np.flatnonzero((~np.isnan(each)).any(axis=0)) for each in (truth, estimate)]
+    wider = (np.ptp(columns[1]) - np.ptp(columns[0])) * PROBE.pixel_spacing[0]
+    assert 0.0 < wider < 2 * 2e-3
+
+
+def test_persistence_keeps_what_was_and_forgets_it_after_a_pause(scanner):
+    settings = dataclasses.replace(WIDE, persistence=0.9, pulses=64)
+    doppler, blood = ColourDoppler(PROBE, settings), Blood([tube_vessel(ARTERY)])
+    first = doppler.estimate(blood, frame_at(scanner, SYSTOLE))
+    slow = SYSTOLE + 0.3
+    kept = doppler.estimate(blood, frame_at(scanner, slow))
+    fresh = ColourDoppler(PROBE, settings).estimate(blood, frame_at(scanner, slow))
+    shown = ~np.isnan(first) & ~np.isnan(kept) & ~np.isnan(fresh)
+    nearer = np.abs(kept - first)[shown] < np.abs(kept - fresh)[shown]
+    assert nearer.mean() > 0.9
+    late = doppler.estimate(blood, frame_at(scanner, slow + 10 / 1.1))
+    again = ColourDoppler(PROBE, settings).estimate(blood, frame_at(scanner, slow + 10 / 1.1))
+    assert np.array_equal(late, again, equal_nan=True)
+
+
+def test_the_same_moment_has_the_same_noise_and_others_have_other(scanner, blood):
+    estimates = [
+        ColourDoppler(PROBE, WIDE).estimate(blood, frame_at(scanner, time))
+        for time in (SYSTOLE, SYSTOLE, SYSTOLE + 1 / 1.1)
+    ]
+    assert np.array_equal(estimates[0], estimates[1], equal_nan=True)
+    assert not np.array_equal(estimates[0], estimates[2], equal_nan=True)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    lateral=st.floats(-0.5, 0.5),
+    width=st.floats(0.2, 1.0),
+    depth=st.floats(2e-3, 18e-3),
+    height=st.floats(2e-3, 30e-3),
+    steering=st.floats(-0.5, 0.5),
+)
+def test_colour_is_shown_within_its_box_only(lateral, width, depth, height, steering):
+    asked = ColourSettings(lateral, width, depth, height, steering, gain=30.0, resolution=0.0)
+    doppler = ColourDoppler(PROBE, asked)
+    scanner, blood = BMode(SMALL.volume, PROBE), SMALL.blood
+    shown = ~np.isnan(doppler.estimate(blood, scanner.frame(POSE, None, time=1.0)))
+    matrix = PROBE.image_to_probe
+    x = matrix[0, 3] + matrix[0, 0] * np.arange(PROBE.columns)
+    z = matrix[2, 3] + matrix[2, 1] * np.arange(PROBE.rows)[:, None]
+    across = (x - (z - depth) * np.tan(steering)) / PROBE.aperture - lateral
+    slack = 1e-6
+    inside = (np.abs(across) < 0.5 * width + slack) & (np.abs(z - depth) < 0.5 * height + slack)
+    assert not (shown & ~inside).any()
+    column, row = np.meshgrid(np.arange(PROBE.columns), np.arange(PROBE.rows))
+    grown = Path(doppler.outline).contains_points(
+        np.column_stack([column[shown], row[shown]]), radius=0.1
+    ) | Path(doppler.outline).contains_points(
+        np.column_stack([column[shown], row[shown]]), radius=-0.1
+    )
+    assert grown.all()
+
+
+class SMALL:
+    """A volume and its blood, made once for all examples."""
+
+    volume = tube_volume(voxel=1e-3)
+    blood = Blood([tube_vessel(ARTERY, volume)])
+
+
+def test_steered_beams_see_a_vessel_in_the_image_by_the_angle(scanner):
+    """Along the tube upright beams see nothing; steered ones the sine of the angle."""
+    along = Pose([0.0, 0.0, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    frame = scanner.frame(along, block().nodes, time=SYSTOLE)
+    blood = Blood([tube_vessel(ARTERY)])
+    for steering in (0.0, 0.2, 0.4):
+        doppler = ColourDoppler(PROBE, dataclasses.replace(WIDE, steering=steering))
+        fastest = np.nanmax(np.abs(doppler.truth(blood, frame)))
+        assert fastest == pytest.approx(0.8 * np.sin(steering), rel=0.03, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("probe", "settings", "sentence"),
+    [
+        (PROBE, {"depth": 0.025}, "colour.depth: the middle of the box at 25 mm lies outside the"),
+        (
+            ConvexProbe(radius=0.03, opening_angle=1.0, depth=0.05, columns=80, rows=80),
+            {"steering": 0.1},
+            "colour.steering: is for linear probes only",
+        ),
+        (
+            LinearProbe(aperture=0.02, depth=0.02, columns=4, rows=4),
+            {"width": 0.02, "lateral": 0.1, "height": 1e-3},
+            "colour.width: no pixel of the image lies in the box",
+        ),
+    ],
+)
+def test_a_box_outside_the_image_is_refused(probe, settings, sentence):
+    with pytest.raises(ProbeError, match=sentence):
+        ColourDoppler(probe, ColourSettings(**settings))
+
+
+def test_a_nyquist_velocity_of_zero_and_a_filter_of_everything_are_refused():
+    with pytest.raises(ProbeError, match=r"colour.nyquist_velocity: 0 m/s is outside 0.01 to 5"):
+        ColourSettings(nyquist_velocity=0.0)
+    with pytest.raises(ProbeError, match=r"colour.wall_filter: 0.1 m/s is not below nyquist_vel"):
+        ColourSettings(nyquist_velocity=0.1, wall_filter=0.1)

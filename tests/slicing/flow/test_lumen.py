@@ -1,0 +1,71 @@
+"""Cross-sections of tubes that are known, and where points lie in them."""
+
+import numpy as np
+import pytest
+from tubes import SIDES, around, grid, tube_volume
+
+from us_sim.errors import VolumeError
+from us_sim.slicing.flow.lumen import lumen_of
+
+MIDDLE = np.array([0.0, 0.0, 0.5 * SIDES[2]])
+
+
+def lumen_in(volume):
+    return lumen_of(volume.labels == 1, volume.index_to_patient)
+
+
+@pytest.mark.parametrize("radius", [2e-3, 3e-3, 5e-3])
+@pytest.mark.parametrize("direction", [(0, 1, 0), (0.25, 1, -0.15)])
+def test_sections_of_a_cylinder_have_its_area_across_it(radius, direction):
+    volume = tube_volume(radius, direction)
+    lumen = lumen_in(volume)
+    inner = slice(2, -2)
+    unit = np.array(direction) / np.linalg.norm(direction)
+    of_voxels = volume.labels.sum() * (5e-4) ** 3 * unit[1] / SIDES[1]
+    assert lumen.areas[inner].mean() == pytest.approx(of_voxels, rel=0.015)
+    assert lumen.areas[inner] == pytest.approx(np.pi * radius**2, rel=0.06)  # of few voxels
+    assert np.abs(lumen.tangents[inner] @ unit).min() > 0.995
+    frames = np.concatenate([lumen.tangents[:, None], lumen.across], axis=1)
+    assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+
+
+def test_a_flat_section_is_known_in_every_direction():
+    """An ellipse of 5 by 2 mm, whose wall is known in closed form."""
+    places, to_patient = grid(voxel=4e-4)
+    x, _, z = np.moveaxis(places - MIDDLE, -1, 0)
+    lumen = lumen_of((x / 5e-3) ** 2 + (z / 2e-3) ** 2 < 1.0, to_patient)
+    middle = len(lumen.areas) // 2
+    wall = lumen.rings(np.array([1.0]))[middle, 0] - lumen.centres[middle]
+    assert np.hypot(wall[:, 0] / 5e-3, wall[:, 2] / 2e-3) == pytest.approx(1.0, abs=0.06)
+    assert lumen.areas[middle] == pytest.approx(np.pi * 1e-5, rel=0.03)
+
+
+def test_places_are_along_the_tube_and_radial_coordinates_as_in_a_cylinder():
+    lumen = lumen_in(tube_volume())
+    random = np.random.default_rng(3)
+    angle, part = random.uniform(0, 2 * np.pi, 200), random.uniform(0.05, 1.3, 200)
+    along = random.uniform(-15e-3, 15e-3, 200)
+    points = np.column_stack([3e-3 * part * np.cos(angle), along, 3e-3 * part * np.sin(angle)])
+    station, squares = lumen.locate(points + MIDDLE)
+    assert np.sqrt(squares) == pytest.approx(part, rel=0.06)
+    forward = np.sign(lumen.centres[-1, 1] - lumen.centres[0, 1])
+    place = lumen.centres[0, 1] + forward * station * lumen.spacing
+    assert place == pytest.approx(along, abs=0.3e-3)
+
+
+def test_a_vessel_at_the_edge_of_the_volume_is_not_closed():
+    places, to_patient = grid()
+    lumen = around(places, (0.0, 0.0, 0.5e-3), (0, 1, 0))
+    with pytest.raises(VolumeError, match=r"is no tube: its section at \(.* mm is not closed"):
+        lumen_of(lumen, to_patient)
+
+
+def test_what_its_sections_do_not_hold_is_no_tube():
+    """A tube with a wide thin fin, which a star cannot reach around the corner of."""
+    places, to_patient = grid()
+    x, _, z = np.moveaxis(places - MIDDLE, -1, 0)
+    tube = np.hypot(x, z) < 1.6e-3
+    fin = (np.abs(x - 1e-3) < 0.6e-3) & (z > 0) & (z < 8e-3)
+    hook = (x > 0.4e-3) & (x < 7e-3) & (np.abs(z - 8e-3) < 0.6e-3)
+    with pytest.raises(VolumeError, match=r"is no tube: |is too short"):
+        lumen_of(tube | fin | hook, to_patient)

@@ -1,0 +1,39 @@
+"""M-mode shows what is along its line, when it was there."""
+
+import numpy as np
+import pytest
+
+from us_sim.slicing.m_mode import MMode
+from us_sim.slicing.m_mode_settings import MModeSettings
+from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import LinearProbe
+
+PROBE = LinearProbe(aperture=0.04, depth=0.03, columns=80, rows=60)
+COLUMNS, ROWS, SWEEP = 512, 384, 4.0
+
+
+def test_a_wall_that_moves_is_where_it_was_at_each_moment():
+    """One bright row, whose depth is a sine of a second: columns show it with the frames' steps."""
+    m_mode = MMode(PROBE, MModeSettings(lateral=0.1, sweep=SWEEP))
+    rate, image = 32.0, np.zeros((60, 80), np.uint8)
+    for k in range(int(SWEEP * rate) + 1):
+        row = 30 + round(20 * np.sin(2 * np.pi * k / rate))
+        image[:] = 0
+        image[row] = 250
+        picture = m_mode.show(image, 100.0 + k / rate)
+    grey = picture[:ROWS, :COLUMNS, 0]
+    brightest = (grey.argmax(axis=0) + 0.5) / ROWS * 60 - 0.5
+    times = (np.arange(COLUMNS) - (COLUMNS - 1)) * SWEEP / COLUMNS
+    frame = np.ceil(times * rate - 1e-6) / rate  # what a column shows came after it
+    expected = 30 + np.rint(20 * np.sin(2 * np.pi * frame))
+    assert brightest[4:] == pytest.approx(expected[4:], abs=0.6)
+
+
+def test_its_line_is_a_beam_where_beams_spread():
+    probe = ConvexProbe(radius=0.04, opening_angle=1.0, depth=0.05, columns=200, rows=200)
+    line, _ = probe.pixel_beams
+    image = np.where(np.isnan(line), 0, line).astype(np.uint8)
+    for lateral in (-0.4, 0.0, 0.3):
+        shown = MMode(probe, MModeSettings(lateral=lateral)).line(image)
+        wanted = (lateral + 0.5) * probe.lines - 0.5
+        assert shown[8:-8].astype(float) == pytest.approx(wanted, abs=2.0)

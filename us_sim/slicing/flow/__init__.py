@@ -1,0 +1,1 @@
+"""Blood in the vessels of deformed tissue, and how Doppler ultrasound shows it."""

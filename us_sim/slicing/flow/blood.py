@@ -1,0 +1,202 @@
+"""The blood of a scene: all vessels with a flow, on the frames of a scanner.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.b_mode import BMode
+>>> from us_sim.slicing.flow.blood import Blood, Window
+>>> from us_sim.slicing.flow.settings import FlowSettings
+>>> from us_sim.slicing.flow.vessel import Vessel
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.volume.volume import Volume
+>>> y, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
+>>> tube = np.repeat((y**2 + z**2 < 36)[None], 60, axis=0).astype(np.uint8)
+>>> volume = Volume(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]), tube, {1: "vein"})
+>>> flow = FlowSettings("venous", (1, 0, 0), peak_velocity=0.1, mean_velocity=0.05)
+>>> blood = Blood([Vessel("vein", volume, 1, flow)])
+>>> probe = LinearProbe(aperture=0.02, depth=0.01, columns=41, rows=21)
+>>> frame = BMode(volume, probe).frame(Pose([0.015, 5e-3, 0.0]), time=0.0)
+>>> steered = np.full((21, 41), np.radians(-30.0))  # against the flow
+>>> velocity = blood.velocity(frame, Window(probe, steered))
+>>> round(float(velocity[10, 20]), 2), bool(np.isnan(velocity[0, 0]))
+(0.05, True)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.kernels import njit
+from us_sim.slicing.cutting.located import Located
+from us_sim.slicing.cutting.resampling import pixel_to_index
+from us_sim.slicing.flow.vessel import Vessel
+from us_sim.slicing.frame import Frame, Mesh
+from us_sim.slicing.probe.probe import Probe
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["Blood", "Window"]
+
+
+class Window:
+    """Places in an image, and the directions of the beams there.
+
+    Args:
+        probe: whose image it is.
+        angles: rad, of the beams from the probe's z towards its x; of pixels (rows, columns) of the
+            window, or of places (P,).
+        places: (P, 2) column and row; None for the pixels of the window.
+        corner: row and column of the window's first pixel.
+    """
+
+    def __init__(
+        self,
+        probe: Probe,
+        angles: NDArray[Any],
+        places: NDArray[np.float64] | None = None,
+        corner: tuple[int, int] = (0, 0),
+    ) -> None:
+        if places is None:
+            rows, columns = (
+                np.arange(n) + first for n, first in zip(angles.shape, corner, strict=True)
+            )
+            places = np.stack(np.meshgrid(columns, rows), axis=-1)
+        self.shape = places.shape[:-1]
+        column, row = places.reshape(-1, 2).T.astype(np.float32)
+        self.column, self.row = np.ascontiguousarray(column), np.ascontiguousarray(row)
+        self.x = np.sin(angles).astype(np.float32).ravel()
+        self.z = np.cos(angles).astype(np.float32).ravel()
+        nearest = np.rint(self.row).astype(np.int32), np.rint(self.column).astype(np.int32)
+        within = (nearest[0] >= 0) & (nearest[0] < probe.rows) & (nearest[1] >= 0)
+        within &= nearest[1] < probe.columns
+        self.pixel = np.where(within, nearest[0] * probe.columns + nearest[1], -1).astype(np.int32)
+
+
+class Blood:
+    """The vessels of a scene that have a flow.
+
+    Args:
+        vessels: they are advanced from frame to frame.
+    """
+
+    def __init__(self, vessels: Sequence[Vessel]) -> None:
+        self.vessels = tuple(vessels)
+        self._frame: Frame | None = None
+        self._mesh: Mesh | None = None
+
+    def at(self, frame: Frame) -> Blood:
+        """The same, gone on to a frame, once for all that ask.
+
+        Raises:
+            MeshError: the frame's mesh cannot carry anything.
+        """
+        if frame is not self._frame:
+            if frame.mesh is not self._mesh:
+                mesh = None if frame.mesh is None else TetrahedralMesh(*frame.mesh)
+                for vessel in self.vessels:
+                    vessel.carried_by(mesh)
+                self._mesh = frame.mesh
+            for vessel in self.vessels:
+                vessel.advance(frame.time, frame.nodes)
+            self._frame = frame
+        return self
+
+    def velocity(self, frame: Frame, window: Window) -> NDArray[np.float32]:
+        """m/s along the beams towards the probe, as ``window`` has places; NaN outside lumens."""
+        factors = [float(vessel.pulse(frame.time)) for vessel in self.vessels]
+        return self._velocity(frame, window, factors)[0]
+
+    def mean_velocities(
+        self, frame: Frame, window: Window
+    ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Likewise averaged over the pulse, and which vessel each place is in, -1 for none."""
+        return self._velocity(frame, window, [1.0] * len(self.vessels))
+
+    def _velocity(
+        self, frame: Frame, window: Window, factors: Sequence[float]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        self.at(frame)
+        located = _located(frame)
+        velocity = np.full(len(window.pixel), np.nan, dtype=np.float32)
+        which = np.full(len(window.pixel), -1, dtype=np.int8)
+        in_image = frame.pose.rotation[:, [0, 2]]
+        for number, (vessel, factor) in enumerate(zip(self.vessels, factors, strict=True)):
+            # Beams lead away from the probe.
+            axis = np.ascontiguousarray(vessel.axis_velocity @ in_image * -factor)
+            _find_velocity(
+                located.elements.reshape(-1), located.maps, window.pixel, window.column, window.row,
+                window.x, window.z, vessel.map.corner, vessel.map.station, vessel.map.radial, axis,
+                np.int8(number), velocity, which,
+            )  # fmt: skip
+        return velocity.reshape(window.shape), which.reshape(window.shape)
+
+
+def _located(frame: Frame) -> Located:
+    """Where pixels lie in the mesh, or in the volume as it is."""
+    if frame.nodes is not None:
+        return frame.located
+    plane = frame.plane
+    elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
+    maps = pixel_to_index(frame.volume, plane)[None]
+    return Located(elements, maps, np.empty(0, dtype=np.intp))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_velocity(
+    elements, maps, pixel, columns, rows, beam_x, beam_z, corner, station, radial, axis, number,
+    velocity, which,
+):  # fmt: skip
+    """Writes velocity (P,) and which (P,) of places in a vessel's lumen.
+
+    Args:
+        elements: of all pixels. maps: (E, 3, 3) from (1, column, row) to voxel indices.
+        pixel: (P,) number of the pixel at each place, -1 outside the image. columns, rows: (P,).
+        beam_x, beam_z: (P,) the beams' directions. corner: (3,) voxels.
+        station, radial: (i, j, k). axis: (S, 2) m/s along the probe's x and z.
+    """
+    last_i = station.shape[0] - 2
+    last_j = station.shape[1] - 2
+    last_k = station.shape[2] - 2
+    most = len(axis) - 2
+    for p in range(len(pixel)):
+        if pixel[p] < 0:
+            continue
+        e = elements[pixel[p]]
+        if e < 0:
+            continue
+        column = np.float64(columns[p])
+        row = np.float64(rows[p])
+        u = maps[e, 0, 0] + maps[e, 0, 1] * column + maps[e, 0, 2] * row - corner[0]
+        if not 0.0 <= u <= last_i + 1:
+            continue
+        v = maps[e, 1, 0] + maps[e, 1, 1] * column + maps[e, 1, 2] * row - corner[1]
+        w = maps[e, 2, 0] + maps[e, 2, 1] * column + maps[e, 2, 2] * row - corner[2]
+        if not (0.0 <= v <= last_j + 1 and 0.0 <= w <= last_k + 1):
+            continue
+        i = min(np.int64(u), last_i)
+        j = min(np.int64(v), last_j)
+        k = min(np.int64(w), last_k)
+        r = _blended(radial, i, j, k, u - i, v - j, w - k)
+        if not r < 1.0:
+            continue
+        s = _blended(station, i, j, k, u - i, v - j, w - k)
+        at = np.int64(min(s, np.float64(most)))
+        part = s - at
+        along_x = axis[at, 0] * (1.0 - part) + axis[at + 1, 0] * part
+        along_z = axis[at, 1] * (1.0 - part) + axis[at + 1, 1] * part
+        velocity[p] = (1.0 - r) * (along_x * beam_x[p] + along_z * beam_z[p])
+        which[p] = number
+
+
+@njit(inline="always", error_model="numpy")
+def _blended(grid, i, j, k, u, v, w):
+    """Trilinear value in a cell of a grid."""
+    c0 = (grid[i, j, k] * (1.0 - w) + grid[i, j, k + 1] * w) * (1.0 - v) + (
+        grid[i, j + 1, k] * (1.0 - w) + grid[i, j + 1, k + 1] * w
+    ) * v
+    c1 = (grid[i + 1, j, k] * (1.0 - w) + grid[i + 1, j, k + 1] * w) * (1.0 - v) + (
+        grid[i + 1, j + 1, k] * (1.0 - w) + grid[i + 1, j + 1, k + 1] * w
+    ) * v
+    return c0 * (1.0 - u) + c1 * u

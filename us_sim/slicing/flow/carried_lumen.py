@@ -1,0 +1,141 @@
+"""A vessel's lumen where the tissue has carried it: its middle, its areas, and how blood fills it.
+
+Points on rings around each station go with the tissue's tetrahedra. The area that a ring encloses
+across the vessel is the area vector of its polygon along the vessel's tangent, which a flow through
+it sees whatever the ring's own plane has become. Blood flows fastest at radial coordinate 0 and
+stands at the wall, 1, as the square of the coordinate falls (Poiseuille). What a lumen is filled
+by a flow with speed 1 on its axis is the sum over the rings of that profile times area.
+
+>>> import numpy as np
+>>> from us_sim.slicing.flow.carried_lumen import CarriedLumen
+>>> from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> centres = np.array([[0.05, y, 0.05] for y in (0.02, 0.04, 0.06, 0.08)])
+>>> along, across = np.tile([0.0, 1, 0], (4, 1)), np.tile([[0.0, 0, 1], [1, 0, 0]], (4, 1, 1))
+>>> tube = Lumen(centres, along, across, np.full((4, DIRECTIONS), 0.01))
+>>> mesh = box_mesh(*[np.linspace(0.0, 0.1, 5)] * 3)
+>>> squeezed = CarriedLumen(tube, mesh).carry(mesh.nodes * [1.0, 1.0, 0.5])
+>>> (squeezed.areas / tube.areas).round(3).tolist()
+[0.5, 0.5, 0.5, 0.5]
+>>> (squeezed.filled / squeezed.areas).round(3).tolist()
+[0.5, 0.5, 0.5, 0.5]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.kernels import njit
+from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
+from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+
+__all__ = ["CarriedLumen", "LumenNow"]
+
+_RINGS = 4
+"""Rings around a station that share its area at rest evenly."""
+
+_FRACTIONS = np.sqrt(np.arange(_RINGS + 1) / _RINGS)
+
+_REACH = 2e-3
+"""m outside the tissue beyond which a vessel stays where it is, as the volume does there."""
+
+
+@dataclass(frozen=True, eq=False)
+class LumenNow:
+    """A lumen at one moment, at its S stations."""
+
+    tangents: NDArray[np.float64]  # (S, 3), unit vectors along the vessel
+    areas: NDArray[np.float64]  # (S,) m², across it
+    filled: NDArray[np.float64]  # (S,) m², the flow over the velocity on the axis
+
+
+class CarriedLumen:
+    """Carries a lumen with the tissue.
+
+    Args:
+        lumen: at rest.
+        mesh: of the tissue at rest; None for a lumen that stays as it is.
+    """
+
+    def __init__(self, lumen: Lumen, mesh: TetrahedralMesh | None) -> None:
+        points = lumen.rings(_FRACTIONS).reshape(-1, 3)
+        self._points = np.ascontiguousarray(points)
+        self._rest_areas = lumen.areas
+        self._nodes = np.zeros((len(points), 4), dtype=np.int32)
+        self._weights = np.zeros((len(points), 4))
+        self._rest_nodes = np.zeros((1, 3))
+        if mesh is not None:
+            where = locate(mesh, points)
+            self._nodes = np.ascontiguousarray(mesh.tetrahedra[where.tetrahedra])
+            self._weights = where.weights * (where.outside < _REACH)[:, None]
+            self._rest_nodes = mesh.nodes
+        self._rest_polygons = np.ones((len(lumen.areas), _RINGS))
+        self._rest_polygons = self._measured(self._rest_nodes)[1]
+        self.rest = self.carry(self._rest_nodes)
+
+    def carry(self, nodes: NDArray[np.float64]) -> LumenNow:
+        """The lumen with the tissue's nodes at ``nodes`` (N, 3) m."""
+        tangents, polygons = self._measured(nodes)
+        within = self._rest_areas[:, None] * _FRACTIONS[1:] ** 2
+        within *= np.maximum(polygons, 0.0) / self._rest_polygons
+        # Between two rings the profile falls evenly with the area at rest.
+        profile = 1.0 - 0.5 * (_FRACTIONS[1:] ** 2 + _FRACTIONS[:-1] ** 2)
+        between = np.maximum(np.diff(within, axis=1, prepend=0.0), 0.0)
+        return LumenNow(tangents, within[:, -1], between @ profile)
+
+    def _measured(
+        self, nodes: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Tangents (S, 3), and areas (S, rings) m² of the polygons across them."""
+        stations = len(self._rest_areas)
+        tangents, polygons = np.empty((stations, 3)), np.empty((stations, _RINGS))
+        moved = np.ascontiguousarray(nodes, dtype=np.float64) - self._rest_nodes
+        _measure(self._points, self._nodes, self._weights, moved, tangents, polygons)
+        return tangents, polygons
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure(points, nodes, weights, moved, tangents, polygons):
+    """Fills tangents (S, 3) and polygons (S, rings).
+
+    Args:
+        points: (S * (rings + 1) * directions, 3) m, at rest; the first ring is the centre.
+        nodes, weights: (points, 4), of the tetrahedron that each goes with.
+        moved: (N, 3) m, displacements of the nodes.
+    """
+    stations, rings = polygons.shape
+    each = (rings + 1) * DIRECTIONS
+    place = np.empty((each * stations, 3))
+    for p in range(len(points)):
+        for x in range(3):
+            place[p, x] = points[p, x] + (
+                weights[p, 0] * moved[nodes[p, 0], x] + weights[p, 1] * moved[nodes[p, 1], x]
+                + weights[p, 2] * moved[nodes[p, 2], x] + weights[p, 3] * moved[nodes[p, 3], x]
+            )  # fmt: skip
+    area = np.empty(3)
+    for s in range(stations):
+        before = max(s - 1, 0) * each
+        after = min(s + 1, stations - 1) * each
+        length = 0.0
+        for x in range(3):
+            tangents[s, x] = place[after, x] - place[before, x]
+            length += tangents[s, x] ** 2
+        for x in range(3):
+            tangents[s, x] /= max(np.sqrt(length), 1e-12)
+        c = place[s * each]
+        for k in range(rings):
+            first = s * each + (k + 1) * DIRECTIONS
+            area[:] = 0.0
+            for j in range(DIRECTIONS):
+                a = place[first + j]
+                b = place[first + (j + 1) % DIRECTIONS]
+                area[0] += (a[1] - c[1]) * (b[2] - c[2]) - (a[2] - c[2]) * (b[1] - c[1])
+                area[1] += (a[2] - c[2]) * (b[0] - c[0]) - (a[0] - c[0]) * (b[2] - c[2])
+                area[2] += (a[0] - c[0]) * (b[1] - c[1]) - (a[1] - c[1]) * (b[0] - c[0])
+            polygons[s, k] = 0.5 * (
+                area[0] * tangents[s, 0] + area[1] * tangents[s, 1] + area[2] * tangents[s, 2]
+            )
