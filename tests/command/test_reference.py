@@ -49,6 +49,10 @@ def test_every_parameter_of_every_node_is_on_it():
             told |= {f"{name}.{key}" for key in keys_in(sections[name])}
         flow = keys_in(sections["structures.NAME.flow"])
         told |= {f"flow.{name}.{key}" for name in scene.flows for key in flow}
+        told |= {f"acoustics.{key}" for key in keys_in(sections["imaging.acoustics"])}
+        tissue = keys_in(sections["imaging.acoustics.tissues.NAME"])
+        labels = scene.imaging.acoustics.tissues
+        told |= {f"acoustics.tissues.{label}.{key}" for label in labels for key in tissue}
         for prefix, settings in parameters_of(node, scene):
             assert {prefix + name for name in rules_of(settings)} <= told
 

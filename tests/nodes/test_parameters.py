@@ -132,7 +132,7 @@ def test_what_may_change_is_taken_in_its_range_and_refused_outside(bench, scene,
             assert not refused.successful
             assert "'qqqq' is not one of" in refused.reason
         assert node.get_parameter(parameter).value == before
-        if kind in (int, float) and field not in ("depth", "focus"):
+        if kind in (int, float) and field not in ("depth", "focus", "frequency"):
             near = 0.99 * before + 0.01 * quantity.maximum if kind is float else before + 1
             assert attempt(node, parameter, near).successful
             assert node.get_parameter(parameter).value == near
@@ -148,6 +148,20 @@ def test_the_depth_of_the_image_may_change_and_its_range_is_said(bench, scene, t
     assert not refused.successful
     assert "0.0005 m is outside 0.001 to 0.4 m" in refused.reason
     assert attempt(node, "focus", 0.0).successful
+
+
+def test_the_frequency_is_one_that_the_probe_has_while_artefacts_are_live(bench, scene, tmp_path):
+    node = made(bench, "slice_interpolator", scene, tmp_path)
+    assert attempt(node, "acoustics.frequency", 2e6).successful  # of no use yet
+    refused = attempt(node, "acoustics.artefacts", "live")
+    assert not refused.successful
+    assert "2 MHz is not one that this probe has, which are 4 to 16 MHz" in refused.reason
+    assert attempt(node, "acoustics.frequency", 0.0).successful  # the probe's middle
+    assert attempt(node, "acoustics.artefacts", "live").successful
+    assert attempt(node, "acoustics.frequency", 6e6).successful
+    refused = attempt(node, "acoustics.frequency", 20e6)
+    assert not refused.successful
+    assert "20 MHz is not one that this probe has" in refused.reason
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.reading import find_scene, load_scene, parse_scene
+from us_sim.scene.scene import ImagingSettings
 from us_sim.share import shared_path
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.slicing.strain.settings import Strain
@@ -339,7 +339,7 @@ def test_null_takes_back_what_the_base_says(tmp_path):
     assert set(arm.tissue.materials) - set(scene.tissue.materials) == {"vein"}
     assert scene.tissue.materials["nerve"].density == 990
     assert (arm.tissue.solver, scene.tissue.solver) == ("fem_nonlinear", "fem")
-    assert scene.imaging == Imaging()
+    assert scene.imaging == ImagingSettings()
     with pytest.raises(SceneError, match="volume: is missing"):
         based_on("upper_arm", "volume: null", tmp_path)
 

@@ -36,6 +36,7 @@ structures:
   vein: {}
   artery: {flow: {kind: venous, direction: [0, 1, 0], peak_velocity: 0.3, mean_velocity: 0.1}}
 skin: {}
+imaging: {acoustics: {tissues: {muscle: {fibres: [0, 1, 0]}}}}
 """
 )
 

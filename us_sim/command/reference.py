@@ -173,7 +173,12 @@ def _nodes() -> Iterator[Section]:
                 text.append(
                     f"The keys of [imaging](#imaging), and of the [probe](#probe) its "
                     f"{_of_probe()}, while running; where there is tissue `strain.KEY` for every "
-                    f"key of [strain](#strain). Their defaults are the scene's."
+                    f"key of [strain](#strain). `acoustics.KEY` for every key of "
+                    f"[imaging.acoustics](#imagingacoustics) but the last, and "
+                    f"`acoustics.tissues.LABEL.KEY` for every key of every tissue that the scene "
+                    f"names there, such as `acoustics.tissues.muscle.attenuation`, see "
+                    f"[imaging.acoustics.tissues](#imagingacousticstissuesname). Their defaults "
+                    f"are the scene's."
                 )
             elif each is not SceneNodeSettings:
                 about = first_sentence(each)

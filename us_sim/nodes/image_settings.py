@@ -14,6 +14,7 @@ from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 
 __all__ = ["OVERLAYS", "AnnotatedImageSettings", "PoseAgeSettings", "image_parameters"]
 
@@ -53,6 +54,9 @@ class AnnotatedImageSettings(Settings):
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
     """Settings of a scene that are parameters, too, each with what goes before their names."""
     yield "", type(probe_of(scene))
+    yield "acoustics.", SoundSettings
+    for label in scene.imaging.acoustics.tissues:
+        yield f"acoustics.tissues.{label}.", TissueAcoustics
     yield "m_mode.", type(scene.m_mode)
     if scene.tissue is not None:
         yield "strain.", type(scene.strain)

@@ -1,7 +1,7 @@
 """Settings as ROS parameters: declared with unit and range, read, and changed while running.
 
-A number that need not be given is 0 in a parameter where it is not, and such a text is empty,
-since ROS parameters have no value for nothing.
+A number that need not be given is 0 in a parameter where it is not, such a list is one of zeros,
+and such a text is empty, since ROS parameters have no value for nothing.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _changed(settings: S, values: Mapping[str, Any], prefix: str, before: str = 
         value = values[prefix + name]
         if kind is str and isinstance(value, int | float):
             value = str(value)  # a camera's number, say
-        if _may_be_none(kind) and (value == 0 or value == ""):
+        if _may_be_none(kind) and _is_nothing(value):
             value = None
         elif get_origin(kind) is tuple and get_args(kind)[0] is str:
             value = tuple(text for text in value or () if text)
@@ -151,11 +151,19 @@ def _changed(settings: S, values: Mapping[str, Any], prefix: str, before: str = 
     return changed
 
 
+def _is_nothing(value: Any) -> bool:
+    """Whether a parameter's value stands for none: 0, a list of zeros, or an empty text."""
+    if isinstance(value, str) or not hasattr(value, "__iter__"):
+        return bool(value == 0 or value == "")
+    return not any(value)
+
+
 def _default(settings: Settings, name: str) -> Any:
     """A setting's value as a parameter's."""
     value, kind = getattr(settings, name), kinds_of(type(settings))[name]
-    if get_origin(kind) is tuple:
-        if get_args(kind)[0] is str:
+    lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
+    if lists:
+        if get_args(lists[0])[0] is str:
             return list(value) or [""]
         return array("d", value or (0.0,))  # an empty list would have no type
     if value is not None:
@@ -173,7 +181,8 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
     if names:
         constraints.insert(0, f"one of {', '.join(names)}")
     if _may_be_none(kind):
-        none = "0" if {int, float} & set(get_args(kind)) else "''"
+        is_text = str in get_args(kind)
+        none = "''" if is_text else "0"
         constraints.insert(0, f"{none} for none")
     descriptor = ParameterDescriptor(
         description=f"{rule.description} ({unit})" if unit else rule.description,

@@ -19,13 +19,12 @@ from us_sim.nodes.conversions import (
     vectors_from,
 )
 from us_sim.nodes.frame_streams import frame_streams
-from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.scanner_console import ScannerConsole
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.settings import is_live
-from us_sim.scene.building import probe_of, scanner_of, volume_of
-from us_sim.settings.setting import rules_of
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.probe import Probe
 
@@ -42,18 +41,18 @@ class SliceInterpolator(SceneNode):
     for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
     its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`, and
     `frame_streams` are further topics, each made of the same frame for those who subscribe. What a
-    sonographer sets are parameters: the fields of `Imaging`, and the probe's depth and focus.
+    sonographer sets are parameters, see `ScannerConsole`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
         # Before the volume, which may take a minute to make.
-        probe, imaging = self._console()
+        probe, imaging, acoustics = ScannerConsole(self, self._prepare, self._use).values
         volume = volume_of(self.scene)
         self._scanner = scanner_of(self.scene, volume, threads=self.threads)
         self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
-        self._scanner.prepare(probe, imaging)
-        self._scanner.use(probe, imaging)
+        self._scanner.prepare(probe, imaging, acoustics)
+        self._scanner.use(probe, imaging, acoustics)
         self._rest: Any = None
         self._tetrahedra: Any = None
         self._carried = False
@@ -76,28 +75,16 @@ class SliceInterpolator(SceneNode):
         self.health.state = "ready"
         self.get_logger().info("ready")
 
-    def _console(self) -> tuple[Probe, Imaging]:
-        """What a sonographer sets, as parameters that may change while the node runs."""
-        probe = probe_of(self.scene)
-        live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
-        console = LiveSettings(
-            self,
-            {"probe": Group(probe, names=live), "imaging": Group(self.scene.imaging)},
-            lambda wanted: self._prepare(**wanted),
-            lambda wanted: self._use(**wanted),
-        )
-        return console.values["probe"], console.values["imaging"]
-
-    def _prepare(self, probe: Probe, imaging: Imaging) -> None:
+    def _prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
         """Load what was set at the console, before it is used."""
-        self._scanner.prepare(probe, imaging)
+        self._scanner.prepare(probe, imaging, acoustics)
         for stream in self._streams:
             stream.prepare(probe)
 
-    def _use(self, probe: Probe, imaging: Imaging) -> None:
+    def _use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
         """Go on with what was set at the console."""
         changed = probe != self._scanner.probe
-        self._scanner.use(probe, imaging)
+        self._scanner.use(probe, imaging, acoustics)
         if changed:
             self._places.publish(affine_message(probe.image_to_probe))
             self._annotated.show_probe(probe)

@@ -101,6 +101,7 @@ def _show_blood() -> None:
 
 def _make_image(method: str) -> None:
     """With everything on that imaging can do."""
+    from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.formation.imaging import Imaging
     from us_sim.slicing.probe.probe import LinearProbe
@@ -118,7 +119,9 @@ def _make_image(method: str) -> None:
         contact=True,
     )
     BMode(volume, probe, method=method).prepare(probe, Imaging(gain=3.0))
-    BMode(volume, probe, imaging, method=method).prepare(probe, imaging)
+    muscle = TissueAcoustics(attenuation=0.57, impedance=1.6e6, fibres=(0.0, 1.0, 0.0))
+    sound = Acoustics(artefacts="live", noise=-90.0, tissues={"nothing": muscle})
+    BMode(volume, probe, imaging, method=method).prepare(probe, imaging, sound)
 
 
 def _strain() -> None:

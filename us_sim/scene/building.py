@@ -113,17 +113,25 @@ def probe_of(scene: Scene) -> Probe:
 
 
 def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
-    """The scanner that makes the scene's images; its tissue's mesh is for it to be told."""
+    """The scanner that makes the scene's images; its tissue's mesh is for it to be told.
+
+    Raises:
+        SceneError: the scene's acoustics do not go with its volume.
+    """
     from us_sim.slicing.b_mode import BMode
 
-    return BMode(
-        volume,
-        probe_of(scene),
-        scene.imaging,
-        method=scene.slice.name,
-        threads=threads,
-        settings=scene.slice.given,
-    )
+    try:
+        return BMode(
+            volume,
+            probe_of(scene),
+            scene.imaging,
+            scene.imaging.acoustics,
+            method=scene.slice.name,
+            threads=threads,
+            settings=scene.slice.given,
+        )
+    except ProbeError as error:
+        raise SceneError(f"{scene.origin}: {error}") from error
 
 
 def collider_of(scene: Scene) -> Collider:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from us_sim.errors import CaseError, SceneError, UsSimError
+from us_sim.errors import CaseError, ProbeError, SceneError, UsSimError
 from us_sim.scene.building import probe_of
 from us_sim.scene.document import merged, read_document
 from us_sim.scene.scene import CASE_PREFIX, Scene
@@ -105,7 +105,12 @@ def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Pa
     document = _with_named_structures(document, origin)
     Reader(origin, None, SceneError).read(Scene, document)  # files matter once all else is right
     scene = Reader(origin, find_file, SceneError).read(Scene, document).named(origin)
-    probe_of(scene)
+    probe = probe_of(scene)
+    if scene.imaging.acoustics.is_live:
+        try:
+            scene.imaging.acoustics.frequency_among(probe.frequencies)
+        except ProbeError as error:
+            raise SceneError(f"{origin}: {error}") from error
     return scene
 
 

@@ -19,6 +19,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
+from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.flow.colour_settings import ColourSettings
 from us_sim.slicing.flow.settings import FlowSettings
 from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
@@ -32,6 +33,7 @@ from us_sim.volume.settings import VolumeSettings
 
 __all__ = [
     "CASE_PREFIX",
+    "ImagingSettings",
     "Part",
     "ProbeSettings",
     "Scene",
@@ -177,6 +179,15 @@ class TrackerSettings(Settings):
 
 
 @dataclass(frozen=True)
+class ImagingSettings(Imaging):
+    """The console's settings, and what sound meets on its way."""
+
+    acoustics: Acoustics = setting(
+        description="artefacts of sound, and the acoustic constants of tissues", default=Acoustics()
+    )
+
+
+@dataclass(frozen=True)
 class Part:
     """A node of the graph, whether this scene needs it, and why."""
 
@@ -203,7 +214,9 @@ class Scene(Settings):
     slice: Chosen = setting(
         description="how the image is cut", choice=SLICERS, default=Chosen("scan_conversion")
     )
-    imaging: Imaging = setting(description="how echoes become grey values", default=Imaging())
+    imaging: ImagingSettings = setting(
+        description="how echoes become grey values", default=ImagingSettings()
+    )
     strain: Strain = setting(
         description="strain images, where there is tissue and somebody subscribes", default=Strain()
     )
@@ -277,6 +290,8 @@ class Scene(Settings):
             for entry in fields(Imaging)
             if getattr(self.imaging, entry.name) != entry.default
         ]
+        if self.imaging.acoustics.is_live:
+            asked.append("artefacts along the beams")
         formed = f"formed with {', '.join(asked)}" if asked else "shown as they are cut"
         blood = f", with blood in {', '.join(self.flows)}" if self.flows else ""
         return f"{self.probe.geometry} images are cut by `{self.slice.name}`, {formed}{blood}"

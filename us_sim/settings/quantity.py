@@ -25,7 +25,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "stiffness": {"N/m": 1.0, "N/mm": 1e3},
     "mass per area": {"kg/m2": 1.0, "kg/m^2": 1.0},
     "level": {"dB": 1.0},
-"frequency": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
+    "frequency": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
     "rate": {"Hz": 1.0, "/min": 1 / 60},
     "attenuation": {"dB/cm/MHz": 1.0},
     "acoustic impedance": {"Rayl": 1.0, "MRayl": 1e6},

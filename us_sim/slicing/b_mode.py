@@ -54,7 +54,7 @@ class BMode:
         acoustics: what sound meets along the beams; None for no more than the volume holds.
 
     Raises:
-        ProbeError, VolumeError: the acoustics do not go with volume and probe, see `LiveAcoustics`.
+        ProbeError: the acoustics do not go with volume and probe, see `LiveAcoustics`.
     """
 
     def __init__(
@@ -76,6 +76,7 @@ class BMode:
         self._slicer: Slicer | None = None
         self._surface: ContactSurface | None = None
         self._acoustics: LiveAcoustics | None = None
+        self._prepared: tuple[Probe, Acoustics, LiveAcoustics] | None = None
         self.use(probe, imaging or Imaging(), acoustics)
 
     @property
@@ -92,11 +93,13 @@ class BMode:
         """Use another probe, or other settings, from the next image on.
 
         Raises:
-            ProbeError, VolumeError: as for the class.
+            ProbeError: as for the class.
         """
         self._acoustics = self._live_acoustics(probe, acoustics)
         if self._acoustics is not None:
             imaging = self._acoustics.resolved(imaging)
+            if self._mesh is not None:
+                self._acoustics.carry(*self._mesh)
         self._probe = probe
         self._formation = ImageFormation(probe, imaging)
 
@@ -104,12 +107,14 @@ class BMode:
         """Load what images with these settings will use, so that the first is not late.
 
         Raises:
-            ProbeError, VolumeError: volume, probe and settings do not go together.
+            ProbeError: volume, probe and settings do not go together.
         """
         warm_up(self._method, self._threads)
         live = self._live_acoustics(probe, acoustics)
         if live is not None:
+            assert acoustics is not None
             live.warm_up()
+            self._prepared = probe, acoustics, live
             imaging = live.resolved(imaging)
         formation = ImageFormation(probe, imaging)
         blank = np.zeros((probe.rows, probe.columns), dtype=np.uint8)
@@ -211,12 +216,12 @@ class BMode:
         """What follows the beams; imported only where it is asked for."""
         if acoustics is None or not acoustics.is_live:
             return None
+        prepared, self._prepared = self._prepared, None
+        if prepared is not None and prepared[:2] == (probe, acoustics):
+            return prepared[2]
         from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
 
-        live = LiveAcoustics(self._volume, probe, acoustics, before=self._acoustics)
-        if self._mesh is not None:
-            live.carry(*self._mesh)
-        return live
+        return LiveAcoustics(self._volume, probe, acoustics)
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
         """The surface that the face can touch: the tissue's, or a box around a volume without."""

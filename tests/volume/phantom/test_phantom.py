@@ -81,7 +81,7 @@ def test_structures_of_any_seed_keep_apart(seed):
     arm = UpperArm(seed)
     x, z = np.arange(-20e-3, 25e-3, 0.1e-3), np.arange(5e-3, 50e-3, 0.1e-3)
     for y in (-0.03, 0.0, 0.03):
-        walls = [t.distance(x, y, z)[0] for t in (arm.artery, arm.vein, arm.nerve, arm.humerus)]
+        walls = [t.distance(x, y, z) for t in (arm.artery, arm.vein, arm.nerve, arm.humerus)]
         nearest = np.sort(walls, axis=0)
         assert (nearest[0] + nearest[1]).min() > 0.2e-3
 
@@ -118,21 +118,24 @@ def test_tissues_echo_as_a_sonographer_expects(arm):
     assert grey["muscle"] - max(grey["vein"], grey["artery"]) > 20
 
 
-def test_the_bone_is_bright_where_it_faces_the_probe_and_shadows_the_rest(arm):
+def test_the_volume_knows_nothing_of_where_a_probe_is(arm):
+    """No shadow behind the bone, and nothing that is brighter where it faces the skin."""
     middle = UpperArm(seed=1).humerus.middle(0.0)
-    to_index = arm.patient_to_index
-    i, j, _, _ = np.rint(to_index @ [middle[0], 0.0, 0.0, 1.0]).astype(int)
-    column = (slice(i - 2, i + 3), slice(j - 5, j + 6))
-    first = int(np.argmax(arm.labels[i, j] == UPPER_ARM_LABELS["bone"]))
-    surface = arm.intensities[column][:, :, first - 1 : first + 2].max(axis=2).mean()
-    muscle = arm.intensities[arm.labels == UPPER_ARM_LABELS["muscle"]].mean()
-    assert surface > 200 > 2 * muscle
-    below = arm.labels[i, j, -1] != UPPER_ARM_LABELS["bone"]
-    assert below
-    assert arm.intensities[column][:, :, -4:].mean() < 15
+    i, j, _, _ = np.rint(arm.patient_to_index @ [middle[0], 0.0, 0.0, 1.0]).astype(int)
+    column = (slice(i - 3, i + 4), slice(j - 10, j + 11))
+    bone = arm.labels[column] == UPPER_ARM_LABELS["bone"]
+    muscle = arm.labels[column] == UPPER_ARM_LABELS["muscle"]
+    depth = np.arange(arm.shape[2])
+    first = int(depth[bone.any(axis=(0, 1))].min())
+    behind = muscle & (depth > first)
+    assert behind.any()
+    before = arm.intensities[column][muscle & (depth < first)].mean()
+    assert arm.intensities[column][behind].mean() == pytest.approx(before, abs=15)
+    surface = arm.intensities[column][:, :, first - 1 : first + 2].mean()
+    assert surface < before + 15
 
 
-def test_muscle_behind_a_vein_is_brighter_than_beside_it():
+def test_muscle_behind_a_vein_scatters_as_that_beside_it():
     arm = UpperArm(seed=1)
     x, z = np.arange(-20e-3, 20e-3, 0.2e-3), np.arange(0.1e-3, 30e-3, 0.2e-3)
     behind, beside = [], []
@@ -142,8 +145,7 @@ def test_muscle_behind_a_vein_is_brighter_than_beside_it():
         deep = (z > 19e-3) & (z < 24e-3)
         behind.append((section.diffuse[np.abs(x - middle) < 1e-3][:, deep] ** 2).mean())
         beside.append((section.diffuse[np.abs(x - middle - 9e-3) < 1e-3][:, deep] ** 2).mean())
-    # 5.5 mm of blood instead of muscle: 0.7 dB/mm less loss, nearly 4 dB.
-    assert 10 * np.log10(np.mean(behind) / np.mean(beside)) == pytest.approx(3.85, abs=2.0)
+    assert 10 * np.log10(np.mean(behind) / np.mean(beside)) == pytest.approx(0.0, abs=2.0)
 
 
 @pytest.mark.parametrize(

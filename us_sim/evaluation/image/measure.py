@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from us_sim.evaluation.image.angles import Fibres, Surfaces
 from us_sim.evaluation.image.artefact import Artefact
 from us_sim.evaluation.image.attenuation import Attenuation
 from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.image.report import table, write_report
+from us_sim.evaluation.image.shadow import Shadow
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures, words_of
 from us_sim.evaluation.steps import steps
 
 __all__ = ["ARTEFACTS", "evaluate_image"]
 
-ARTEFACTS: tuple[Artefact, ...] = (Attenuation(),)
+ARTEFACTS: tuple[Artefact, ...] = (
+    Attenuation(),
+    Shadow(),
+    Surfaces(),
+    Fibres(),
+)
 """In the order of the report."""
 
 

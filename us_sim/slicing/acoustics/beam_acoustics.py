@@ -21,19 +21,22 @@ array([-4.5, -4.5, -4.5])
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.slicing.acoustics.beam_grid import BeamGrid
 from us_sim.slicing.acoustics.fibres import Fibres
-from us_sim.slicing.acoustics.media import media_of, surface_levels
+from us_sim.slicing.acoustics.media import decibels_per_metre, media_of, surface_levels
 from us_sim.slicing.acoustics.noise import Noise
 from us_sim.slicing.acoustics.path_loss import follow_beams, room_for_crossings, sharpen_borders
-from us_sim.slicing.acoustics.penumbra import AMPLITUDES, cast_shadows
+from us_sim.slicing.acoustics.penumbra import AMPLITUDES, cast_shadows, sharpen_edges
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.acoustics.surface_echo import ANGLES, GRAIN, draw_surfaces
-from us_sim.slicing.acoustics.surface_normals import SurfaceNormals
+from us_sim.slicing.acoustics.surface_normals import surface_normals_of
 from us_sim.slicing.cutting.located import Located
 from us_sim.slicing.cutting.resampling import full_runs, label_voxels, pixel_to_index
 from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
@@ -41,18 +44,13 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["SPEED_OF_SOUND", "BeamAcoustics", "decibels_per_metre"]
+__all__ = ["SPEED_OF_SOUND", "BeamAcoustics"]
 
 SPEED_OF_SOUND = 1540.0
 """m/s, that scanners take for all soft tissue."""
 
-_PULSE = 1.5  # wavelengths, the length of a surface's echo
+_PULSE = 2.0  # wavelengths, the length of a surface's echo
 _CROSSINGS = 16  # of each beam there is room for
-
-
-def decibels_per_metre(attenuation: float, frequency: float) -> float:
-    """dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
-    return 2.0 * attenuation * 100.0 * frequency * 1e-6
 
 
 class BeamAcoustics:
@@ -64,17 +62,22 @@ class BeamAcoustics:
         acoustics: the settings.
 
     Raises:
-        ProbeError: a label without constants, constants of a label that there is not, or a
-            frequency that the probe does not have.
-        VolumeError: the volume has no labels.
+        ProbeError: a volume without labels, a label without constants, constants of a label that
+            there is not, or a frequency that the probe does not have.
     """
 
     def __init__(self, volume: Volume, probe: Probe, acoustics: Acoustics) -> None:
         self._volume, self._acoustics = volume, acoustics
+        if volume.labels is None:
+            raise acoustics.refused(
+                "artefacts",
+                "`live` needs to know what is where, and the volume has no labels: say `baked`, or "
+                "give a volume with a segmentation",
+            )
         self._voxels, self._shape = label_voxels(volume)
         self.grid = grid = BeamGrid(probe)
         self._probe = probe
-        frequency = frequency_of(acoustics, probe)
+        frequency = acoustics.frequency_among(probe.frequencies)
         self._media, self._constants, directions = media_of(volume, acoustics, frequency, grid.step)
         rise = decibels_per_metre(acoustics.compensation, frequency)
         if not acoustics.attenuation:
@@ -89,11 +92,15 @@ class BeamAcoustics:
         if acoustics.noise is not None:
             self._noise = Noise(probe, acoustics.noise, rise)
         self._surface = surface_levels(self._constants)
-        self._normals: SurfaceNormals | None = None
         self._rest_index = np.empty((0, 3))
         self._corners = np.empty((0, 4), dtype=np.int32)
-        self._gain = np.empty((grid.samples, grid.beams), dtype=np.float32)
-        self._blocked, self._blocker = np.empty_like(self._gain), np.empty_like(self._gain)
+        self._gain = _apart((grid.samples, grid.beams), np.float32)
+        self._blocked, self._blocker = np.zeros_like(self._gain), np.zeros_like(self._gain)
+        columns = -(-probe.columns // grid.steps[1])
+        self._elements = _apart((-(-probe.rows // grid.steps[0]), columns), np.int32)
+        places = grid.places.astype(np.int64)
+        places = places // columns * self._elements.shape[1] + places % columns
+        self._places = np.ascontiguousarray(places, dtype=np.int32)
         self._crossings = room_for_crossings(_CROSSINGS * grid.beams)
         self._across, self._along = (
             np.ascontiguousarray(grid.directions[:, axis], dtype=np.float32) for axis in (0, 1)
@@ -102,11 +109,10 @@ class BeamAcoustics:
         self._at: tuple[Located, NDArray[np.float64]]
         self._lines = grid.lines
         self._dither = _dither(probe.columns)
-
-    def keep(self, other: BeamAcoustics) -> None:
-        """Take over what another one found out about the same volume."""
-        if other._volume is self._volume:
-            self._normals = other._normals
+        self._rigid = np.ascontiguousarray(volume.patient_to_index[:3, :3])
+        self._origin = -probe.image_to_probe[[0, 2], 3] / probe.pixel_spacing
+        plane = probe.plane(Pose())
+        self._runs = full_runs(plane) if plane.spans is None else plane.spans
 
     def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
         """Let a mesh carry the volume: (N, 3) m at rest and (M, 4)."""
@@ -123,18 +129,25 @@ class BeamAcoustics:
         """
         grid, fibre = self.grid, self._no_fibres
         self._at = located, nodes = self._located(frame)
+        self._elements[:, : located.elements.shape[1]] = located.elements
         if self._fibres is not None:
             fibre = self._fibres.now(located, nodes, frame.plane)
         self._found, first = follow_beams(
-            located.elements.reshape(-1), located.maps, self._voxels, self._shape, grid.places,
+            self._elements.reshape(-1), located.maps, self._voxels, self._shape, self._places,
             self._lines, self._across, self._along, self._media, self._time_gain, fibre,
             self._gain, self._blocked, self._blocker, self._crossings,
         )  # fmt: skip
+        if first < grid.samples:
+            sharpen_edges(
+                self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
+                self._voxels, self._shape, self._lines, self._media, grid.samples, grid.beams,
+                self._blocked, self._blocker,
+            )  # fmt: skip
         cast_shadows(
-            first, self._blocked, self._blocker, grid.distance, grid.aperture, grid.spacing,
-            AMPLITUDES, self._gain,
+            first, grid.beams, self._blocked, self._blocker, grid.distance, grid.aperture,
+            grid.spacing, AMPLITUDES, self._gain,
         )  # fmt: skip
-        return self._gain
+        return self._gain[:, : grid.beams]
 
     def heard(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
         """A slice of echoes (rows, columns) as the frame's beams bring them."""
@@ -163,41 +176,23 @@ class BeamAcoustics:
         return Located(elements, maps, np.empty(0, dtype=np.intp)), np.empty((0, 3))
 
     def _draw(self, frame: Frame, out: NDArray[np.uint8]) -> None:
-        assert self._volume.labels is not None
-        if self._normals is None:
-            self._normals = SurfaceNormals(self._volume.labels)
+        normals = surface_normals_of(self._volume)
         grid, plane = self.grid, frame.plane
         located, nodes = self._at
         lateral, axial = self._probe.pixel_spacing
-        origin = self._probe.image_to_probe[[0, 2], 3]
         axes = np.stack([plane.column_step / lateral, plane.row_step / axial])
-        rigid = np.ascontiguousarray(self._volume.patient_to_index[:3, :3])
-        runs = full_runs(plane) if plane.spans is None else plane.spans
         draw_surfaces(
-            self._found, self._crossings, self._surface, self._normals.normals,
-            self._normals.blocks, self._shape, self._rest_index, located.tetrahedra,
-            self._corners, nodes, rigid, axes, grid.step, grid.spacing, grid.starts,
-            grid.directions, lateral, axial, -origin / [lateral, axial], self._pulse,
-            GREYS_PER_DECIBEL, ANGLES, GRAIN, runs, out,
+            self._found, self._crossings, self._surface, normals.normals, normals.blocks,
+            self._shape, self._rest_index, located.tetrahedra, self._corners, nodes, self._rigid,
+            axes, grid.step, grid.spacing, grid.starts, grid.directions, lateral, axial,
+            self._origin, self._pulse, GREYS_PER_DECIBEL, ANGLES, GRAIN, self._runs, out,
         )  # fmt: skip
 
 
-def frequency_of(acoustics: Acoustics, probe: Probe) -> float:
-    """Hz: the frequency that is set, or the middle of the probe's.
-
-    Raises:
-        ProbeError: the probe cannot have it.
-    """
-    low, high = probe.frequencies
-    if acoustics.frequency is None:
-        return float(np.sqrt(low * high))
-    if not low <= acoustics.frequency <= high:
-        raise acoustics.refused(
-            "frequency",
-            f"{acoustics.frequency * 1e-6:g} MHz is not one that this probe has, which are "
-            f"{low * 1e-6:g} to {high * 1e-6:g} MHz (probe.frequencies)",
-        )
-    return acoustics.frequency
+def _apart(shape: tuple[int, int], kind: type[np.number]) -> NDArray[Any]:
+    """Zeros with so many columns that rows do not compete for the same lines of a cache."""
+    lines = -(-shape[1] // 16) | 1  # of 64 bytes, an odd number
+    return np.zeros((shape[0], 16 * lines), dtype=kind)
 
 
 def _dither(columns: int) -> NDArray[np.float32]:

@@ -4,7 +4,7 @@
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> grid = BeamGrid(LinearProbe(aperture=0.04, depth=0.04, columns=512, rows=512))
 >>> grid.beams, grid.samples, round(grid.step * 1e3, 4)  # mm
-(256, 128, 0.3125)
+(256, 86, 0.4688)
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 
 __all__ = ["BeamGrid", "aperture"]
 
-_STEP = 0.3e-3  # m, between samples, where the image is as fine as that
+_STEP = 0.45e-3  # m, between samples, where the image is as fine as that
 _PIXELS_ACROSS = 2  # a beam
-_ROWS = (2, 4)  # rows a sample, at least and at most
+_ROWS = (2, 6)  # rows a sample, at least and at most
 
 _F_NUMBER = 2.0  # depth over the length of face that looks there
 _APERTURE = (1.5e-3, 1 / 3)  # m, and fraction of the face: the least and the most that is used
@@ -106,6 +106,11 @@ class BeamGrid:
         sample = np.clip(sample, 0, self.samples - 1).astype(np.float32)
         nearest, fractions = cv2.convertMaps(beam, sample, cv2.CV_16SC2)
         return np.asarray(nearest), np.asarray(fractions)
+
+    @property
+    def room(self) -> tuple[int, int]:
+        """Rows and columns of pixels that all samples and beams of a linear array are on."""
+        return self.samples * self.steps[0], self.beams * self.steps[1]
 
     def on_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (samples, beams) at the pixels (rows, columns), linear in between."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.acoustics.beam_acoustics import SPEED_OF_SOUND, BeamAcoustics, frequency_of
+from us_sim.slicing.acoustics.beam_acoustics import SPEED_OF_SOUND, BeamAcoustics
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.frame import Frame
@@ -30,25 +30,15 @@ class LiveAcoustics:
         volume: its labels say what is where.
         probe: its geometry.
         acoustics: the settings.
-        before: what was used until now; of the same volume it knows surfaces already.
 
     Raises:
-        ProbeError: a label has no constants, constants no label, or the probe not the frequency.
-        VolumeError: the volume has no labels.
+        ProbeError: the volume has no labels, a label no constants, constants no label, or the probe
+            not the frequency.
     """
 
-    def __init__(
-        self,
-        volume: Volume,
-        probe: Probe,
-        acoustics: Acoustics,
-        *,
-        before: LiveAcoustics | None = None,
-    ) -> None:
+    def __init__(self, volume: Volume, probe: Probe, acoustics: Acoustics) -> None:
         self._volume, self._probe, self._acoustics = volume, probe, acoustics
         self._beams = BeamAcoustics(volume, probe, acoustics)
-        if before is not None:
-            self._beams.keep(before._beams)
 
     def resolved(self, imaging: Imaging) -> Imaging:
         """The console's settings with the blur of a frequency below the volume's own.
@@ -57,7 +47,7 @@ class LiveAcoustics:
         section 6.6). What the volume's own frequency has blurred already is taken off in squares.
         """
         own = self._acoustics.volume_frequency
-        frequency = frequency_of(self._acoustics, self._probe)
+        frequency = self._acoustics.frequency_among(self._probe.frequencies)
         if own is None or frequency >= own:
             return imaging
         wavelength = SPEED_OF_SOUND * math.sqrt(1.0 / frequency**2 - 1.0 / own**2)

@@ -22,11 +22,23 @@ from us_sim.slicing.acoustics.surface_echo import MIRROR
 from us_sim.slicing.acoustics.tissue_table import AROUND
 from us_sim.volume.volume import Volume
 
-__all__ = ["constants_by_label", "crossing_loss", "media_of", "reflection", "surface_levels"]
+__all__ = [
+    "constants_by_label",
+    "crossing_loss",
+    "decibels_per_metre",
+    "media_of",
+    "reflection",
+    "surface_levels",
+]
 
 _SOFT = (0.8e6, 3.0e6)
 """Rayl, of soft tissue and fluid: what has more or less is bone or gas, which casts a shadow."""
 _FAINTEST = -200.0  # dB, in place of nothing
+
+
+def decibels_per_metre(attenuation: float, frequency: float) -> float:
+    """dB/m that an echo loses there and back, at an attenuation in dB/cm/MHz and Hz."""
+    return 2.0 * attenuation * 100.0 * frequency * 1e-6
 
 
 def reflection(before: float, behind: float) -> float:
@@ -73,16 +85,16 @@ def media_of(
     by_label = constants_by_label(volume, acoustics)
     of_label = np.full(256, NOTHING, dtype=np.uint8)
     constants: list[TissueAcoustics] = []
-    directions: list[tuple[float, ...]] = []
+    directions: list[tuple[float, float, float]] = []
     for label, tissue in by_label.items():
         if tissue not in constants:
             constants.append(tissue)
         of_label[label] = 1 + constants.index(tissue)
         is_used = acoustics.anisotropy and tissue.has_fibres
-        if is_used and tissue.fibres not in directions:
+        if is_used and tissue.fibres is not None and tissue.fibres not in directions:
             directions.append(tissue.fibres)
     count = 1 + len(constants)
-    loss, scattering = np.zeros(count), np.zeros(count)
+    loss, shadow, scattering = np.zeros(count), np.zeros(count), np.zeros(count)
     crossing = np.zeros((count, count))
     fibres = np.full(count, -1, dtype=np.int32)
     anisotropy, half_sine = np.zeros(count), np.ones(count)
@@ -92,18 +104,24 @@ def media_of(
         assert tissue.impedance is not None
         scattering[number] = tissue.scattering
         if acoustics.attenuation:
-            loss[number] = 2.0 * tissue.attenuation * 100.0 * frequency * 1e-6 * step
+            per_sample = step * decibels_per_metre(1.0, frequency)
+            loss[number] = per_sample * tissue.attenuation
             blocks[number] = not _SOFT[0] <= tissue.impedance <= _SOFT[1]
+            if blocks[number]:
+                nominal = min(tissue.attenuation, acoustics.compensation)
+                loss[number] = per_sample * nominal
+                shadow[number] = per_sample * (tissue.attenuation - nominal)
             for other, behind in enumerate(constants, 1):
                 assert behind.impedance is not None
                 crossing[number, other] = crossing_loss(tissue.impedance, behind.impedance)
-        if acoustics.anisotropy and tissue.has_fibres:
+        if tissue.fibres in directions:
             fibres[number] = directions.index(tissue.fibres)
             anisotropy[number] = tissue.anisotropy
             half_sine[number] = np.sin(tissue.half_angle) ** 2
     media = Media(
         of_label,
         loss.astype(np.float32),
+        shadow.astype(np.float32),
         crossing.astype(np.float32),
         blocks,
         scattering.astype(np.float32),

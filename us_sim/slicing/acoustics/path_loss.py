@@ -4,9 +4,10 @@ Sound goes there and back, so in a tissue of attenuation α (dB/cm/MHz, of the a
 direction) an echo loses 2 α f dB each centimetre (Beer and Lambert). A border of impedances Z1 and
 Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude, and of an echo from behind it 1 - R² passes
 in both directions together (Szabo 2014, section 3.3). Where a beam crosses a border is found to a
-256th of a sample, so that the loss at each sample is that of the true path.
+64th of a sample, so that the loss at each sample is that of the true path.
 
-What bone and gas take is kept apart: their shadows have soft edges (`penumbra`).
+What bone and gas take beyond what soft tissue would is kept apart: their shadows have soft edges
+(`penumbra`).
 """
 
 from __future__ import annotations
@@ -19,13 +20,25 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.trilinear import SLACK
 
-__all__ = ["NOTHING", "Crossings", "Media", "follow_beams", "room_for_crossings", "sharpen_borders"]
+__all__ = [
+    "END",
+    "NOTHING",
+    "Crossings",
+    "Media",
+    "follow_beams",
+    "medium_at",
+    "room_for_crossings",
+    "sharpen_borders",
+]
 
 NOTHING = 0
 """The medium where there is no tissue."""
 
-_BEGIN, _END = -0.5 - SLACK, -0.5 + SLACK  # of a volume, from its first index and its side
-_HALVINGS = 8  # of a sample, to find where a beam crosses a border
+_BEGIN = -0.5 - SLACK
+END = -0.5 + SLACK
+"""Of a volume, in voxels from its side."""
+
+_HALVINGS = 6  # of a sample, to find where a beam crosses a border
 _DARK = 30.0  # dB after which it does not matter where more is lost
 
 
@@ -33,7 +46,8 @@ class Media(NamedTuple):
     """What the labels of a volume are to sound at one frequency; medium 0 is `NOTHING`."""
 
     of_label: NDArray[np.uint8]  # (256,) the medium of each label
-    loss: NDArray[np.float32]  # (media,) dB, of an echo in a sample's length
+    loss: NDArray[np.float32]  # (media,) dB, of an echo in a sample's length, as of soft tissue
+    shadow: NDArray[np.float32]  # (media,) dB likewise, that bone and gas take beyond it
     crossing: NDArray[np.float32]  # (media, media) dB, of an echo from behind the border
     blocks: NDArray[np.bool_]  # (media,) whether it is bone or gas
     scattering: NDArray[np.float32]  # (media,) dB
@@ -50,6 +64,7 @@ class Crossings(NamedTuple):
     media: NDArray[np.uint8]  # (crossings, 2) before and behind
     element: NDArray[np.int32]  # the map that holds there
     voxel: NDArray[np.float32]  # (crossings, 3) voxel index just behind
+    slope: NDArray[np.float32]  # (crossings, 3) voxels a sample
     level: NDArray[np.float32]  # dB of the soft loss and the time gain there
 
 
@@ -60,6 +75,7 @@ def room_for_crossings(count: int) -> Crossings:
         np.empty(count, np.float32),
         np.empty((count, 2), np.uint8),
         np.empty(count, np.int32),
+        np.empty((count, 3), np.float32),
         np.empty((count, 3), np.float32),
         np.empty(count, np.float32),
     )
@@ -93,7 +109,7 @@ def follow_beams(
     nothing = np.float32(0.0)
     of_label = media.of_label
     sides = (shape[0], shape[1], shape[2])
-    ends = (sides[0] + _END, sides[1] + _END, sides[2] + _END)
+    ends = (sides[0] + END, sides[1] + END, sides[2] + END)
     for k in range(beams):
         soft = nothing
         hard = nothing
@@ -126,16 +142,15 @@ def follow_beams(
                     gx = m[0, 1] * to_column + m[0, 2] * to_row
                     gy = m[1, 1] * to_column + m[1, 2] * to_row
                     gz = m[2, 1] * to_column + m[2, 2] * to_row
-                medium = _medium_at(x, y, z, voxels, sides, ends, of_label)
+                medium = medium_at(x, y, z, voxels, sides, ends, of_label)
             held = element
             length = half if s == 0 else one
             if medium == was:
-                loss = length * media.loss[medium]
+                soft += length * media.loss[medium]
                 if media.blocks[medium]:
+                    loss = length * media.shadow[medium]
                     where = _blocked_at(where, hard, loss, s)
                     hard += loss
-                else:
-                    soft += loss
             else:
                 low = 0.0
                 high = 1.0
@@ -144,23 +159,20 @@ def follow_beams(
                 elif was != NOTHING and medium != NOTHING:
                     for _ in range(_HALVINGS):
                         middle = 0.5 * (low + high)
-                        there = _medium_at(
-                            px + middle * (x - px), py + middle * (y - py), pz + middle * (z - pz), voxels, sides,
-                            ends, of_label,
-                        )  # fmt: skip
+                        ax, ay, az = middle * (x - px), middle * (y - py), middle * (z - pz)
+                        there = medium_at(px + ax, py + ay, pz + az, voxels, sides, ends, of_label)
                         if there == was:
                             low = middle
                         else:
                             high = middle
                 t = np.float32(0.5 * (low + high))
-                before = t * media.loss[was]
-                behind = (length - t) * media.loss[medium]
+                rest = length - t
                 border = media.crossing[was, medium]
+                soft += t * media.loss[was]
                 if media.blocks[was]:
-                    where = _blocked_at(where, hard, before, s)
-                    hard += before
-                else:
-                    soft += before
+                    loss = t * media.shadow[was]
+                    where = _blocked_at(where, hard, loss, s)
+                    hard += loss
                 if was != NOTHING and medium != NOTHING and found < room:
                     crossings.beam[found] = k
                     crossings.distance[found] = np.float32(s) - one + t
@@ -170,6 +182,9 @@ def follow_beams(
                     crossings.voxel[found, 0] = px + high * (x - px)
                     crossings.voxel[found, 1] = py + high * (y - py)
                     crossings.voxel[found, 2] = pz + high * (z - pz)
+                    crossings.slope[found, 0] = x - px
+                    crossings.slope[found, 1] = y - py
+                    crossings.slope[found, 2] = z - pz
                     crossings.level[found] = time_gain[s] - soft - hard
                     found += 1
                 if media.blocks[was] or media.blocks[medium]:
@@ -177,11 +192,11 @@ def follow_beams(
                     hard += border
                 else:
                     soft += border
+                soft += rest * media.loss[medium]
                 if media.blocks[medium]:
-                    where = _blocked_at(where, hard, behind, s)
-                    hard += behind
-                else:
-                    soft += behind
+                    loss = rest * media.shadow[medium]
+                    where = _blocked_at(where, hard, loss, s)
+                    hard += loss
                 was = medium
             level = time_gain[s] - soft + media.scattering[medium]
             direction = media.fibres[medium]
@@ -209,7 +224,7 @@ def _blocked_at(where, hard, loss, s):
 
 
 @njit(inline="always", error_model="numpy")
-def _medium_at(x, y, z, voxels, sides, ends, of_label):
+def medium_at(x, y, z, voxels, sides, ends, of_label):
     """The medium at a voxel index: of the nearest voxel, `NOTHING` beyond the volume.
 
     Args:

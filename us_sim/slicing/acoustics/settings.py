@@ -12,6 +12,7 @@ us_sim.errors.ProbeError: imaging.acoustics.frequency: 8e+07 Hz is outside 50000
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.acoustics.tissue_table import table_constants
 
-__all__ = ["Acoustics", "TissueAcoustics"]
+__all__ = ["Acoustics", "SoundSettings", "TissueAcoustics"]
 
 _FREQUENCY = Quantity("frequency", 0.5e6, 50e6)
 
@@ -57,27 +58,27 @@ class TissueAcoustics(Settings):
     scattering: float = setting(
         Quantity("level", -60.0, 60.0), "added to the echoes that the volume holds", default=0.0
     )
-    fibres: tuple[float, ...] = setting(
-        Quantity("number", -1.0, 1.0), "x, y, z in `patient` of its fibres at rest", default=()
+    fibres: tuple[float, float, float] | None = setting(
+        Quantity("number", -1.0, 1.0), "x, y, z in `patient` of its fibres at rest", default=None
     )
     anisotropy: float = setting(
         Quantity("level", 0.0, 60.0), "most by which echoes fall along the fibres", default=12.0
     )
     half_angle: float = setting(
-        Quantity("angle", 0.01, 1.5),
+        Quantity("angle", math.radians(1), math.radians(89)),
         "between the beam and the fibres' perpendicular at which they fall by half of that",
-        default=0.35,
+        default=math.radians(20),
     )
 
     def check(self) -> None:
-        """Fibres have a direction of three numbers, or none."""
-        if any(self.fibres) and len(self.fibres) != 3:
-            raise self.refused("fibres", f"needs 3 values, not {len(self.fibres)}")
+        """Fibres have a direction, if any."""
+        if self.fibres is not None and not any(self.fibres):
+            raise self.refused("fibres", "0, 0, 0 is no direction: leave it out for none")
 
     @property
     def has_fibres(self) -> bool:
         """Whether its echoes depend on a direction."""
-        return any(self.fibres) and self.anisotropy > 0.0
+        return self.fibres is not None and self.anisotropy > 0.0
 
     def resolved(self, name: str) -> TissueAcoustics:
         """With the textbook's constants of a label's name where none are given.
@@ -90,19 +91,18 @@ class TissueAcoustics(Settings):
         for place, key in enumerate(("attenuation", "impedance")):
             if getattr(self, key) is None:
                 if found is None:
-                    error = self.refused(
+                    raise self.refused(
                         f"{name}.{key}",
-                        f"is missing, and the textbook's table has no tissue of the name `{name}`: "
-                        f"give one",
+                        f"is missing, and the table of textbooks' constants has no tissue of the "
+                        f"name `{name}`: give its {key}",
                     )
-                    raise error
                 values[key] = found[place]
         return dataclasses.replace(self, **values) if values else self
 
 
 @dataclass(frozen=True)
-class Acoustics(Settings):
-    """Artefacts of sound along the current beams; each part costs nothing where it is off.
+class SoundSettings(Settings):
+    """What of sound's artefacts is made along the current beams; a part that is off costs nothing.
 
     Raises:
         ProbeError: a value is out of range, with its name and the range.
@@ -141,18 +141,41 @@ class Acoustics(Settings):
     )
     anisotropy: bool = setting(description="fading of fibres off the perpendicular", default=True)
     noise: float | None = setting(
-        Quantity("level", -160.0, -20.0),
+        Quantity("level", -160.0, 0.0),
         "of the electronics at the face, which the time gain lifts; not given: none",
         default=None,
-    )
-    tissues: Mapping[str, TissueAcoustics] = setting(
-        description="constants by label; of what is not said, the textbook's", default_factory=dict
     )
 
     @property
     def is_live(self) -> bool:
         """Whether artefacts are made along the beams."""
         return self.artefacts == "live"
+
+    def frequency_among(self, frequencies: tuple[float, float]) -> float:
+        """Hz: the frequency that is set, or the middle of those that a probe has.
+
+        Raises:
+            ProbeError: the probe cannot have it.
+        """
+        low, high = frequencies
+        if self.frequency is None:
+            return math.sqrt(low * high)
+        if not low <= self.frequency <= high:
+            raise self.refused(
+                "frequency",
+                f"{self.frequency * 1e-6:g} MHz is not one that this probe has, which are "
+                f"{low * 1e-6:g} to {high * 1e-6:g} MHz (probe.frequencies)",
+            )
+        return self.frequency
+
+
+@dataclass(frozen=True)
+class Acoustics(SoundSettings):
+    """What sound meets along the current beams, and the acoustic constants of each tissue."""
+
+    tissues: Mapping[str, TissueAcoustics] = setting(
+        description="constants by label; of what is not said, the textbook's", default_factory=dict
+    )
 
     def of(self, name: str) -> TissueAcoustics:
         """The constants of the tissue with a label of that name.

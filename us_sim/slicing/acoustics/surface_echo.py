@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from us_sim.kernels import njit
-from us_sim.slicing.acoustics.surface_normals import BLOCK
+from us_sim.slicing.acoustics.surface_normals import BLOCK, DISTANCE
 
 __all__ = ["GRAIN", "MIRROR", "angle_loss", "draw_surfaces"]
 
@@ -30,8 +30,9 @@ ROUGHNESS = 0.35
 
 _DIFFUSE = -25.0  # dB, of what a rough border sends in all directions, at a right angle
 _GRAZING = 0.3  # least cosine for the slope with which an echo is drawn
-_GRAIN_SIDE = 32
-_LONGEST = 1.5  # pulse lengths on either side of a border that are drawn
+_GRAIN_SIDE = 16  # voxels
+_STEEPEST = 0.05  # least rate at which rows lead away from a border that is not along them
+_LONGEST = 1.2  # pulse lengths on either side of a border that are drawn
 _FLAT = 1e-30
 
 
@@ -49,7 +50,7 @@ def _angle_table() -> np.ndarray:
 
 
 def _grain() -> np.ndarray:
-    """(32, 32, 32) float32 dB: borders are patchy, as the tissue at them is."""
+    """(16, 16, 16) float32 dB: borders are patchy, as the tissue at them is."""
     random = np.random.Generator(np.random.PCG64(11))
     noise = random.standard_normal((_GRAIN_SIDE,) * 3) + 1j * random.standard_normal(
         (_GRAIN_SIDE,) * 3
@@ -58,7 +59,7 @@ def _grain() -> np.ndarray:
     square = sum(np.square(f) for f in np.meshgrid(frequency, frequency, frequency, indexing="ij"))
     smooth = np.fft.ifftn(np.fft.fftn(noise) * np.exp(-square / (2 * 0.12**2)))
     # A smooth echo of one phase, and a weaker one that speckles.
-    echo = np.abs(1.0 + 0.5 * smooth / np.sqrt(np.mean(np.abs(smooth) ** 2)))
+    echo = np.abs(1.0 + 0.8 * smooth / np.sqrt(np.mean(np.abs(smooth) ** 2)))
     level = 20.0 * np.log10(np.maximum(echo, 0.1))
     return np.asarray(level - level.mean(), dtype=np.float32)
 
@@ -130,6 +131,15 @@ def draw_surfaces(
         if level * greys + 255.0 < 1.0:
             continue
         slope = max(size, _GRAZING) * (1.0 if cosine >= 0.0 else -1.0)
+        # From the step of voxels that the beam crosses to the smooth surface.
+        ahead = normal[3] / -DISTANCE
+        towards = 0.0
+        for axis, centre in enumerate((i, j, m)):
+            part = normal[axis] / 127.0
+            ahead -= part * (crossings.voxel[f, axis] - centre)
+            towards += part * crossings.slope[f, axis]
+        if abs(towards) > _GRAZING * abs(ahead):
+            at += ahead / towards
         away = (at + 0.5) * step
         x = starts[k, 0] + away * dx
         z = starts[k, 1] + away * dz
@@ -143,24 +153,32 @@ def draw_surfaces(
         left, right = _within(
             to_pixel[0] + (x - wide) / across, to_pixel[0] + (x + wide) / across, columns
         )
-        for row in range(top, bottom):
-            qz = (row - to_pixel[1]) * down - z
-            for column in range(left, right):
-                qx = (column - to_pixel[0]) * across - x
-                lateral = qx * dz - qz * dx
-                if abs(lateral) > half:
-                    continue
-                # Along the beam, to the border's tangent.
-                t = (nx * qx + nz * qz) / slope
-                if abs(t) > longest:
-                    continue
-                fainter = 6.0206 * (2.0 * t / pulse) ** 2  # 6 dB at half the pulse's length
-                grey = np.int64(255.5 + (level - fainter) * greys)
-                if grey > image[row, column] and (
-                    runs[row, 0, 0] <= column < runs[row, 0, 1]
-                    or runs[row, 1, 0] <= column < runs[row, 1, 1]
+        # How far a pixel in row 0 is along the beam from the border's tangent, and by row.
+        by_row = nz * down / slope
+        grey = level * greys + 255.5
+        fading = 6.0206 * 4.0 / (pulse * pulse) * greys  # 6 dB at half the pulse's length
+        for column in range(left, right):
+            qx = (column - to_pixel[0]) * across - x
+            start = (nx * qx - nz * (to_pixel[1] * down + z)) / slope
+            lateral = qx * dz + (to_pixel[1] * down + z) * dx
+            upper, lower = top, bottom
+            if by_row > _STEEPEST * down:
+                upper, lower = _within(
+                    (-longest - start) / by_row, (longest - start) / by_row, rows
+                )
+                upper, lower = max(upper, top), min(lower, bottom)
+            for row in range(upper, lower):
+                t = start + row * by_row
+                shown = grey - fading * t * t
+                if (
+                    shown > image[row, column] + 0.5
+                    and abs(lateral - row * down * dx) <= half
+                    and (
+                        runs[row, 0, 0] <= column < runs[row, 0, 1]
+                        or runs[row, 1, 0] <= column < runs[row, 1, 1]
+                    )
                 ):
-                    image[row, column] = min(grey, 255)
+                    image[row, column] = 255 if shown > 255.0 else int(shown)
 
 
 @njit(inline="always", error_model="numpy")

@@ -2,7 +2,8 @@
 
 The normal is the gradient of what lies within a few voxels: 1 where it has the voxel's own label
 and 0 elsewhere, weighted as a Gaussian. So the steps of voxels are smoothed away. It is a covector
-of voxel indices, as the gradient of a function of these is.
+of voxel indices, as the gradient of a function of these is. The weighted mean of the same tells how
+far the surface is from the voxel's centre: of a half space it is the normal distribution.
 
 Normals are kept in blocks of 8³ voxels, where there are surfaces at all.
 
@@ -10,22 +11,30 @@ Normals are kept in blocks of 8³ voxels, where there are surfaces at all.
 >>> from us_sim.slicing.acoustics.surface_normals import SurfaceNormals
 >>> labels = np.zeros((24, 24, 24), np.uint8)
 >>> labels[:, :, 12:] = 1
->>> SurfaceNormals(labels).at(10, 10, 12)
-array([0., 0., 1.])
+>>> normal, distance = SurfaceNormals(labels).at(10, 10, 12)
+>>> normal, round(distance, 1)  # the surface is half a voxel before the voxel's centre
+(array([0., 0., 1.]), 0.5)
 """
 
 from __future__ import annotations
+
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
+from us_sim.volume.volume import Volume
 
-__all__ = ["BLOCK", "SurfaceNormals"]
+__all__ = ["BLOCK", "DISTANCE", "SurfaceNormals", "surface_normals_of"]
 
 BLOCK = 8
+DISTANCE = 40.0
+"""Parts of a voxel in which the distance of a surface is kept."""
+
 _REACH = 3  # voxels
 _SIGMA = 1.5  # voxels
+_PARTS = 256  # of the weighted mean that are told apart
 
 
 class SurfaceNormals:
@@ -35,19 +44,50 @@ class SurfaceNormals:
         shape = np.array(labels.shape, dtype=np.int64)
         self.blocks = np.full(tuple(-(-shape // BLOCK)), -1, dtype=np.int32)
         offset = np.arange(-_REACH, _REACH + 1)
-        weights = np.exp(-0.5 * (offset / _SIGMA) ** 2).astype(np.float32)
+        weights = np.exp(-0.5 * (offset / _SIGMA) ** 2)
+        weights = (weights / weights.sum()).astype(np.float32)
         flat = labels.reshape(-1)
         count = _mark_blocks(flat, shape, self.blocks)
-        self.normals = np.zeros((count, BLOCK**3, 3), dtype=np.int8)
-        _fill_normals(flat, shape, weights, self.blocks, self.normals)
+        self.normals = np.zeros((count, BLOCK**3, 4), dtype=np.int8)
+        _fill_normals(flat, shape, weights, _DISTANCES, self.blocks, self.normals)
 
-    def at(self, i: int, j: int, k: int) -> NDArray[np.float64]:
-        """(3,) into the voxel's own label, of length 1; zeros where there is no surface."""
+    def at(self, i: int, j: int, k: int) -> tuple[NDArray[np.float64], float]:
+        """(3,) into the voxel's own label, of length 1, and how many voxels away the surface is.
+
+        Zeros where there is no surface.
+        """
         block = self.blocks[i // BLOCK, j // BLOCK, k // BLOCK]
         if block < 0:
-            return np.zeros(3)
+            return np.zeros(3), 0.0
         within = ((i % BLOCK) * BLOCK + j % BLOCK) * BLOCK + k % BLOCK
-        return np.asarray(self.normals[block, within] / 127.0)
+        found = self.normals[block, within]
+        return np.asarray(found[:3] / 127.0), float(found[3] / DISTANCE)
+
+
+def _distances() -> NDArray[np.int8]:
+    """(`_PARTS`,) how far a plane is in `DISTANCE`-ths of a voxel, by the part on this side."""
+    part = (np.arange(_PARTS) + 0.5) / _PARTS
+    # A Gaussian that ends at the reach, of voxels: as the mean of a half space's would be.
+    offset = np.arange(-_REACH, _REACH + 1)
+    weights = np.exp(-0.5 * (offset / _SIGMA) ** 2)
+    total = np.concatenate([[0.0], np.cumsum(weights / weights.sum())])
+    return (
+        np.asarray(np.rint(DISTANCE * np.interp(part, total, np.append(offset, _REACH + 1) - 0.5)))
+        .clip(-127, 127)
+        .astype(np.int8)
+    )
+
+
+_DISTANCES = _distances()
+_found: WeakKeyDictionary[Volume, SurfaceNormals] = WeakKeyDictionary()
+
+
+def surface_normals_of(volume: Volume) -> SurfaceNormals:
+    """The normals of a volume's labels, found when they are first asked for (about a second)."""
+    assert volume.labels is not None
+    if volume not in _found:
+        _found[volume] = SurfaceNormals(volume.labels)
+    return _found[volume]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -91,7 +131,7 @@ def _has_surface(labels, shape, i0, j0, k0):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_normals(labels, shape, weights, blocks, normals):
+def _fill_normals(labels, shape, weights, distances, blocks, normals):
     for a in range(blocks.shape[0]):
         for b in range(blocks.shape[1]):
             for c in range(blocks.shape[2]):
@@ -104,14 +144,17 @@ def _fill_normals(labels, shape, weights, blocks, normals):
                         for k in range(k0, min(k0 + BLOCK, shape[2])):
                             if _beside_another(labels, shape, i, j, k):
                                 within = ((i - i0) * BLOCK + j - j0) * BLOCK + k - k0
-                                _gradient(labels, shape, weights, i, j, k, normals[block, within])
+                                _gradient(
+                                    labels, shape, weights, distances, i, j, k,
+                                    normals[block, within],
+                                )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gradient(labels, shape, weights, i, j, k, out):
-    """Sets the unit normal in 127ths."""
+def _gradient(labels, shape, weights, distances, i, j, k, out):
+    """Sets the unit normal in 127ths, and the surface's distance."""
     own = labels[(i * shape[1] + j) * shape[2] + k]
-    x = y = z = np.float32(0.0)
+    x = y = z = total = np.float32(0.0)
     for a in range(-_REACH, _REACH + 1):
         p = min(max(i + a, 0), shape[0] - 1)
         for b in range(-_REACH, _REACH + 1):
@@ -122,6 +165,7 @@ def _gradient(labels, shape, weights, i, j, k, out):
                 r = min(max(k + c, 0), shape[2] - 1)
                 if labels[row + r] == own:
                     w = both * weights[c + _REACH]
+                    total += w
                     x += w * np.float32(a)
                     y += w * np.float32(b)
                     z += w * np.float32(c)
@@ -131,3 +175,4 @@ def _gradient(labels, shape, weights, i, j, k, out):
         out[0] = np.int8(np.rint(scale * x))
         out[1] = np.int8(np.rint(scale * y))
         out[2] = np.int8(np.rint(scale * z))
+        out[3] = distances[min(int(total * np.float32(_PARTS)), _PARTS - 1)]

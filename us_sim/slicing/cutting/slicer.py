@@ -180,6 +180,7 @@ def warm_up(name: str, threads: int = 1) -> None:
     plane = LinearProbe(aperture=0.01, depth=0.01, columns=4, rows=4).plane(Pose())
     slicer.image(1.1 * nodes, plane)
     slicer.labels(nodes, plane)
+    slicer.locate_some(nodes, plane, (2, 2))
     slicer.rest_coordinates(nodes, plane)
     sample_plane(volume, plane, threads=threads)
     sample_labels(volume, plane, threads=threads)

@@ -3,7 +3,7 @@
 >>> import numpy as np
 >>> from us_sim.volume.phantom.tube import Tube
 >>> vein = Tube(centre=(2e-3, 13e-3), radii=(3.5e-3, 2.75e-3))
->>> distance, _ = vein.distance(np.array([2e-3]), 0.0, np.array([13e-3 - 2.75e-3]))
+>>> distance = vein.distance(np.array([2e-3]), 0.0, np.array([13e-3 - 2.75e-3]))
 >>> abs(round(float(distance[0, 0]), 9))
 0.0
 """
@@ -39,8 +39,8 @@ class Tube:
 
     def distance(
         self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (X, Z) m from the wall, negative inside, and the z of its outward unit normal.
+    ) -> NDArray[np.float64]:
+        """Distance (X, Z) m from the wall, negative inside.
 
         The distance is exact on the wall and right to first order beside it.
         """
@@ -51,4 +51,4 @@ class Tube:
         radius = np.sqrt(np.maximum(across**2 + down**2, 1e-12))
         slope = np.sqrt((across / self.radii[0]) ** 2 + (down / self.radii[1]) ** 2)
         slope = np.maximum(slope, 1e-6 / max(self.radii))
-        return (radius - 1.0) * radius / slope, down / self.radii[1] / slope
+        return np.asarray((radius - 1.0) * radius / slope)

@@ -1,8 +1,12 @@
-"""The anatomy of a virtual upper arm: its structures, and how they echo.
+"""The anatomy of a virtual upper arm: its structures, and how they scatter.
 
 A block of the inner side of the arm, the skin at z = 0, vessels and humerus along y. Proportions
 follow what ultrasound shows at mid-arm: the brachial artery between a vein and the median nerve,
 in a sheath under the fascia, biceps above and brachialis below, the humerus to one side.
+
+What depends on where the probe is has no place in it: loss, shadows, the borders of structures and
+the noise of a scanner, see `us_sim.slicing.acoustics`. Sheets of connective tissue within fat and
+muscle lie along the skin for the most part, so those that do are the stronger ones.
 
 >>> import numpy as np
 >>> from us_sim.volume.phantom.upper_arm import UPPER_ARM_LABELS, UpperArm
@@ -43,12 +47,8 @@ UPPER_ARM_LABELS = {
     "nerve": 7,
 }
 
-_ATTENUATION = np.array([0.0, 1600.0, 800.0, 950.0, 6000.0, 250.0, 250.0, 950.0])
-"""Attenuation there and back at 8 MHz, dB/m by label: twice 0.15 (blood) to 1 (skin) dB/cm/MHz;
-bone's leaves nothing. The scanner's time gain gives back a little less than muscle takes."""
-
-_TIME_GAIN = 820.0
 _SIDE_LOBES = -27.0  # dB
+_BLOOD = -60.0  # dB, all but free of echoes
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class UpperArm:
         self._muscles(section)
         self._bundle(section)
         self._bone(section)
-        _attenuate(section)
+        _add_side_lobes(section)
         return section
 
     def _layers(self, section: ArmSection) -> None:
@@ -149,7 +149,6 @@ class UpperArm:
         section.interface(profile * self._patchy(section) * (0.1 + 0.9 * facing), -11.0)
         section.fill("skin", below < 0.0, _echo(-25.0 - 2800.0 * below + cloud))
         section.interface(_sheet(z[None, :] - 0.15e-3, 0.15e-3), -5.0)
-        section.interface(_sheet(below, 0.15e-3), -15.0)
 
     def _muscles(self, section: ArmSection) -> None:
         """Add biceps, brachialis and triceps under the fascia, with the septa between them."""
@@ -180,7 +179,6 @@ class UpperArm:
                 profile, facing = sheets(fibres.plane(x, y, shifted), section.steps, thickness)
                 profile *= patchy * (0.1 + 0.9 * facing) * muscle
                 section.interface(profile, level + gain)
-        section.interface(_sheet(z - fascia, 0.22e-3), -9.0)
         section.interface(_sheet(z - fascia - 0.7e-3, 0.12e-3) * patchy, -16.0)
         section.interface(_sheet(left_of_septum, 0.2e-3) * (z > 13e-3) * patchy, -18.0)
         section.interface(_sheet(under_biceps, 0.2e-3) * ~triceps * (0.4 + 0.6 * patchy), -13.0)
@@ -189,22 +187,16 @@ class UpperArm:
         """Add artery, vein and nerve in bright connective tissue."""
         x, y, z = section.x, section.y, section.depth
         walls = [tube.distance(x, y, z) for tube in (self.artery, self.vein, self.nerve)]
-        near = np.maximum(np.min([distance for distance, _ in walls], axis=0), 0.0)
+        near = np.maximum(np.min(walls, axis=0), 0.0)
         sheath = _echo(-31.0 + 2.0 * self._cloud.plane(x, y, z)) * _sheet(near, 1.0e-3)
         np.maximum(section.diffuse, sheath, out=section.diffuse)
-        _vessel(section, "artery", *walls[0], wall=0.3e-3, level=-7.0)
-        _vessel(section, "vein", *walls[1], wall=0.18e-3, level=-11.0)
-        self._nerve(section, *walls[2])
+        for label, distance in zip(("artery", "vein"), walls, strict=False):
+            section.fill(label, distance < 0.0, np.full(distance.shape, _echo(_BLOOD)))
+        self._nerve(section, walls[2])
 
-    def _nerve(
-        self,
-        section: ArmSection,
-        distance: NDArray[np.float64],
-        normal_z: NDArray[np.float64],
-    ) -> None:
+    def _nerve(self, section: ArmSection, distance: NDArray[np.float64]) -> None:
         """Add a nerve: dark fascicles in a bright honeycomb."""
         section.fill("nerve", distance < 0.0, np.full(distance.shape, _echo(-23.0)))
-        section.interface(_sheet(distance, 0.15e-3) * (0.3 + 0.7 * normal_z**2), -14.0)
         (middle_x, middle_z), (radius_x, radius_z) = self.nerve.middle(section.y), self.nerve.radii
         for across, down in self._fascicles:
             squares_x = ((section.x - middle_x - across * radius_x) / 0.50e-3) ** 2
@@ -212,13 +204,11 @@ class UpperArm:
             section.diffuse[squares_x[:, None] + squares_z < 1.0] = _echo(-48.0)
 
     def _bone(self, section: ArmSection) -> None:
-        """Add the humerus: a bright line where it faces the beam, and faint echoes behind it."""
+        """Add the humerus, which scatters little."""
         x, y, z = section.x, section.y, section.depth
-        distance, normal_z = self.humerus.distance(x, y, z)
+        distance = self.humerus.distance(x, y, z)
         distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse
         section.fill("bone", distance < 0.0, np.full(distance.shape, _echo(-42.0)))
-        facing = np.maximum(-normal_z, 0.0) ** 3
-        section.interface(_sheet(distance + 0.15e-3, 0.22e-3) * (0.02 + 0.98 * facing), 7.0)
 
     def _patchy(self, section: ArmSection) -> NDArray[np.float64]:
         """(X, Z) from 0 to 1: no sheet of connective tissue echoes everywhere."""
@@ -226,30 +216,9 @@ class UpperArm:
         return np.clip(0.55 + 0.5 * noise, 0.0, 1.0)
 
 
-def _vessel(
-    section: ArmSection,
-    label: str,
-    distance: NDArray[np.float64],
-    normal_z: NDArray[np.float64],
-    *,
-    wall: float,
-    level: float,
-) -> None:
-    """Add a vessel: an almost echo-free lumen, and a wall that echoes where it faces the beam."""
-    section.fill(label, distance < 0.0, np.full(distance.shape, _echo(-60.0)))
-    facing = 0.08 + 0.92 * normal_z**4
-    section.interface(_sheet(distance - wall, wall) * facing * (distance >= 0.0), level)
-
-
-def _attenuate(section: ArmSection) -> None:
-    """Apply the loss along the beam less the time gain, and side lobes, also in lumens."""
+def _add_side_lobes(section: ArmSection) -> None:
+    """Add what side lobes hear of the surroundings, which lumens are not free of."""
     step_x, step_z = section.steps
-    loss = _ATTENUATION[section.labels] * (section.z > 0.0) * step_z
-    loss = np.cumsum(loss, axis=1) - 0.5 * loss - _TIME_GAIN * section.depth
-    # The beam is as wide as its aperture over bone's edge, so a shadow's side is soft.
-    arriving = gaussian_filter1d(_echo(-loss), 0.8e-3 / step_x, axis=0)
-    section.diffuse[:] *= arriving
-    section.specular[:] *= arriving
     power = gaussian_filter1d(section.diffuse**2 + section.specular**2, 2.5e-3 / step_x, axis=0)
     power = gaussian_filter1d(power, 0.5e-3 / step_z, axis=1)
     section.diffuse[:] = np.sqrt(section.diffuse**2 + _echo(_SIDE_LOBES) ** 2 * power)
