@@ -2,8 +2,9 @@
 
 Edges of the surface are springs; each vertex is a particle that a spring of zero length and a
 damper tie to its rest position. The probe's repulsion is taken to its rigid limit: a particle
-inside the collider is put on its surface and loses its velocity into it, so that no particle is
-ever inside. Particles move by symplectic Euler (the paper, equations 3 to 5).
+inside the collider is put on its surface, with which it moves on, so that none is ever inside, and
+places between particles (`us_sim.skin.contact`) hardly are. Particles move by symplectic Euler (the
+paper, equations 3 to 5).
 
 An unstretched spring does not resist a displacement across it, and skin of such springs has a
 crease where contact ends. Skin in the body is under tension, which smooths it: the springs are
@@ -17,8 +18,8 @@ the paper's.
 >>> from us_sim.skin.surface import plane_surface
 >>> skin = SkinMembrane(plane_surface((0.1, 0.1), 0.005), Sphere(0.03))
 >>> pressed = skin.deform(Pose([0, 0, 0.005]))
->>> f"{pressed.vertices[:, 2].max():.4f} m"
-'0.0050 m'
+>>> f"{pressed.vertices[:, 2].max():.3f} m"
+'0.005 m'
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.triangle_parts import TriangleParts, part_size
 from us_sim.kernels import njit
-from us_sim.skin.contact import push_out
+from us_sim.skin.contact import PartArrays, push_out
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces
 from us_sim.skin.surface import TriangleSurface
@@ -58,6 +60,9 @@ _JUMP = 0.03
 """A probe that moves farther than this between frames was lifted and set down elsewhere, m."""
 
 _MOST_STEPS = 400  # in a frame
+
+_STRETCHED = 1.5
+"""Length that an edge may reach in a frame, over the longest at its beginning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,13 @@ class SkinMembrane:
         length = np.sqrt((at_rest**2).sum(axis=1))
         self._natural_length = (1.0 - settings.prestrain) * length
         self._rest_tension = np.ascontiguousarray(at_rest * settings.prestrain)
+
+        triangles = surface.triangles
+        corners = surface.vertices[triangles]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        rounding = float(collider.offset_box[3])
+        parts = TriangleParts(sides.max(axis=1), part_size(rounding, float(np.median(sides))))
+        self._parts = PartArrays(triangles.astype(np.uint32), parts.first, parts.weights)
 
         valence = np.bincount(surface.edges.ravel(), minlength=len(surface.vertices))
         # Gershgorin's bound: no mode is stiffer than twice a particle's springs plus its anchor.
@@ -182,6 +194,7 @@ class SkinMembrane:
             self._decay,
             self._time_step,
             steps,
+            self._parts,
             self._collider.offset_box,
             _placement(start),
             _placement(pose),
@@ -263,14 +276,14 @@ def _placement(pose: Pose | None) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relax(
     x, v, rest, edges, natural_length, rest_tension, stiffness, anchor, mass, decay,
-    time_step, steps, box, start, end, pressed,
+    time_step, steps, parts, box, start, end, pressed,
 ):  # fmt: skip
     """Moves the membrane on in time, and the probe from ``start`` to ``end``.
 
     Args:
         x, v: (N, 3) m and m/s, changed here. rest: (N, 3) m. edges: (E, 2).
         natural_length: (E,) m. rest_tension: (E, 3) m, of a spring at rest, over its stiffness.
-        mass, decay: (N,) kg and 1/s. box: the collider's ``offset_box``.
+        mass, decay: (N,) kg and 1/s. parts: `PartArrays`. box: the collider's ``offset_box``.
         start, end: (7,) placements of the probe. pressed: whether there is one.
 
     Returns:
@@ -278,15 +291,15 @@ def _relax(
     """
     n = len(x)
     before = x.copy()
-    force = np.empty((n, 3))
-    normal = np.zeros((n, 3))
-    touched = np.zeros(n, dtype=np.bool_)
+    force, last, way = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
+    longest = _STRETCHED * _longest(x, edges)
     contacts = 0
     awake = False
     for i in range(n):
         for a in range(3):
             awake = awake or x[i, a] != rest[i, a] or v[i, a] != 0.0
     for step in range(1, steps + 1):
+        last[:] = x
         if awake:
             spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness, anchor)
             for i in range(n):
@@ -297,8 +310,11 @@ def _relax(
                     v[i, a] = kept * (v[i, a] + gain * force[i, a])
                     x[i, a] += time_step * v[i, a]
         if pressed:
-            contacts = push_out(x, v, normal, touched, box, start, end, step / steps)
+            contacts = push_out(x, way, mass, parts, longest, box, start, end, step / steps)
             awake = awake or contacts > 0
+            for i in range(n if contacts else 0):
+                if way[i, 0] != 0.0 or way[i, 1] != 0.0 or way[i, 2] != 0.0:
+                    _follow(x[i], last[i], time_step, v[i])
 
     if not awake:
         return 0.0, 0.0, contacts
@@ -307,17 +323,44 @@ def _relax(
     borne = 0.0
     moved = 0.0
     for i in range(n):
-        into = 0.0
-        if touched[i]:
-            for a in range(3):
-                into += force[i, a] * normal[i, a]
-            into = min(into, 0.0)
+        # What pushes a particle acts along its way, and can hold what pulls it back.
+        length = way[i, 0] ** 2 + way[i, 1] ** 2 + way[i, 2] ** 2
+        along = way[i, 0] * force[i, 0] + way[i, 1] * force[i, 1] + way[i, 2] * force[i, 2]
+        held = min(along, 0.0) / length if length > 0.0 else 0.0
         distance = 0.0
         for a in range(3):
-            unbalanced += (force[i, a] - into * normal[i, a]) ** 2
+            unbalanced += (force[i, a] - held * way[i, a]) ** 2
             borne += (anchor * (x[i, a] - rest[i, a])) ** 2
             distance += (x[i, a] - before[i, a]) ** 2
         moved = max(moved, distance)
     if borne == 0.0:
         return 0.0, np.sqrt(moved), contacts
     return np.sqrt(unbalanced / borne), np.sqrt(moved), contacts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow(now, last, time_step, velocity):
+    """The velocity (3,) of a particle that was pushed: that of its way, but no faster than before.
+
+    So contact never adds to the energy of motion, and what rests against the probe has none.
+    """
+    before = after = 0.0
+    for a in range(3):
+        before += velocity[a] ** 2
+        velocity[a] = (now[a] - last[a]) / time_step
+        after += velocity[a] ** 2
+    if after > before:
+        scale = np.sqrt(before / after)
+        for a in range(3):
+            velocity[a] *= scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _longest(x, edges):
+    """m, the length of the longest edge."""
+    square = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e]
+        away = (x[i, 0] - x[j, 0]) ** 2 + (x[i, 1] - x[j, 1]) ** 2 + (x[i, 2] - x[j, 2]) ** 2
+        square = max(square, away)
+    return np.sqrt(square)

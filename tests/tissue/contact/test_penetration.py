@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.triangle_parts import part_size
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.penetration import only_forward, push_out, wrench_on_probe
-from us_sim.tissue.contact.surface_points import SurfacePoints, point_size
+from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
@@ -151,7 +152,7 @@ def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
     model, pressed, deformation = pressed_by_a_curved_face("fem_nonlinear")
     spacing = model.contact_spacing
     displacement = (deformation.nodes - model.mesh.nodes).T
-    points = SurfacePoints(model, point_size(CONVEX.rounding, spacing))
+    points = SurfacePoints(model, part_size(CONVEX.rounding, spacing))
     distance, _ = signed_distance(CONVEX, pressed, points.rest + points.moved(displacement))
     assert -0.1 * spacing < distance.min() < 0.0
     touching = deformation.nodes[deformation.contact_nodes]

@@ -14,7 +14,6 @@ from us_sim.tissue.contact.surface_points import (
     SurfacePoints,
     add_springs,
     add_turns,
-    point_size,
 )
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -222,12 +221,6 @@ def test_where_nothing_can_be_touched_there_are_no_points():
     points = SurfacePoints(with_contact_nodes([]), 1.0)
     assert points.moved(np.ones((3, COUNT))).shape == (0, 3)
     assert not points.at_nodes(np.zeros(0)).any()
-
-
-def test_parts_are_as_large_as_the_rounding_between_the_spacing_and_a_quarter_of_it():
-    assert point_size(0.004, 0.01) == pytest.approx(0.004)
-    assert point_size(0.05, 0.01) == pytest.approx(0.01)
-    assert point_size(1e-5, 0.01) == pytest.approx(0.0025)
 
 
 @pytest.mark.parametrize("size", [0.01, 1.0])

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from us_sim.geometry.triangle_parts import part_size
 from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
-from us_sim.tissue.contact.surface_points import SurfacePoints, point_size
+from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness, shear_times_area
 from us_sim.tissue.model import TissueModel
 
@@ -45,7 +46,7 @@ def surface_contact(
     """
     # A lone node has no neighbour to be apart from.
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
-    points = SurfacePoints(model, point_size(float(model.collider.offset_box[3]), spacing))
+    points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
     firm = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
     strongest = _GREATEST_PUSH * points.spread(shear_times_area(model.mesh, model.materials))
     law = (FlaredProbe(model.collider, spacing), firm, strongest, _STIFFENING * spacing)

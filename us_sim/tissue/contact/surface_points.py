@@ -1,10 +1,7 @@
 """Points spread over the surface that a probe can touch, and what they share with its nodes.
 
-Contact belongs to the surface, not to its nodes: between them too the probe must not sink in. So
-triangles are divided until their parts are small enough for an edge of the probe to be felt, and
-each part has a point in its middle that stands for its area and moves with the triangle's nodes (as
-quadrature points do; P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section 9). A node
-that the probe can touch, but no triangle's, is a point by itself.
+They are in the middles of the triangles' parts (`us_sim.geometry.triangle_parts`) and at the nodes.
+A node that the probe can touch, but no triangle's, is a point by itself.
 
 >>> import numpy as np
 >>> from us_sim.tissue.contact.surface_points import SurfacePoints
@@ -27,15 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.triangle_parts import TriangleParts
 from us_sim.kernels import njit
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["SurfacePoints", "add_springs", "add_turns", "point_size"]
+__all__ = ["SurfacePoints", "add_springs", "add_turns"]
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
-
-_FELT, _FINEST = 1.0, 0.25
-"""Size of a part over the probe's rounding, and at least over the spacing of the nodes."""
 
 _SHARE = 0.5
 """Part of a point's spring that each of its nodes gets by weight, where they do not share it. From
@@ -49,13 +44,6 @@ this proportion to one in the middle, what changes with the square of the place 
 
 _WEAK = 0.2
 """A spring at a node that is weaker than this part of all there is left out."""
-
-
-def point_size(rounding: float, spacing: float) -> float:
-    """m, the longest side of a triangle's parts, for a probe of some rounding (m) and nodes that
-    are ``spacing`` (m) apart.
-    """
-    return min(max(_FELT * rounding, _FINEST * spacing), spacing)
 
 
 class SurfacePoints:
@@ -81,22 +69,16 @@ class SurfacePoints:
         np.add.at(corner_area, triangles, area[:, None] / 3)
         corner_area[reached & ~model.fixed & (corner_area == 0.0)] = 1.0  # of nodes by themselves
         own = np.flatnonzero((corner_area > 0.0) & ~model.fixed)
-        nodes, weights = (
-            [np.repeat(own[:, None], 3, axis=1)],
-            [np.tile([1.0, 0.0, 0.0], (len(own), 1))],
-        )
-        areas = [np.where(np.isin(own, triangles), _AT_NODES, 1.0) * corner_area[own]]
-        area = (1 - _AT_NODES) * area
-        parts = np.maximum(np.ceil(longest / size - 1e-9), 1).astype(int)
-        for count in np.unique(parts):
-            those, middles = np.flatnonzero(parts == count), _middles(count)
-            nodes.append(np.repeat(triangles[those], len(middles), axis=0))
-            weights.append(np.tile(middles, (len(those), 1)))
-            areas.append(np.repeat(area[those] / len(middles), len(middles)))
+        parts = TriangleParts(longest, size)
+        nodes = (np.repeat(own[:, None], 3, axis=1), triangles[parts.triangle])
         self.nodes = np.concatenate(nodes).astype(np.int64)  # (P, 3)
+        weights = (np.tile([1.0, 0.0, 0.0], (len(own), 1)), parts.weights)
         self.weights = np.concatenate(weights)  # (P, 3) of these nodes; they sum to one
+        share = np.where(np.isin(own, triangles), _AT_NODES, 1.0)
+        area = (1 - _AT_NODES) * area / np.diff(parts.first)
+        areas = (share * corner_area[own], area[parts.triangle])
         self.rest = np.einsum("pk,pkd->pd", self.weights, mesh.nodes[self.nodes])  # (P, 3) m
-        self._area = np.concatenate(areas)
+        self._area = np.concatenate(areas)  # (P,) m2
         self._count, self._fixed = len(mesh.nodes), model.fixed
         self._all = np.arange(len(self.nodes))
         total = self.at_nodes(self._area)
@@ -190,16 +172,6 @@ class SurfacePoints:
         along, firm = np.empty((3 * len(used), 3)), np.empty(3 * len(used))
         count = _split(used, tensor, nodes, along, firm)
         return nodes[:count], along[:count], firm[:count]
-
-
-def _middles(count: int) -> NDArray[np.float64]:
-    """(count^2, 3) barycentric coordinates of the middles of a triangle's equal parts."""
-    row, column = np.divmod(np.arange(count * count), count)
-    lower = row + column < count
-    first = np.column_stack([row, column])[lower] + 1 / 3
-    second = np.column_stack([row, column])[row + column < count - 1] + 2 / 3
-    two = np.concatenate([first, second]) / count
-    return np.column_stack([1 - two.sum(axis=1), two])
 
 
 @njit(**_LOOP)
