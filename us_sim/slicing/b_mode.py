@@ -26,7 +26,7 @@ from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.frame import Frame
+from us_sim.slicing.frame import Contact, Frame
 from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
@@ -171,6 +171,7 @@ class BMode:
             self._volume,
             self._slicer,
             partial(self._form, self._formation, self._acoustics),
+            meet=self._meet if self._formation.needs_contact else None,
             mesh=self._mesh if nodes is not None else None,
             number=number,
             time=time,
@@ -205,12 +206,14 @@ class BMode:
         """The picture of a frame."""
         slices = [frame.slice(plane) for plane in formation.planes(frame.pose, frame.plane)]
         heard = None if acoustics is None else acoustics.heard(frame)
-        if not formation.needs_contact:
-            return formation.form(slices, heard=heard)
+        coupling, gap = frame.contact or (None, None)
+        return formation.form(slices, coupling, gap, heard)
+
+    def _meet(self, frame: Frame) -> Contact:
+        """How each line of a frame meets the skin."""
         surface = self._contact_surface(frame.nodes is not None)
         where = surface.rest_nodes if frame.nodes is None else frame.nodes
-        coupling, gap = surface.contact(where, frame.probe, frame.pose)
-        return formation.form(slices, coupling, gap, heard)
+        return surface.contact(where, frame.probe, frame.pose)
 
     def _live_acoustics(self, probe: Probe, acoustics: Acoustics | None) -> LiveAcoustics | None:
         """What follows the beams; imported only where it is asked for."""

@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from us_sim.slicing.cutting.slicer import Slicer
     from us_sim.volume.volume import Volume
 
-__all__ = ["Frame", "Mesh"]
+__all__ = ["Contact", "Frame", "Mesh"]
 
+Contact = tuple[NDArray[np.float32], NDArray[np.float64]]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 
 
@@ -52,6 +53,7 @@ class Frame:
         volume: in frame ``patient``.
         slicer: of the mesh; needed where there are nodes.
         form: makes the picture of the frame.
+        meet: how each line meets the skin, see `contact`; None where all are taken to meet it.
         mesh: rest nodes (N, 3) m and tetrahedra (M, 4) that carry the volume; None without nodes.
         number: of the poses so far; frames with successive numbers follow one another.
         time: s since 1970, of the pose; what moves by itself, as blood does, moves with it.
@@ -67,6 +69,7 @@ class Frame:
         slicer: Slicer | None,
         form: Callable[[Frame], NDArray[np.uint8]],
         *,
+        meet: Callable[[Frame], Contact] | None = None,
         mesh: Mesh | None = None,
         number: int = 0,
         time: float = 0.0,
@@ -78,6 +81,7 @@ class Frame:
         self.volume = volume
         self._slicer = slicer if nodes is not None else None
         self._form = form
+        self._meet = meet
         self.mesh = mesh
         self.number = number
         self.time = time
@@ -103,6 +107,15 @@ class Frame:
             VolumeError: the volume has too many voxels.
         """
         return self._form(self)
+
+    @cached_property
+    def contact(self) -> Contact | None:
+        """Coupling (lines,) from 0 in air to 1, and gap (lines,) m; None where none is modelled.
+
+        Raises:
+            MeshError: as for `pixels`.
+        """
+        return None if self._meet is None else self._meet(self)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8]:

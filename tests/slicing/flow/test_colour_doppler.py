@@ -15,6 +15,7 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
 from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.probe import LinearProbe
 
@@ -213,3 +214,26 @@ def test_a_nyquist_velocity_of_zero_and_a_filter_of_everything_are_refused():
         ColourSettings(nyquist_velocity=0.0)
     with pytest.raises(ProbeError, match=r"colour.wall_filter: 0.1 m/s is not below nyquist_vel"):
         ColourSettings(nyquist_velocity=0.1, wall_filter=0.1)
+
+
+def test_beams_whose_face_is_in_the_air_show_nothing():
+    """With the face along the vessel and one end lifted, lines there are not coupled."""
+    volume = tube_volume()
+    blood = Blood([tube_vessel(ARTERY, volume)])
+    turn = np.radians(30) / 2  # about y, so that one end of the face is lifted
+    lifted = Pose([0.0, 0.0, -1e-3], [0.0, np.sin(turn), 0.0, np.cos(turn)])
+    along = Pose([0.0] * 3, [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    frames = [
+        BMode(volume, PROBE, Imaging(contact=contact)).frame(along @ lifted, None, time=SYSTOLE)
+        for contact in (True, False)
+    ]
+    coupling, _ = frames[0].contact
+    assert coupling.min() == 0.0
+    assert frames[1].contact is None
+    settings_ = dataclasses.replace(WIDE, nyquist_velocity=1.0)
+    coupled, free = (
+        ~np.isnan(ColourDoppler(PROBE, settings_).estimate(blood, frame)) for frame in frames
+    )
+    dead = coupling[np.linspace(0, PROBE.lines - 1, PROBE.columns).round().astype(int)] < 0.1
+    assert free[:, dead].any()
+    assert not coupled[:, dead].any()

@@ -9,7 +9,8 @@ blood of both is in one place they cancel. Here R is made from velocities that a
 
     R = w(v) exp(i pi v / n), averaged over the resolution, plus noise,
 
-with a wall filter w, which takes what is as slow as tissue, and complex normal noise. Part of the
+with a wall filter w, which takes what is as slow as tissue, and complex normal noise; beams whose
+part of the face is in air have no signal. Part of the
 noise is proportional to R, as blood moves through the beam and is not the same from pulse to pulse
 (spectral broadening), part is not (the receiver's); both fall with the square root of the number of
 pulses. Places where R stays below a level show no colour, and gain lowers that.
@@ -45,7 +46,7 @@ __all__ = ["ColourDoppler"]
 _SHOWN = 0.3
 """Size of R, over that of fast blood, from which colour is shown with a gain of 0 dB."""
 
-_BROADENING, _RECEIVER = 0.5, 0.2
+_BROADENING, _RECEIVER = 0.35, 0.15
 """Standard deviation of the noise for one pulse, over R and over that of fast blood."""
 
 _COLOURS = (
@@ -115,6 +116,8 @@ class ColourDoppler:
         turned = np.empty((*self._window.shape, 2), dtype=np.float32)
         velocity = blood.velocity(frame, self._window)
         _turn(velocity, settings.nyquist_velocity, settings.wall_filter, turned)
+        if frame.contact is not None:
+            turned *= frame.contact[0][self._lines][..., None]
         for _ in range(2):  # twice even is a triangle, half as high at its width apart
             cv2.blur(turned, self._cell, turned, borderType=cv2.BORDER_CONSTANT)
         since, self._time = frame.time - self._time, frame.time
@@ -151,6 +154,16 @@ class ColourDoppler:
         slope = math.tan(self.settings.steering) / self._probe.aperture
         return np.asarray((depth - self._depth) * slope)
 
+    def _lines_of(
+        self, fraction: NDArray[np.float32], depth: NDArray[np.float32]
+    ) -> NDArray[np.intp]:
+        """The line at whose place on the face the steered beam of each pixel starts."""
+        probe = self._probe
+        start = np.nan_to_num(fraction)
+        if isinstance(probe, LinearProbe):
+            start = start - depth * math.tan(self.settings.steering) / probe.aperture
+        return np.clip(np.rint((start + 0.5) * probe.lines - 0.5), 0, probe.lines - 1).astype(int)
+
     def _lay_out(self) -> None:
         """Find the pixels of the box."""
         fraction, depth = fractions_and_depths(self._probe)
@@ -164,6 +177,7 @@ class ColourDoppler:
         box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         self._within = np.ascontiguousarray(within[box])
         self._corner = int(rows[0]), int(columns[0])
+        self._lines = self._lines_of(fraction[box], depth[box])
         angles = beam_angles(self._probe, fraction[box], self.settings.steering)
         self._window = Window(self._probe, angles, corner=self._corner)
         # Beyond the box nothing is computed, as no beams go there.

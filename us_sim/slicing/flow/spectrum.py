@@ -77,6 +77,8 @@ class Spectrum:
         wide = _BEAM * ((np.arange(_ACROSS) + 0.5) / _ACROSS - 0.5)
         offsets = far[:, None, None] * along + wide[None, :, None] * across
         places = middle + offsets.reshape(-1, 2) / probe.pixel_spacing
+        line = round((settings.lateral + 0.5) * probe.lines - 0.5)
+        self._line = min(max(line, 0), probe.lines - 1)
         self._window = Window(probe, np.full(len(places), angle), places)
         self.lines = _gate_lines(middle, along, across, settings, probe)
         nyquist, cosine = settings.nyquist_velocity, math.cos(settings.angle_correction)
@@ -105,9 +107,11 @@ class Spectrum:
         velocities = means[None] * pulses[which].T  # where there is no vessel the mean is NaN
         power = np.empty((_ROWS, len(moments)))
         seeds = np.rint(moments * 1e6).astype(np.uint64)
+        heard = 1.0 if frame.contact is None else float(frame.contact[0][self._line]) ** 2
         _fill_spectra(
-            velocities, settings.nyquist_velocity, self._lowest, settings.wall_filter, seeds, power
-        )
+            velocities, settings.nyquist_velocity, self._lowest, settings.wall_filter, heard,
+            seeds, power,
+        )  # fmt: skip
         level = 10.0 * np.log10(power) + settings.gain
         grey = 255.0 * (1.0 + level / settings.dynamic_range)
         return np.asarray(np.clip(grey, 0.0, 255.0).astype(np.uint8)[::-1])
@@ -135,8 +139,12 @@ def _gate_lines(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_spectra(velocities, nyquist, lowest, wall, seeds, power):
-    """Fills power (rows, K) from velocities (K, P), NaN outside blood; row 0 is ``lowest``."""
+def _fill_spectra(velocities, nyquist, lowest, wall, heard, seeds, power):
+    """Fills power (rows, K) from velocities (K, P), NaN outside blood; row 0 is ``lowest``.
+
+    Args:
+        heard: power of blood's echoes that the probe hears. seeds: (K,) of the noise.
+    """
     rows = power.shape[0]
     per_row = 2.0 * nyquist / rows
     for k in range(len(velocities)):
@@ -152,7 +160,7 @@ def _fill_spectra(velocities, nyquist, lowest, wall, seeds, power):
             reach = np.int64(np.ceil(4.0 * sigma / per_row))
             first = np.int64(np.floor(middle)) - reach
             # The narrowest spectrum has power 1 where it is highest.
-            height = nyquist * _LEAST_BROADENING / sigma / places
+            height = heard * nyquist * _LEAST_BROADENING / sigma / places
             for r in range(first, first + 2 * reach + 2):
                 apart = (r - middle) * per_row / sigma
                 power[r % rows, k] += height * np.exp(-0.5 * apart * apart)
