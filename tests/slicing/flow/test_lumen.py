@@ -46,8 +46,8 @@ def test_places_are_along_the_tube_and_radial_coordinates_as_in_a_cylinder():
     angle, part = random.uniform(0, 2 * np.pi, 200), random.uniform(0.05, 1.3, 200)
     along = random.uniform(-15e-3, 15e-3, 200)
     points = np.column_stack([3e-3 * part * np.cos(angle), along, 3e-3 * part * np.sin(angle)])
-    station, squares = lumen.locate(points + MIDDLE)
-    assert np.sqrt(squares) == pytest.approx(part, rel=0.06)
+    station, offset = lumen.locate(points + MIDDLE)
+    assert np.hypot(*offset.T) == pytest.approx(part, rel=0.06)
     forward = np.sign(lumen.centres[-1, 1] - lumen.centres[0, 1])
     place = lumen.centres[0, 1] + forward * station * lumen.spacing
     assert place == pytest.approx(along, abs=0.3e-3)

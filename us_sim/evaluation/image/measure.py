@@ -7,6 +7,7 @@ from pathlib import Path
 from us_sim.evaluation.image.angles import Fibres, Surfaces
 from us_sim.evaluation.image.artefact import Artefact
 from us_sim.evaluation.image.attenuation import Attenuation
+from us_sim.evaluation.image.flow import Flow
 from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.image.report import table, write_report
 from us_sim.evaluation.image.shadow import Shadow
@@ -21,6 +22,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
     Shadow(),
     Surfaces(),
     Fibres(),
+    Flow(),
 )
 """In the order of the report."""
 

@@ -127,7 +127,7 @@ class Blood:
             axis = np.ascontiguousarray(vessel.axis_velocity @ in_image * -factor)
             _find_velocity(
                 located.elements.reshape(-1), located.maps, window.pixel, window.column, window.row,
-                window.x, window.z, vessel.map.corner, vessel.map.station, vessel.map.radial, axis,
+                window.x, window.z, vessel.map.corner, vessel.map.station, vessel.map.offset, axis,
                 np.int8(number), velocity, which,
             )  # fmt: skip
         return velocity.reshape(window.shape), which.reshape(window.shape)
@@ -145,7 +145,7 @@ def _located(frame: Frame) -> Located:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_velocity(
-    elements, maps, pixel, columns, rows, beam_x, beam_z, corner, station, radial, axis, number,
+    elements, maps, pixel, columns, rows, beam_x, beam_z, corner, station, offset, axis, number,
     velocity, which,
 ):  # fmt: skip
     """Writes velocity (P,) and which (P,) of places in a vessel's lumen.
@@ -154,7 +154,7 @@ def _find_velocity(
         elements: of all pixels. maps: (E, 3, 3) from (1, column, row) to voxel indices.
         pixel: (P,) number of the pixel at each place, -1 outside the image. columns, rows: (P,).
         beam_x, beam_z: (P,) the beams' directions. corner: (3,) voxels.
-        station, radial: (i, j, k). axis: (S, 2) m/s along the probe's x and z.
+        station: (i, j, k). offset: (i, j, k, 2). axis: (S, 2) m/s along the probe's x and z.
     """
     last_i = station.shape[0] - 2
     last_j = station.shape[1] - 2
@@ -178,7 +178,9 @@ def _find_velocity(
         i = min(np.int64(u), last_i)
         j = min(np.int64(v), last_j)
         k = min(np.int64(w), last_k)
-        r = _blended(radial, i, j, k, u - i, v - j, w - k)
+        across = _blended(offset[..., 0], i, j, k, u - i, v - j, w - k)
+        down = _blended(offset[..., 1], i, j, k, u - i, v - j, w - k)
+        r = across * across + down * down
         if not r < 1.0:
             continue
         s = _blended(station, i, j, k, u - i, v - j, w - k)

@@ -11,9 +11,9 @@ over that of the wall in the same direction: 0 on the axis and 1 at the wall.
 >>> lumen = lumen_of(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]))
 >>> bool(np.allclose(lumen.areas, np.pi * 3e-3**2, rtol=0.05))
 True
->>> station, radial_squared = lumen.locate(np.array([[6.5e-3, 15e-3, 5e-3]]))  # 1.5 of 3 mm off
->>> round(float(radial_squared[0]), 1)
-0.3
+>>> station, offset = lumen.locate(np.array([[6.5e-3, 15e-3, 5e-3]]))  # 1.5 of 3 mm off
+>>> round(float(np.hypot(*offset[0])), 1)
+0.5
 """
 
 from __future__ import annotations
@@ -85,9 +85,10 @@ class Lumen:
     def locate(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Place along the stations (P,), and the square of the radial coordinate (P,).
+        """Place along the stations (P,), and offset (P, 2) across the tube from its middle.
 
-        Beyond its ends the tube goes on straight, with the place of its last station.
+        The offset is that over the wall's distance in its direction, so that its length is the
+        radial coordinate. Beyond its ends the tube goes on straight, with its last station's place.
 
         Args:
             points: (P, 3) m.
@@ -106,7 +107,7 @@ class Lumen:
         row = np.arange(len(points))
         part = turn - np.floor(turn)
         wall = near[row, low] * (1.0 - part) + near[row, (low + 1) % DIRECTIONS] * part
-        return station, (x**2 + y**2) / wall**2
+        return station, np.stack([x, y], axis=1) / wall[:, None]
 
 
 def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) -> Lumen:

@@ -33,7 +33,7 @@ __all__ = ["LumenMap", "Vessel"]
 _ALONG = 0.25
 """Least cosine between the direction that is set and the vessel's own."""
 
-_OUTSIDE = 9.0  # square of a radial coordinate that is well outside the wall
+_OUTSIDE = 3.0  # radial coordinate that is well outside the wall
 _MARGIN = 2  # voxels beyond the wall in which coordinates are known
 
 
@@ -145,9 +145,10 @@ class Vessel:
 
 
 class LumenMap:
-    """Place along a vessel, and square of the radial coordinate, of the voxels around its lumen.
+    """Place along a vessel, and offset across it as `Lumen.locate` says, of voxels around it.
 
-    Its cell (0, 0, 0) is the volume's voxel at ``corner`` (3,).
+    The offset is kept and not the radial coordinate, since it is as good as linear from voxel to
+    voxel. Cell (0, 0, 0) is the volume's voxel at ``corner`` (3,).
     """
 
     def __init__(self, lumen: Lumen, volume: Volume, label: int) -> None:
@@ -158,7 +159,7 @@ class LumenMap:
         index = np.indices(shape).reshape(3, -1).T + low
         to_patient = volume.index_to_patient
         points = index @ to_patient[:3, :3].T + to_patient[:3, 3]
-        station, radial = lumen.locate(points)
+        station, offset = lumen.locate(points)
         self.station = station.astype(np.float32).reshape(shape)
-        self.radial = np.minimum(radial, _OUTSIDE).astype(np.float32).reshape(shape)
+        self.offset = np.clip(offset, -_OUTSIDE, _OUTSIDE).astype(np.float32).reshape(*shape, 2)
         self.corner = low
