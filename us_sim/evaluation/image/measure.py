@@ -11,6 +11,7 @@ from us_sim.evaluation.image.flow import Flow
 from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.image.report import table, write_report
 from us_sim.evaluation.image.shadow import Shadow
+from us_sim.evaluation.image.strain import StrainImages
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures, words_of
 from us_sim.evaluation.steps import steps
@@ -22,6 +23,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
     Shadow(),
     Surfaces(),
     Fibres(),
+    StrainImages(),
     Flow(),
 )
 """In the order of the report."""

@@ -83,7 +83,7 @@ class StrainStream(_StrainImages):
     def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
         super().__init__(node, parameters)
         self._strain: AxialStrain | None = None
-        self._mesh: object = None
+        self._made_for: tuple[object, str] = (None, "")
         self._earlier = Earlier(lambda frame: frame.nodes)
 
     def prepare(self, probe: Probe) -> None:
@@ -95,8 +95,10 @@ class StrainStream(_StrainImages):
         before = self._earlier.before(frame, settings.interval)
         if settings.since == "image" and before is None:
             return None
-        if self._strain is None or self._mesh is not frame.mesh:
-            self._mesh, self._strain = frame.mesh, AxialStrain.of(frame)
+        mesh, borders = self._made_for
+        if self._strain is None or mesh is not frame.mesh or borders != settings.borders:
+            self._made_for = frame.mesh, settings.borders
+            self._strain = AxialStrain.of(frame, sharp=settings.borders == "sharp")
         return self._strain.image(frame, before if settings.since == "image" else None)
 
     def _note(self, values: NDArray[np.float32]) -> str:

@@ -33,7 +33,8 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.row_bands import parallel_rows
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import LinearProbe, Probe
-from us_sim.slicing.strain.nodal_strain import nodal_deformation, tetrahedra_around, to_pixels
+from us_sim.slicing.strain.main_label import main_labels
+from us_sim.slicing.strain.nodal_strain import corners_by_tissue, nodal_deformation, to_pixels
 
 __all__ = ["AxialStrain"]
 
@@ -43,29 +44,46 @@ class AxialStrain:
 
     Args:
         rest_nodes: (N, 3) m. tetrahedra: (M, 4) indices into them.
+        tissue: (M,) which tissue each is of, at least 0: strain is averaged at the nodes of one
+            tissue only. None is one for all.
     """
 
-    def __init__(self, rest_nodes: ArrayLike, tetrahedra: ArrayLike) -> None:
+    def __init__(
+        self,
+        rest_nodes: ArrayLike,
+        tetrahedra: ArrayLike,
+        tissue: NDArray[np.integer] | None = None,
+    ) -> None:
         self._rest = np.array(rest_nodes, dtype=np.float64)
         self._tetrahedra = np.array(tetrahedra, dtype=np.int32)
         nodes, count = self._rest.shape, len(self._tetrahedra)
-        self._starts, self._members = tetrahedra_around(self._tetrahedra, len(self._rest))
-        self._now, self._before = np.empty(nodes), np.empty(nodes)
-        self._place, self._mean = np.empty(nodes), np.empty(nodes)
+        self._corners = corners_by_tissue(
+            self._tetrahedra, np.zeros(count, dtype=np.int64) if tissue is None else tissue
+        )
+        corners = len(self._corners.starts) - 1
+        self._now, self._before, self._place = np.empty(nodes), np.empty(nodes), np.empty(nodes)
+        self._mean = np.empty((corners, 3))
         self._deformed = np.empty((count, 4))
-        self._done = np.empty(count + len(self._rest), dtype=np.bool_)
+        self._done = np.empty(count + corners, dtype=np.bool_)
         self._directions: tuple[Probe, NDArray[np.float32]] | None = None
 
     @classmethod
-    def of(cls, frame: Frame) -> AxialStrain:
+    def of(cls, frame: Frame, *, sharp: bool = False) -> AxialStrain:
         """Of the mesh that carries the volume in a frame.
+
+        Args:
+            sharp: average nothing over borders of the volume's labels, as far as the mesh follows
+                them.
 
         Raises:
             MeshError: there is none.
         """
         if frame.mesh is None:
             raise MeshError("no tissue carries the volume, so there is no strain")
-        return cls(*frame.mesh)
+        nodes, tetrahedra = frame.mesh
+        return cls(
+            nodes, tetrahedra, main_labels(nodes, tetrahedra, frame.volume) if sharp else None
+        )
 
     def image(self, frame: Frame, before: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
@@ -87,12 +105,13 @@ class AxialStrain:
         then = self._rest if before is None else self._as_kernels_take(before, self._before)
         shown = located.tetrahedra
         nodal_deformation(
-            shown, self._tetrahedra, self._starts, self._members, then, now, plane.to_pixel,
+            shown, self._tetrahedra, *self._corners, then, now, plane.to_pixel,
             float(np.linalg.det(plane.basis)), frame.probe.pixel_spacing, self._place,
             self._deformed, self._done, self._mean,
         )  # fmt: skip
         maps = np.empty((len(shown), 3, 3))
-        to_pixels(shown, self._tetrahedra, self._place, self._mean, maps)
+        numbers = self._corners.numbers
+        to_pixels(shown, self._tetrahedra, numbers, self._place, self._mean, maps)
         values = np.empty(located.elements.shape, dtype=np.float32)
         elements, directions = located.elements, self._directions_of(frame.probe)
         parallel_rows(

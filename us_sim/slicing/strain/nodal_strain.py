@@ -6,11 +6,14 @@ Cauchy–Green tensor; Holzapfel, *Nonlinear Solid Mechanics*, 2000, section 2.5
 to now. It is constant in a linear tetrahedron. What a node has is the mean over the tetrahedra
 around it, weighted by their volumes, as averaged gradients are recovered from finite elements
 (Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987); between nodes it is linear, so that
-tetrahedra do not show as steps. A turn of the tissue, even one that differs from tetrahedron to
-tetrahedron, leaves c as it is.
+tetrahedra do not show as steps. Strain does jump from one tissue to another: where the mesh's
+tetrahedra are told apart, only those of one tissue are averaged. A turn of the tissue, even one
+that differs from tetrahedron to tetrahedron, leaves c as it is.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,42 +21,52 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 
-__all__ = ["nodal_deformation", "tetrahedra_around", "to_pixels"]
+__all__ = ["Corners", "corners_by_tissue", "nodal_deformation", "to_pixels"]
 
 
-def tetrahedra_around(
-    tetrahedra: NDArray[np.int32], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The tetrahedra around each of ``count`` nodes, one list after the other.
+class Corners(NamedTuple):
+    """The P corners that tetrahedra of one tissue share: a node between two tissues is two."""
 
-    Returns:
-        starts (count + 1,) and members (starts[-1],).
+    numbers: NDArray[np.int32]  # (M, 4) of the tetrahedra's corners
+    starts: NDArray[np.int64]  # (P + 1,) of the list of tetrahedra around each, one after the other
+    members: NDArray[np.int32]  # (starts[-1],)
+
+
+def corners_by_tissue(tetrahedra: NDArray[np.int32], tissue: NDArray[np.integer]) -> Corners:
+    """Corners over which strain is averaged, and not from one tissue to another.
+
+    Args:
+        tetrahedra: (M, 4). tissue: (M,) which one each is of, at least 0.
     """
-    nodes = tetrahedra.ravel()
-    members = (np.argsort(nodes, kind="stable") // 4).astype(np.int32)
+    width = int(tissue.max(initial=0)) + 1
+    keys = tetrahedra.astype(np.int64) * width + np.asarray(tissue, dtype=np.int64)[:, None]
+    _, numbers = np.unique(keys.ravel(), return_inverse=True)
+    numbers = numbers.ravel()  # NumPy 2.0 gives it the shape of the keys
+    count = int(numbers.max(initial=-1)) + 1
     starts = np.zeros(count + 1, dtype=np.int64)
-    np.cumsum(np.bincount(nodes, minlength=count), out=starts[1:])
-    return starts, members
+    np.cumsum(np.bincount(numbers, minlength=count), out=starts[1:])
+    members = (np.argsort(numbers, kind="stable") // 4).astype(np.int32)
+    return Corners(numbers.reshape(-1, 4).astype(np.int32), starts, members)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nodal_deformation(
-    shown, tetrahedra, starts, members, before, now, to_pixel, pixel_volume, steps, place, deformed,
-    done, mean,
+    shown, tetrahedra, corners, starts, members, before, now, to_pixel, pixel_volume, steps, place,
+    deformed, done, mean,
 ):  # fmt: skip
-    """Fills ``mean`` (N, 3) at the corners of the tetrahedra that are shown.
+    """Fills ``mean`` (P, 3) at the corners of the tetrahedra that are shown.
 
-    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A node
+    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A corner
     around which all tetrahedra are inverted or flat is left without deformation: 1, 0, 1.
 
     Args:
-        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4).
-        starts, members: as `tetrahedra_around` returns them.
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
+        corners, starts, members: as `Corners`.
         before, now: (N, 3) m, nodes in the other state and now.
         to_pixel: (3, 4) from m to column, row and height. pixel_volume: m³ per unit of those.
         steps: (2,) m, from one column to the next, and from one row to the next.
         place: (N, 3) column, row and height of the nodes now, filled here.
-        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + N,) bool, room.
+        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + P,) bool, room.
     """
     for n in range(len(now)):
         for a in range(3):
@@ -68,7 +81,7 @@ def nodal_deformation(
     count = len(tetrahedra)
     for s in shown:
         for k in range(4):
-            n = tetrahedra[s, k]
+            n = corners[s, k]
             if done[count + n]:
                 continue
             done[count + n] = True
@@ -130,13 +143,13 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def to_pixels(shown, tetrahedra, place, mean, maps):
-    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of what nodes have.
+def to_pixels(shown, tetrahedra, corners, place, mean, maps):
+    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of what corners have.
 
     Args:
-        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4).
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes. corners: (M, 4).
         place: (N, 3) column, row and height of the nodes.
-        mean: (N, 3), as `nodal_deformation` fills it.
+        mean: (P, 3), as `nodal_deformation` fills it.
     """
     for s in range(len(shown)):
         e = shown[s]
@@ -146,10 +159,10 @@ def to_pixels(shown, tetrahedra, place, mean, maps):
         )
         r = 1.0 / size
         for k in range(3):
-            at = mean[n0, k]
-            b = r * (mean[tetrahedra[e, 1], k] - at)
-            c = r * (mean[tetrahedra[e, 2], k] - at)
-            d = r * (mean[tetrahedra[e, 3], k] - at)
+            at = mean[corners[e, 0], k]
+            b = r * (mean[corners[e, 1], k] - at)
+            c = r * (mean[corners[e, 2], k] - at)
+            d = r * (mean[corners[e, 3], k] - at)
             maps[s, k, 0] = at + b * to_1[0] + c * to_2[0] + d * to_3[0]
             maps[s, k, 1] = b * to_1[1] + c * to_2[1] + d * to_3[1]
             maps[s, k, 2] = b * to_1[2] + c * to_2[2] + d * to_3[2]
