@@ -24,7 +24,7 @@ from us_sim.tissue.elasticity.materials import average_over_labels, label_fracti
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import create_solver
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
 __all__ = [
@@ -72,9 +72,8 @@ def plate_model(
     )
 
 
-def pressed_by_plate(model: TissueModel, depth: float, method: str = "fem") -> NDArray[np.float64]:
+def pressed_by_plate(solver: TissueSolver, depth: float) -> NDArray[np.float64]:
     """(N, 3) m, the nodes with the plate ``depth`` m below the top, once nothing moves."""
-    solver = create_solver(method, model)
     pose = Pose(np.array([0.0, 0.0, depth]))
     for _ in range(200):
         deformation = solver.deform(pose)
@@ -132,14 +131,14 @@ def _growing(length: float, size: float, count: int) -> NDArray[np.float64]:
 @cache
 def ball_nodes(ball: Ball, depth: float) -> NDArray[np.float64]:
     """(N, 3) m, of that mesh with the ball in it, under the plate."""
-    return pressed_by_plate(_ball_model(ball), depth)
+    return pressed_by_plate(_ball_solver(ball), depth)
 
 
 @cache
-def _ball_model(ball: Ball) -> TissueModel:
+def _ball_solver(ball: Ball) -> TissueSolver:
     soft = Material(10e3, ball.poisson_ratio, 1000.0)
     stiff = Material(10e3 * ball.stiffer, ball.poisson_ratio, 1000.0)
-    return plate_model(ball_mesh(ball), soft, stiff, labelled(ball))
+    return create_solver("fem", plate_model(ball_mesh(ball), soft, stiff, labelled(ball)))
 
 
 class Reference:

@@ -15,6 +15,7 @@ from us_sim.evaluation.block import EXTENT, block
 from us_sim.evaluation.image.inclusion import labelled, plate_model, pressed_by_plate
 from us_sim.slicing.frame import Frame
 from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.solvers.solver import create_solver
 
 __all__ = ["PRESS", "beam_displacement", "beam_strain", "pressed_block"]
 
@@ -27,7 +28,7 @@ def pressed_block(counts: tuple[int, int, int]) -> NDArray[np.float64]:
     """(N, 3) m, the nodes of the block's mesh with so many of them along each axis."""
     material = Material(10e3, 0.0, 1000.0)
     model = plate_model(block(counts), material, material, labelled(None))
-    return pressed_by_plate(model, PRESS * EXTENT[2][1])
+    return pressed_by_plate(create_solver("fem", model), PRESS * EXTENT[2][1])
 
 
 def beam_displacement(frame: Frame) -> NDArray[np.float64]:

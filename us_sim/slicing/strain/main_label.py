@@ -5,8 +5,8 @@
 >>> from us_sim.volume.volume import Volume
 >>> labels = np.repeat(np.array([1, 1, 4, 4], np.uint8), 16).reshape(4, 4, 4)
 >>> volume = Volume(labels, np.eye(4), labels)
->>> nodes = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3], [3.0, 3, 3]])
->>> main_labels(nodes, np.array([[0, 1, 2, 3], [4, 1, 2, 3]]), volume).tolist()
+>>> nodes = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3], [3, 3, 0], [3, 0, 3]])
+>>> main_labels(nodes, np.array([[0, 1, 2, 3], [1, 4, 5, 3]]), volume).tolist()
 [1, 4]
 """
 
