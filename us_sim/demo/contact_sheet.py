@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from us_sim.demo.colour_pictures import TILT, colour_pictures
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
@@ -30,10 +31,12 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         BagError: the session has no image.
     """
     moments = _moments(session)
-    figure = Figure(figsize=(15, 9 if areas is None else 12.5), layout="constrained")
+    colours = colour_pictures(session, scene)
+    heights = [1.0, 1.0, *[1.0] * bool(colours), *[0.55] * (areas is not None)]
+    height = 4.5 * sum(heights[:-1]) + (4.5 if areas is None else 3.5)
+    figure = Figure(figsize=(15, height), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = 2 if areas is None else 3
-    grid = figure.add_gridspec(rows, 3, height_ratios=[1.0, 1.0, 0.55][:rows])
+    grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
     probe = probe_of(scene)
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
@@ -54,10 +57,15 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes.tick_params(labelsize=8)
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
+    for i, (title, picture) in enumerate(colours.items()):
+        axes = figure.add_subplot(grid[2, i])
+        axes.imshow(picture)
+        axes.set_title(f"flow, {title}; plane tilted {TILT:g}° along the vessels", fontsize=11)
+        axes.axis("off")
     if areas is not None:
-        colours = {name: _colour(scene, name) for name in areas.area}
+        of_vessels = {name: _colour(scene, name) for name in areas.area}
         times = [(stamp - first) * 1e-9 for _, stamp in moments]
-        _plot_areas(figure.add_subplot(grid[2, :]), areas, times, colours)
+        _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, of_vessels)
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
     figure.savefig(file, dpi=80)
 

@@ -29,11 +29,12 @@ __all__ = ["draw_arm"]
 _TILT = math.radians(20)
 _AIM = 15e-3  # m, depth at which the middle beam crosses the plane under the probe's middle
 _TOUCH, _PRESS = 3e-3, 12e-3  # m
-_RATE = 15.0  # poses a second
+_PER_BEAT = 14  # poses
 _HEIGHT = np.array([[0.0, _TOUCH], [2.5, _TOUCH], [4.0, _PRESS], [6.0, _PRESS], [6.6, _TOUCH],
                     [9.0, _TOUCH]])  # fmt: skip
 """Time, s, and depth of the probe, m."""
-_SHOWN = {"light touch": 2.4, "full press": 5.9, "let go": 6.8}  # s
+_SHOWN = {"light touch": 2, "full press": 6, "let go": 8}
+"""Beats whose systole is shown."""
 _SYSTOLE = 0.13  # of a beat
 _GATES = {"artery": (-0.15, 11.5e-3, 0.3, 0.6), "vein": (0.05, 10e-3, 0.08, -0.6)}
 """Beam, depth in m, Nyquist velocity in m/s and baseline; gates are long, as vessels go down."""
@@ -68,25 +69,23 @@ def draw_arm(file: Path) -> None:
     solver = create_solver("fem_nonlinear", model)
     pictures: dict[str, NDArray[np.uint8]] = {}
     beat = 1.0 / scene.flows["artery"].heart_rate
-    for time, pose in _poses():
+    shown = {round((count + _SYSTOLE) * beat, 6): title for title, count in _SHOWN.items()}
+    for time, pose in _poses(beat):
         nodes = solver.deform(pose).nodes
         frame = scanner.frame(pose, nodes, time=time)
         sweeps = {name: spectrum.show(blood, frame) for name, spectrum in spectra.items()}
-        for title, moment in _SHOWN.items():
-            if title not in pictures and time >= moment:
-                systole = (math.ceil(time / beat) + _SYSTOLE) * beat
-                at_systole = scanner.frame(pose, nodes, time=systole)
-                pictures[title] = _picture(at_systole, blood, colour, annotation)
-                blood.at(frame)
+        if round(time, 6) in shown:
+            pictures[shown[round(time, 6)]] = _picture(frame, blood, colour, annotation)
     _draw(pictures, sweeps, file)
 
 
-def _poses() -> Iterator[tuple[float, Pose]]:
+def _poses(beat: float) -> Iterator[tuple[float, Pose]]:
     """Times, s, and poses of a probe that is tilted along the vessels and pressed along itself."""
     turn = np.array([math.sin(0.5 * _TILT), 0.0, 0.0, math.cos(0.5 * _TILT)])
     along = Pose(np.zeros(3), turn).rotation[:, 2]
     start = np.array([0.0, 0.0, _AIM]) - along * (_AIM / along[2])
-    for time in np.arange(0.0, _HEIGHT[-1, 0], 1.0 / _RATE):
+    count = int(_HEIGHT[-1, 0] / beat * _PER_BEAT)
+    for time in (_SYSTOLE + np.arange(count) / _PER_BEAT) * beat:
         depth = float(np.interp(time, *_HEIGHT.T))
         yield float(time), Pose(start + along * depth, turn)
 
