@@ -30,6 +30,8 @@ from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["SliceInterpolator", "main"]
 
+_BEYOND = 1e-3  # m, by which an image may be too deep before that is said
+
 REMEMBERED = 256
 """Poses kept for the deformed nodes that carry their stamps."""
 
@@ -57,6 +59,7 @@ class SliceInterpolator(SceneNode):
         self._tetrahedra: Any = None
         self._carried = False
         self._poses: dict[int, Pose] = {}
+        self._is_said = False  # that the image is too deep
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
         self._streams = frame_streams(self, volume)
@@ -86,6 +89,7 @@ class SliceInterpolator(SceneNode):
         changed = probe != self._scanner.probe
         self._scanner.use(probe, imaging, acoustics)
         if changed:
+            self._is_said = False
             self._places.publish(affine_message(probe.image_to_probe))
             self._annotated.show_probe(probe)
 
@@ -142,7 +146,7 @@ class SliceInterpolator(SceneNode):
         nodes = None if tissue is None else vectors_from(tissue, "patient")
         time = 1e-9 * nanoseconds_of(stamp)
         frame = self._scanner.frame(pose, nodes, number=self._number, time=time)
-        self.health.values = {}  # what streams say is of this frame
+        self.health.values = self._reach(pose)  # what streams say of this frame comes on top
         for stream in wanted:
             stream.show(frame, stamp)
         self._annotated.show(frame, stamp)
@@ -151,6 +155,20 @@ class SliceInterpolator(SceneNode):
             "probe_pose": self._annotated.state,
             "skipped_tetrahedra": str(self._scanner.skipped),
         }
+
+    def _reach(self, pose: Pose) -> dict[str, str]:
+        """Say once, and in diagnostics, that the image is deeper than what there is to see."""
+        too_deep = self._scanner.beyond(pose)
+        if too_deep < _BEYOND:
+            return {}
+        if not self._is_said:
+            self._is_said = True
+            what = "tissue's mesh" if self.scene.tissue is not None else "volume"
+            self.get_logger().warning(
+                f"the image reaches {1e3 * too_deep:.0f} mm beyond the {what}: what lies there is "
+                f"shown as it is without tissue, and black beyond the volume; set a smaller depth"
+            )
+        return {"beyond_mm": f"{1e3 * too_deep:.0f}"}
 
 
 def _nanoseconds(message: PoseStamped | PointCloud2) -> int:

@@ -28,6 +28,7 @@ from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.frame import Contact, Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.reach import beyond
 
 if TYPE_CHECKING:
     from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
@@ -190,6 +191,13 @@ class BMode:
             VolumeError: the volume has too many voxels.
         """
         return self.frame(pose, nodes).pixels
+
+    def beyond(self, pose: Pose) -> float:
+        """m by which the middle beam reaches beyond the mesh at rest, or the volume without one."""
+        extent = self._volume.extent
+        if self._mesh is not None:
+            extent = np.stack([self._mesh[0].min(axis=0), self._mesh[0].max(axis=0)])
+        return beyond(self._probe, pose, extent)
 
     def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
         """The volume's label at each pixel (rows, columns), 0 where there is nothing.

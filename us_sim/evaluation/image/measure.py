@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from us_sim.evaluation.image.angles import Fibres, Surfaces
+from us_sim.evaluation.image.arm_tilts import ArmTilts
 from us_sim.evaluation.image.artefact import Artefact
 from us_sim.evaluation.image.attenuation import Attenuation
+from us_sim.evaluation.image.enhancement import Enhancement
 from us_sim.evaluation.image.flow import Flow
 from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.image.report import table, write_report
+from us_sim.evaluation.image.run_time import RunTime
 from us_sim.evaluation.image.shadow import Shadow
 from us_sim.evaluation.image.strain import StrainImages
 from us_sim.evaluation.report_folder import ReportFolder
@@ -20,11 +23,14 @@ __all__ = ["ARTEFACTS", "evaluate_image"]
 
 ARTEFACTS: tuple[Artefact, ...] = (
     Attenuation(),
+    Enhancement(),
     Shadow(),
     Surfaces(),
     Fibres(),
+    ArmTilts(),
     StrainImages(),
     Flow(),
+    RunTime(),
 )
 """In the order of the report."""
 

@@ -151,12 +151,7 @@ class BeamAcoustics:
 
     def heard(self, image: NDArray[np.uint8], frame: Frame) -> NDArray[np.uint8]:
         """A slice of echoes (rows, columns) as the frame's beams bring them."""
-        gain = self.grid.on_pixels(self.gain(frame))
-        if self.grid.is_linear:
-            sharpen_borders(
-                self._found, self._crossings, self._gain, self._blocked, self._media, self._rise,
-                self._steps, gain,
-            )  # fmt: skip
+        gain = self.gain_on_pixels(frame)
         out = np.empty_like(image)
         _add_gain(image, gain, np.float32(GREYS_PER_DECIBEL), self._dither, out)
         if self._acoustics.surfaces:
@@ -164,6 +159,16 @@ class BeamAcoustics:
         if self._noise is not None:
             np.maximum(out, self._noise.at(frame.pose), out=out)
         return out
+
+    def gain_on_pixels(self, frame: Frame) -> NDArray[np.float32]:
+        """(rows, columns) dB to add to the volume's echoes."""
+        gain = self.grid.on_pixels(self.gain(frame))
+        if self.grid.is_linear:
+            sharpen_borders(
+                self._found, self._crossings, self._gain, self._blocked, self._media, self._rise,
+                self._steps, gain,
+            )  # fmt: skip
+        return gain
 
     def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
         """Where pixels lie in the mesh, and the mesh; without one all are rigid."""

@@ -69,6 +69,10 @@ class LiveAcoustics:
         """What makes of a frame's echoes (rows, columns) what is left of them."""
         return lambda image: self._beams.heard(image, frame)
 
+    def gain_on_pixels(self, frame: Frame) -> NDArray[np.float32]:
+        """(rows, columns) dB that a frame's echoes are changed by, but for surfaces and noise."""
+        return self._beams.gain_on_pixels(frame)
+
     def warm_up(self) -> None:
         """Load every kernel, and find the volume's surfaces."""
         blank = np.zeros((self._probe.rows, self._probe.columns), dtype=np.uint8)

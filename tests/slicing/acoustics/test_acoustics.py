@@ -1,0 +1,229 @@
+"""Sound along the current beams: laws that need no formula, and every sentence about wrong input.
+
+Closed forms of loss, shadow, borders and fibres are in tests/evaluation/image.
+"""
+
+import ast
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from us_sim.errors import ProbeError, SceneError
+from us_sim.geometry.pose import Pose
+from us_sim.scene.building import scanner_of
+from us_sim.scene.reading import parse_scene
+from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
+from us_sim.slicing.acoustics.surface_normals import SurfaceNormals
+from us_sim.slicing.acoustics.tissue_table import table_constants
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.reach import beyond
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+from us_sim.volume.volume import Volume
+
+PROBE = LinearProbe(aperture=0.03, depth=0.03, columns=120, rows=120)
+LIVE = Acoustics(artefacts="live", frequency=6e6, compensation=0.57)
+NAMES = {1: "muscle", 2: "bone", 3: "vein"}
+
+
+def ball(label, radius=4e-3, centre=(0.0, 0.0, 0.012)):
+    """Muscle with a ball of something else: 0.5 mm voxels of one grey."""
+    placed = np.diag([5e-4, 5e-4, 5e-4, 1.0])
+    placed[:3, 3] = (-0.02, -0.01, -0.01)
+    index = np.indices((81, 41, 101)).reshape(3, -1)
+    points = placed[:3, :3] @ index + placed[:3, 3:]
+    inside = np.linalg.norm(points - np.array(centre)[:, None], axis=0) < radius
+    labels = np.where(inside, label, 1).astype(np.uint8).reshape(81, 41, 101)
+    return Volume(np.full(labels.shape, 150, np.uint8), placed, labels, NAMES)
+
+
+def test_off_imports_nothing_and_changes_nothing():
+    baked = BMode(ball(3), PROBE, acoustics=Acoustics()).image(Pose())
+    np.testing.assert_array_equal(baked, BMode(ball(3), PROBE).image(Pose()))
+    code = (
+        "import sys; from us_sim.slicing.b_mode import BMode; "
+        "from us_sim.slicing.acoustics.settings import Acoustics; "
+        "print([m for m in sys.modules if m.startswith('us_sim.slicing.acoustics.')])"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    room = "us_sim.slicing.acoustics"
+    assert set(ast.literal_eval(said.stdout)) <= {f"{room}.settings", f"{room}.tissue_table"}
+
+
+def test_behind_bone_is_dark_and_behind_blood_is_bright():
+    plain = dataclasses.replace(LIVE, surfaces=False)
+    beside = (slice(90, 110), slice(2, 12))
+    behind = (slice(90, 110), slice(55, 65))
+    bone = BMode(ball(2), PROBE, acoustics=plain).image(Pose())
+    assert bone[behind].mean() < 40
+    assert bone[beside].mean() == pytest.approx(150, abs=1)
+    blood = BMode(ball(3), PROBE, acoustics=plain).image(Pose())
+    assert blood[behind].mean() > blood[beside].mean() + 10
+    assert blood[beside].mean() == pytest.approx(150, abs=1)
+
+
+def test_the_shadow_stays_with_the_ball_as_the_probe_slides():
+    scanner = BMode(ball(2), PROBE, acoustics=dataclasses.replace(LIVE, surfaces=False))
+    dark = [
+        (scanner.image(Pose(np.array([x, 0.0, 0.0])))[100] < 75).nonzero()[0].mean()
+        for x in (-5e-3, 0.0, 5e-3)
+    ]
+    np.testing.assert_allclose(np.diff(dark), -20.0, atol=1.5)  # pixels of 0.25 mm
+
+
+def test_a_mesh_at_rest_shows_what_the_volume_alone_does():
+    volume = ball(2)
+    scanner = BMode(volume, PROBE, acoustics=dataclasses.replace(LIVE, noise=-80.0))
+    pose = Pose(np.array([1.3e-4, 0.7e-4, 1.1e-4]))  # or pixels would lie on borders of voxels
+    alone = scanner.image(pose)
+    mesh = box_mesh([-0.018, 0.0, 0.018], [-0.009, 0.009], [-0.008, 0.01, 0.035])
+    scanner.carry(mesh.nodes, mesh.tetrahedra)
+    carried = scanner.image(pose, mesh.nodes)
+    off = np.abs(alone.astype(int) - carried)
+    assert np.percentile(off, 99) <= 1
+
+
+@pytest.mark.parametrize("method", ["per_pixel", "row_subdivision"])
+def test_every_way_of_cutting_has_the_same_acoustics(method):
+    mesh = box_mesh([-0.018, 0.0, 0.018], [-0.009, 0.009], [-0.008, 0.01, 0.035])
+    pressed = mesh.nodes * [1.05, 1.0, 0.93]
+    images = []
+    for name in (method, "scan_conversion"):
+        scanner = BMode(ball(2), PROBE, acoustics=LIVE, method=name)
+        scanner.carry(mesh.nodes, mesh.tetrahedra)
+        images.append(scanner.image(Pose(), pressed).astype(int))
+    assert np.percentile(np.abs(images[0] - images[1]), 99) <= 1
+
+
+def test_the_same_image_comes_out_again_and_noise_differs_from_pose_to_pose():
+    loud = BMode(ball(1), PROBE, acoustics=dataclasses.replace(LIVE, noise=-40.0))
+    first = loud.image(Pose())
+    np.testing.assert_array_equal(first, loud.image(Pose()))
+    others = [loud.image(Pose(np.array([x, 0.0, 0.0]))) for x in (1e-4, 2e-4, 3e-4, 4e-4)]
+    assert any((other != first).mean() > 0.2 for other in others)
+
+
+def test_half_the_frequency_loses_half_the_level():
+    plain = dataclasses.replace(LIVE, compensation=0.0, surfaces=False)
+    low, high = (
+        BMode(ball(1), PROBE, acoustics=dataclasses.replace(plain, frequency=f))
+        .image(Pose())[60:100]
+        .mean()
+        for f in (4e6, 8e6)
+    )
+    assert (150.0 - low) / (150.0 - high) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_frequency_below_the_volumes_own_blurs():
+    low = dataclasses.replace(LIVE, frequency=4e6)
+    blurred = dataclasses.replace(low, volume_frequency=8e6)
+    sharp, soft = (BMode(ball(3), PROBE, acoustics=one).image(Pose()) for one in (low, blurred))
+    steps = [int(np.abs(np.diff(image.astype(int), axis=0)).max()) for image in (sharp, soft)]
+    assert steps[1] < 0.7 * steps[0]
+
+
+@pytest.mark.parametrize("radius", [5.0, 8.0])
+def test_normals_of_a_ball_of_voxels_point_to_its_middle(radius):
+    labels = (np.linalg.norm(np.indices((32, 32, 32)) - 15.3, axis=0) < radius).astype(np.uint8)
+    found = SurfaceNormals(labels)
+    angles, distances = [], []
+    for voxel in np.argwhere(labels):
+        normal, distance = found.at(*voxel)
+        if normal.any():
+            place = voxel - 15.3
+            away = np.linalg.norm(place)
+            angles.append(np.degrees(np.arccos(np.clip(-normal @ place / away, -1.0, 1.0))))
+            distances.append(radius - away - distance)
+    assert len(angles) > 100
+    assert np.percentile(angles, 95) < 6.0
+    assert abs(np.median(distances)) < 0.5  # a curved surface seems to be a little nearer
+
+
+def test_constants_come_from_the_last_word_that_the_table_knows():
+    assert table_constants("Left_portal vein") == table_constants("blood")
+    assert table_constants("thing") is None
+    assert Acoustics().of("rib bone").impedance == 6.364e6
+    own = Acoustics(tissues={"muscle": TissueAcoustics(attenuation=1.1)}).of("muscle")
+    assert (own.attenuation, own.impedance) == (1.1, 1.645e6)
+
+
+@pytest.mark.parametrize(
+    ("acoustics", "sentence"),
+    [
+        (
+            {"frequency": 20e6},
+            "imaging.acoustics.frequency: 20 MHz is not one that this probe has, which are 4 to 16",
+        ),
+        (
+            {"tissues": {"liver": TissueAcoustics()}},
+            r"imaging.acoustics.tissues.liver: the volume's label 'liver' is not one of bone, ",
+        ),
+    ],
+)
+def test_what_does_not_go_with_probe_and_volume_is_said(acoustics, sentence):
+    with pytest.raises(ProbeError, match=sentence):
+        BMode(ball(2), PROBE, acoustics=dataclasses.replace(LIVE, **acoustics))
+
+
+def test_a_label_without_constants_is_said():
+    volume = dataclasses.replace(ball(2), label_names={1: "muscle", 2: "plastic"})
+    with pytest.raises(ProbeError, match=r"tissues.plastic.attenuation: is missing, and the table"):
+        BMode(volume, PROBE, acoustics=LIVE)
+    given = {"plastic": TissueAcoustics(attenuation=2.0, impedance=2e6)}
+    BMode(volume, PROBE, acoustics=dataclasses.replace(LIVE, tissues=given)).image(Pose())
+
+
+def test_a_volume_without_labels_is_refused_and_a_bad_change_keeps_what_was():
+    bare = dataclasses.replace(ball(2), labels=None, label_names={})
+    with pytest.raises(ProbeError, match=r"artefacts: `live` needs to know what is where"):
+        BMode(bare, PROBE, acoustics=LIVE)
+    scanner = BMode(ball(2), PROBE, acoustics=LIVE)
+    before = scanner.image(Pose())
+    with pytest.raises(ProbeError):
+        scanner.use(PROBE, Imaging(), dataclasses.replace(LIVE, frequency=40e6))
+    np.testing.assert_array_equal(scanner.image(Pose()), before)
+
+
+SCENE = {
+    "name": "arm",
+    "volume": {"phantom": "upper_arm", "voxel_size": "2 mm"},
+    "probe": {"aperture": "4 cm", "depth": "3 cm", "image": [40, 30]},
+}
+
+
+@pytest.mark.parametrize(
+    ("imaging", "sentence"),
+    [
+        ({"frequency": "30 MHz"}, "scene: imaging.acoustics.frequency: 30 MHz is not one that"),
+        ({"tissues": {"skin": {"attenuation": "3 dB"}}}, "tissues.skin.attenuation: '3 dB' is not"),
+        ({"tissues": {"skin": {"impedance": -1}}}, "tissues.skin.impedance: -1 Rayl is outside"),
+        ({"tissues": {"skin": {"fibres": [0, 0, 0]}}}, "tissues.skin.fibres: 0, 0, 0 is no"),
+        ({"tissues": {"skin": {"colour": 3}}}, "tissues.skin.colour: unknown key"),
+    ],
+)
+def test_a_scene_with_wrong_acoustics_is_refused_with_its_key(imaging, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        parse_scene({**SCENE, "imaging": {"acoustics": {"artefacts": "live", **imaging}}})
+
+
+def test_constants_of_a_label_that_the_volume_lacks_are_refused_with_the_scene():
+    acoustics = {"artefacts": "live", "tissues": {"liver": {}}}
+    scene = parse_scene({**SCENE, "imaging": {"acoustics": acoustics}}, origin="my.yaml")
+    with pytest.raises(SceneError, match=r"^my.yaml: imaging.acoustics.tissues.liver: the volume"):
+        scanner_of(scene, ball(2))
+
+
+def test_an_image_that_is_deeper_than_a_box_says_by_how_much():
+    box = np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.05]])
+    deep = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.08)
+    assert beyond(deep, Pose(), box) == pytest.approx(0.03)
+    assert beyond(PROBE, Pose(), box) == 0.0
+    assert beyond(deep, Pose(np.array([0.0, 0.0, -0.2])), box) == 0.0  # in the air above it
+    half = np.radians(30) / 2
+    turned = Pose(np.zeros(3), np.array([0.0, np.sin(half), 0.0, np.cos(half)]))
+    assert beyond(deep, turned, box) == pytest.approx(0.08 - 0.05 / np.cos(np.radians(30)))
