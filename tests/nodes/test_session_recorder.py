@@ -56,8 +56,10 @@ def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
     assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
 
 
-@pytest.mark.parametrize("topic", ["tissue/structures", "ultrasound/image_annotated"])
-def test_what_is_for_the_eye_is_recorded_only_by_name(bench, tmp_path, topic):
+@pytest.mark.parametrize(
+    "topic", ["tissue/structures", "ultrasound/image_annotated", "ultrasound/displacement"]
+)
+def test_what_is_made_on_demand_is_recorded_only_by_name(bench, tmp_path, topic):
     shown = bench.peer.create_publisher(String, topic, 10)
     other = bench.peer.create_publisher(String, "tissue/nodes", 10)
     bench.make(SessionRecorder, file=str(tmp_path / "all.mcap"))

@@ -100,6 +100,23 @@ def test_the_estimate_is_made_of_two_images_and_only_for_its_subscribers(bench, 
     assert set(node.node.health._published) == {"ultrasound/strain_estimate"}
 
 
+def test_an_estimate_that_cannot_be_made_is_said_and_the_image_comes(bench, pressed):
+    node = pressed(**{"strain.window": 0.03, "strain.interval": 1})
+    images = bench.collect(Image, "ultrasound/image")
+    bench.collect(Image, "ultrasound/strain_estimate")
+    for topic in ("ultrasound/image", "ultrasound/strain_estimate"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    bench.spin_until(lambda: all(s.is_wanted for s in (node.node._streams[0], estimates_of(node))))
+    node.press(1)
+    node.press(2)
+    bench.spin_until(lambda: len(images) == 2)
+    bench.spin_until(lambda: node.node.health.problems("strain estimate") == 1)
+
+
+def estimates_of(node):
+    return next(s for s in node.node._streams if s.topic == "ultrasound/strain_estimate")
+
+
 def test_a_gap_begins_anew(bench, pressed):
     node = pressed(**{"strain.since": "image", "strain.interval": 1})
     images = bench.collect(Image, "ultrasound/strain")
@@ -135,6 +152,7 @@ def test_strain_is_laid_over_the_annotated_image_with_what_the_press_is_like(ben
         ("strain.since", "then", "'then' is not one of rest, image"),
         ("strain.interval", 0, "strain.interval"),
         ("strain.window", 3.0, "strain.window"),
+        ("strain.window", 0.021, "21 mm is more than half of the beams, which are 40 mm long"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(pressed, name, value, sentence):

@@ -9,6 +9,7 @@ from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
+from us_sim.errors import ProbeError
 from us_sim.nodes.conversions import field_message
 from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.parameters import Group, LiveSettings
@@ -20,7 +21,7 @@ from us_sim.slicing.strain.axial_strain import AxialStrain
 from us_sim.slicing.strain.colours import strain_scale
 from us_sim.slicing.strain.compression import compression
 from us_sim.slicing.strain.earlier import Earlier
-from us_sim.slicing.strain.estimate import Estimate, estimate_strain
+from us_sim.slicing.strain.estimate import Estimate, estimate_strain, require_short_windows
 from us_sim.slicing.strain.settings import Strain
 from us_sim.slicing.strain.warm_up import warm_up
 
@@ -29,8 +30,14 @@ __all__ = ["StrainEstimateStream", "StrainStream", "strain_streams"]
 
 def strain_streams(node: SceneNode) -> list[FrameStream]:
     """Both, with the scene's settings as parameters ``strain.…`` that may change while running."""
-    parameters = LiveSettings(node, {"strain": Group(node.scene.strain, prefix="strain.")})
-    return [StrainStream(node, parameters), StrainEstimateStream(node, parameters)]
+    probes: list[Probe] = []
+
+    def check(wanted: dict[str, Strain]) -> None:
+        for probe in probes:
+            require_short_windows(probe, wanted["strain"])
+
+    parameters = LiveSettings(node, {"strain": Group(node.scene.strain, prefix="strain.")}, check)
+    return [StrainStream(node, parameters), StrainEstimateStream(node, parameters, probes)]
 
 
 class _StrainImages(FrameStream):
@@ -109,21 +116,35 @@ class StrainStream(_StrainImages):
 
 
 class StrainEstimateStream(_StrainImages):
-    """``ultrasound/strain_estimate``: between two images, from what they show alone."""
+    """``ultrasound/strain_estimate``: between two images, from what they show alone.
+
+    Args:
+        probes: where the probe that images come of is put, for checks of parameters.
+    """
 
     topic = "ultrasound/strain_estimate"
     overlay_name = "strain_estimate"
 
-    def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
+    def __init__(self, node: SceneNode, parameters: LiveSettings, probes: list[Probe]) -> None:
         super().__init__(node, parameters)
+        self._probes = probes
         self._earlier = Earlier(lambda frame: frame.pixels)
         self._correlation = 0.0
+
+    def prepare(self, probe: Probe) -> None:
+        """Compile what estimates need, or load it."""
+        warm_up()
+        self._probes[:] = [probe]
 
     def _made(self, frame: Frame, settings: Strain) -> NDArray[np.float32] | None:
         before = self._earlier.before(frame, settings.interval)
         if before is None:
             return None
-        found: Estimate = estimate_strain(before, frame.pixels, frame.probe, settings)
+        try:
+            found: Estimate = estimate_strain(before, frame.pixels, frame.probe, settings)
+        except ProbeError as error:
+            self._node.health.problem("strain estimate", f"{error}; no strain is estimated")
+            return None
         self._correlation = found.correlation
         return found.strain
 

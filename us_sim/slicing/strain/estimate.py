@@ -19,12 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.strain.least_squares import slope
 from us_sim.slicing.strain.settings import Strain
 from us_sim.slicing.strain.tracking import track
 
-__all__ = ["Estimate", "estimate_strain"]
+__all__ = ["Estimate", "estimate_strain", "require_short_windows"]
 
 _STEEPEST = 0.5
 """Of displacement along a beam: what is found steeper than that is not tissue."""
@@ -52,8 +53,9 @@ def estimate_strain(
         earlier, later: (rows, columns) images of the probe.
 
     Raises:
-        ProbeError: a window or a fitted line is longer than the beams.
+        ProbeError: a window is longer than half a beam.
     """
+    require_short_windows(probe, settings)
     step = probe.depth / probe.samples
     across = _line_spacing(probe)
     window = _odd(settings.window / step), _odd(settings.window / 3.0 / across)
@@ -68,6 +70,19 @@ def estimate_strain(
     seen = correlation != 0.0
     mean = float(np.maximum(correlation[seen], 0.0).mean()) if seen.any() else 0.0
     return Estimate(_to_pixels(strain, probe), mean)
+
+
+def require_short_windows(probe: Probe, settings: Strain) -> None:
+    """Refuse windows that no beam has room for.
+
+    Raises:
+        ProbeError: with both lengths.
+    """
+    if 2.0 * settings.window > probe.depth:
+        raise ProbeError(
+            f"strain.window: {1e3 * settings.window:g} mm is more than half of the beams, which "
+            f"are {1e3 * probe.depth:g} mm long (depth)"
+        )
 
 
 def _odd(count: float) -> int:
