@@ -15,6 +15,7 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
 from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.probe import LinearProbe
@@ -150,7 +151,9 @@ def test_the_same_moment_has_the_same_noise_and_others_have_other(scanner, blood
     steering=st.floats(-0.5, 0.5),
 )
 def test_colour_is_shown_within_its_box_only(lateral, width, depth, height, steering):
-    asked = ColourSettings(lateral, width, depth, height, steering, gain=30.0, resolution=0.0)
+    asked = ColourSettings(
+        lateral, depth, steering, width=width, height=height, gain=30.0, resolution=0.0
+    )
     doppler = ColourDoppler(PROBE, asked)
     scanner, blood = BMode(SMALL.volume, PROBE), SMALL.blood
     shown = ~np.isnan(doppler.estimate(blood, scanner.frame(POSE, None, time=1.0)))
@@ -209,11 +212,12 @@ def test_a_box_outside_the_image_is_refused(probe, settings, sentence):
         ColourDoppler(probe, ColourSettings(**settings))
 
 
-def test_a_nyquist_velocity_of_zero_and_a_filter_of_everything_are_refused():
-    with pytest.raises(ProbeError, match=r"colour.nyquist_velocity: 0 m/s is outside 0.01 to 5"):
-        ColourSettings(nyquist_velocity=0.0)
-    with pytest.raises(ProbeError, match=r"colour.wall_filter: 0.1 m/s is not below nyquist_vel"):
-        ColourSettings(nyquist_velocity=0.1, wall_filter=0.1)
+@pytest.mark.parametrize("kind", [ColourSettings, SpectrumSettings])
+def test_a_nyquist_velocity_of_zero_and_a_filter_of_everything_are_refused(kind):
+    with pytest.raises(ProbeError, match=r"\.nyquist_velocity: 0 m/s is outside 0.01 to 5"):
+        kind(nyquist_velocity=0.0)
+    with pytest.raises(ProbeError, match=r"\.wall_filter: 0.1 m/s is not below nyquist_velocity"):
+        kind(nyquist_velocity=0.1, wall_filter=0.1)
 
 
 def test_beams_whose_face_is_in_the_air_show_nothing():

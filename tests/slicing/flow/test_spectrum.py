@@ -126,10 +126,3 @@ def test_a_vein_under_a_full_press_shows_none(scanner):
 def test_a_gate_outside_the_image_is_refused(probe, settings, sentence):
     with pytest.raises(ProbeError, match=sentence):
         Spectrum(probe, SpectrumSettings(**settings))
-
-
-def test_settings_that_cannot_be_are_refused():
-    with pytest.raises(ProbeError, match=r"spectrum.nyquist_velocity: 0 m/s is outside"):
-        SpectrumSettings(nyquist_velocity=0.0)
-    with pytest.raises(ProbeError, match=r"spectrum.wall_filter: 0.2 m/s is not below nyquist"):
-        SpectrumSettings(nyquist_velocity=0.1, wall_filter=0.2)
