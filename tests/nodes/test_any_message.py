@@ -358,3 +358,22 @@ def test_no_image_ends_the_writing_of_images(bench, tmp_path):
     assert node.count == count + 1
     written = cv2.imread(str(tmp_path / f"{count:06d}.png"), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(written, conversions.pixels_from(grey()))
+
+
+def test_no_message_ends_the_writing_of_what_is_known_of_images(bench, tmp_path):
+    folders = {name: str(tmp_path / name) for name in ("folder", "labels", "displacement")}
+    node = bench.make(ImageWriter, **folders)
+    node.health = Health(node, "images")
+    inputs = {"ultrasound/image": grey, "ultrasound/labels": grey, "ultrasound/displacement": moved}
+    attack(bench, node, inputs, 60)
+    count = node.truth.count
+    for topic, make in inputs.items():
+        send(node, topic, make(1_000_000))
+    assert node.truth.count == count + 2
+    newest = max((tmp_path / "displacement").iterdir())
+    np.testing.assert_array_equal(np.load(newest), conversions.field_from(moved()))
+
+
+def moved(second=3):
+    values = np.arange(96, dtype=np.float32).reshape(6, 8, 2)
+    return conversions.field_message(values, Time(sec=second), "probe")

@@ -77,6 +77,8 @@ class Overlay:
 
     def lay_over(self, picture: NDArray[np.uint8]) -> None:
         """Blend the colours into a (rows, columns, 3) picture of red, green and blue."""
-        colours = self.scale.table[self.scale.levels(self.values)]
+        levels = cv2.cvtColor(self.scale.levels(self.values), cv2.COLOR_GRAY2RGB)
+        colours = cv2.LUT(levels, self.scale.table[None])
         blended = cv2.addWeighted(colours, self.opacity, picture, 1.0 - self.opacity, 0.0)
-        np.copyto(picture, np.asarray(blended, np.uint8), where=~np.isnan(self.values)[..., None])
+        there = np.equal(self.values, self.values).view(np.uint8)  # not NaN
+        cv2.copyTo(blended, there, picture)
