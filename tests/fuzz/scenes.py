@@ -19,7 +19,10 @@ from us_sim.tracking.camera.rigid_body_file import read_rigid_body
 
 SMALL = Path(__file__).parents[1] / "small_scene.yaml"
 
-MORE = """structures: [vein]
+MORE = """structures:
+  vein:
+    flow: {kind: venous, direction: [0, -1, 0], peak_velocity: 20 cm/s, mean_velocity: 7 cm/s}
+colour: {width: 0.4, nyquist_velocity: 0.2}
 imaging: {gain: 3 dB, time_gain: [0 dB, 3 dB]}
 tracker: {source: pose, filter: {method: one_euro}}
 """

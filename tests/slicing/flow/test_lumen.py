@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tubes import SIDES, around, grid, tube_volume
 
 from us_sim.errors import VolumeError
@@ -69,3 +71,33 @@ def test_what_its_sections_do_not_hold_is_no_tube():
     hook = (x > 0.4e-3) & (x < 7e-3) & (np.abs(z - 8e-3) < 0.6e-3)
     with pytest.raises(VolumeError, match=r"is no tube: |is too short"):
         lumen_of(tube | fin | hook, to_patient)
+
+
+@st.composite
+def shapes(draw):
+    """Boxes and balls in a small volume, one voxel and none included."""
+    lumen = np.zeros((14, 30, 12), bool)
+    for _ in range(draw(st.integers(0, 4))):
+        low = [draw(st.integers(0, side - 1)) for side in lumen.shape]
+        high = [draw(st.integers(a + 1, side)) for a, side in zip(low, lumen.shape, strict=True)]
+        lumen[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] ^= draw(st.booleans())
+    if draw(st.booleans()):
+        centre = [draw(st.integers(0, side)) for side in lumen.shape]
+        away = np.linalg.norm(np.moveaxis(np.indices(lumen.shape), 0, -1) - centre, axis=-1)
+        lumen |= away < draw(st.floats(0.5, 6.0))
+    return lumen
+
+
+@settings(deadline=None, max_examples=60)
+@given(shapes(), st.floats(0.2, 5.0), st.floats(0.2, 5.0))
+def test_any_shape_is_a_tube_or_is_refused(lumen, one, other):
+    try:
+        found = lumen_of(lumen, np.diag([1e-3, one * 1e-3, other * 1e-3, 1.0]))
+    except VolumeError:
+        return
+    assert np.isfinite(found.radii).all()
+    assert (found.radii > 0.0).all()
+    assert len(found.centres) >= 2
+    station, offset = found.locate(found.centres)
+    assert np.isfinite(station).all()
+    assert np.abs(offset).max() < 0.2

@@ -110,8 +110,8 @@ class Flow(Artefact):
             f"A vessel of {1e3 * DEPTH:g} mm depth in a block, at rest and pressed to 60 % of its "
             "height. The rate is the sum of `ultrasound/velocity` over the pixels of the image, "
             "divided by the cosine of the angle between each beam and the vessel; expected is "
-            "Poiseuille's. On the right is the colour on the axis over a beat, 40 cm/s along the beam "
-            "at most: beyond the Nyquist velocity it turns over.",
+            "Poiseuille's. On the right is the colour on the axis over a beat, 40 cm/s along the "
+            "beam at most: beyond the Nyquist velocity it turns over.",
             f"An image of 512 × 512 takes {plain_ms:.2f} ms of one core, and with colour in a "
             f"quarter of it {colour_ms:.2f} ms, {colour_ms / plain_ms:.1f} times as long.",
         ]

@@ -101,8 +101,13 @@ def resampled(
 
     Args:
         smoothing: m, standard deviation of the averaging along the curve. Its ends stay.
+
+    Raises:
+        VolumeError: the curve is shorter than the spacing.
     """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    if not along[-1] > spacing:
+        raise VolumeError("is no tube: slices across it do not follow one another")
     count = max(2, round(along[-1] / spacing)) + 1
     even = np.linspace(0.0, along[-1], count)
     curve = np.stack([np.interp(even, along, points[:, axis]) for axis in range(3)], axis=1)
@@ -156,6 +161,8 @@ def _require_no_branch(
     last = slices.max()
     for which in range(2, last - 1):
         within = slices == which
+        if not within.any():
+            continue  # of a line of voxels that is thinner than they are long
         mine = voxels[within]
         low = mine.min(axis=0)
         box = np.zeros(mine.max(axis=0) - low + 1, dtype=bool)
