@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = ["ArmTilts"]
 _TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)
 _BONE = np.array([12e-3, 0.0, 38e-3])  # m, about which the probe turns, so that it stays in view
 _FROM_BONE = np.array([-6e-3, 0.0, -36e-3])  # m, to the probe's face
+_DEPTH = 0.054  # m, to beyond the bone
 _VISIBLE = -40.0  # dB
 _SIDE, _QUICK_SIDE = 320, 96  # pixels
 
@@ -47,7 +49,8 @@ class ArmTilts(Artefact):
     def points(self, quick: bool) -> list[Point]:
         scene = load_scene("upper_arm")
         volume, side = volume_of(scene), _QUICK_SIDE if quick else _SIDE
-        probe = probe_of(scene).with_pixels(side, side)
+        deep: Any = probe_of(scene)
+        probe = dataclasses.replace(deep, depth=_DEPTH).with_pixels(side, round(1.35 * side))
         acoustics = scene.imaging.acoustics
         all_of_it = BMode(volume, probe, Imaging(), acoustics)
         bare = dataclasses.replace(acoustics, surfaces=False, noise=None)
