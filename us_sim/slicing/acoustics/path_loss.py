@@ -38,6 +38,11 @@ _BEGIN = -0.5 - SLACK
 END = -0.5 + SLACK
 """Of a volume, in voxels from its side."""
 
+_BITS = 24  # of a fixed-point coordinate, behind its point
+_PER_VOXEL = float(1 << _BITS)
+_UNIT = 1.0 / _PER_VOXEL
+_FARTHEST = 1e6  # voxels
+_HALF = 0.5 + SLACK  # of a voxel, from its face to its centre, and rounding
 _HALVINGS = 6  # of a sample, to find where a beam crosses a border
 _DARK = 30.0  # dB after which it does not matter where more is lost
 
@@ -109,15 +114,15 @@ def follow_beams(
     nothing = np.float32(0.0)
     of_label = media.of_label
     sides = (shape[0], shape[1], shape[2])
-    ends = (sides[0] + END, sides[1] + END, sides[2] + END)
+    bx = by = bz = np.int64(0)
     for k in range(beams):
         soft = nothing
         hard = nothing
         where = nothing
         was = np.uint8(NOTHING)
-        px = py = pz = 0.0
-        x = y = z = 0.0
-        gx = gy = gz = 0.0
+        px = py = pz = np.int64(0)
+        x = y = z = np.int64(0)
+        gx = gy = gz = np.int64(0)
         column = lines[k, 0]
         row = lines[k, 1]
         to_column = lines[k, 2]
@@ -136,13 +141,13 @@ def follow_beams(
                     m = maps[np.uint64(element)]
                     c = column + s * to_column
                     r = row + s * to_row
-                    x = m[0, 0] + m[0, 1] * c + m[0, 2] * r
-                    y = m[1, 0] + m[1, 1] * c + m[1, 2] * r
-                    z = m[2, 0] + m[2, 1] * c + m[2, 2] * r
-                    gx = m[0, 1] * to_column + m[0, 2] * to_row
-                    gy = m[1, 1] * to_column + m[1, 2] * to_row
-                    gz = m[2, 1] * to_column + m[2, 2] * to_row
-                medium = medium_at(x, y, z, voxels, sides, ends, of_label)
+                    x = _fixed(m[0, 0] + m[0, 1] * c + m[0, 2] * r + _HALF)
+                    y = _fixed(m[1, 0] + m[1, 1] * c + m[1, 2] * r + _HALF)
+                    z = _fixed(m[2, 0] + m[2, 1] * c + m[2, 2] * r + _HALF)
+                    gx = _fixed(m[0, 1] * to_column + m[0, 2] * to_row)
+                    gy = _fixed(m[1, 1] * to_column + m[1, 2] * to_row)
+                    gz = _fixed(m[2, 1] * to_column + m[2, 2] * to_row)
+                medium = _medium_in(x, y, z, voxels, sides, of_label)
             held = element
             length = half if s == 0 else one
             if medium == was:
@@ -152,20 +157,25 @@ def follow_beams(
                     where = _blocked_at(where, hard, loss, s)
                     hard += loss
             else:
-                low = 0.0
                 high = 1.0
                 if s == 0:
                     high = 0.0
                 elif was != NOTHING and medium != NOTHING:
+                    part = 1.0
+                    ax, ay, az = px, py, pz  # still before the border
+                    bx, by, bz = x, y, z  # behind it
                     for _ in range(_HALVINGS):
-                        middle = 0.5 * (low + high)
-                        ax, ay, az = middle * (x - px), middle * (y - py), middle * (z - pz)
-                        there = medium_at(px + ax, py + ay, pz + az, voxels, sides, ends, of_label)
-                        if there == was:
-                            low = middle
+                        part *= 0.5
+                        cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
+                        if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
+                            ax, ay, az = cx, cy, cz
                         else:
-                            high = middle
-                t = np.float32(0.5 * (low + high))
+                            bx, by, bz = cx, cy, cz
+                            high -= part
+                    high -= 0.5 * part
+                else:
+                    high = 0.5
+                t = np.float32(high)
                 rest = length - t
                 border = media.crossing[was, medium]
                 soft += t * media.loss[was]
@@ -179,12 +189,12 @@ def follow_beams(
                     crossings.media[found, 0] = was
                     crossings.media[found, 1] = medium
                     crossings.element[found] = element
-                    crossings.voxel[found, 0] = px + high * (x - px)
-                    crossings.voxel[found, 1] = py + high * (y - py)
-                    crossings.voxel[found, 2] = pz + high * (z - pz)
-                    crossings.slope[found, 0] = x - px
-                    crossings.slope[found, 1] = y - py
-                    crossings.slope[found, 2] = z - pz
+                    crossings.voxel[found, 0] = bx * _UNIT - _HALF
+                    crossings.voxel[found, 1] = by * _UNIT - _HALF
+                    crossings.voxel[found, 2] = bz * _UNIT - _HALF
+                    crossings.slope[found, 0] = (x - px) * _UNIT
+                    crossings.slope[found, 1] = (y - py) * _UNIT
+                    crossings.slope[found, 2] = (z - pz) * _UNIT
                     crossings.level[found] = time_gain[s] - soft - hard
                     found += 1
                 if media.blocks[was] or media.blocks[medium]:
@@ -221,6 +231,28 @@ def _blocked_at(where, hard, loss, s):
     if hard < np.float32(_DARK) and loss > np.float32(0.0):
         return np.float32((where * hard + loss * s) / (hard + loss))
     return where
+
+
+@njit(inline="always", error_model="numpy")
+def _fixed(value):
+    """A coordinate as a fixed-point number, also where it is far from any voxel."""
+    held = min(max(value, -_FARTHEST), _FARTHEST)
+    return np.int64(held * _PER_VOXEL)
+
+
+@njit(inline="always", error_model="numpy")
+def _medium_in(x, y, z, voxels, sides, of_label):
+    """The medium of the voxel that fixed-point coordinates lie in, `NOTHING` beyond the volume."""
+    ix = x >> _BITS
+    iy = y >> _BITS
+    iz = z >> _BITS
+    # Negative ones are very large without a sign.
+    is_inside = np.uint64(ix) < np.uint64(sides[0])
+    is_inside &= np.uint64(iy) < np.uint64(sides[1])
+    is_inside &= np.uint64(iz) < np.uint64(sides[2])
+    if not is_inside:
+        return np.uint8(NOTHING)
+    return of_label[voxels[np.uint64((ix * sides[1] + iy) * sides[2] + iz)]]
 
 
 @njit(inline="always", error_model="numpy")
