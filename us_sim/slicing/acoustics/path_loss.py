@@ -42,6 +42,8 @@ _BITS = 24  # of a fixed-point coordinate, behind its point
 _PER_VOXEL = float(1 << _BITS)
 _UNIT = 1.0 / _PER_VOXEL
 _FARTHEST = 1e6  # voxels
+_CLOSE = 4  # voxels from one look to the next, at most
+_MOST_PARTS = 8  # looks from one sample to the next
 _HALF = 0.5 + SLACK  # of a voxel, from its face to its centre, and rounding
 _HALVINGS = 6  # of a sample, to find where a beam crosses a border
 _DARK = 30.0  # dB after which it does not matter where more is lost
@@ -149,65 +151,81 @@ def follow_beams(
                     gz = _fixed(m[2, 1] * to_column + m[2, 2] * to_row)
                 medium = _medium_in(x, y, z, voxels, sides, of_label)
             held = element
-            length = half if s == 0 else one
-            if medium == was:
-                soft += length * media.loss[medium]
-                if media.blocks[medium]:
-                    loss = length * media.shadow[medium]
-                    where = _blocked_at(where, hard, loss, s)
-                    hard += loss
-            else:
-                high = 1.0
-                if s == 0:
-                    high = 0.0
-                elif was != NOTHING and medium != NOTHING:
-                    part = 1.0
-                    ax, ay, az = px, py, pz  # still before the border
-                    bx, by, bz = x, y, z  # behind it
-                    for _ in range(_HALVINGS):
-                        part *= 0.5
-                        cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
-                        if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
-                            ax, ay, az = cx, cy, cz
-                        else:
-                            bx, by, bz = cx, cy, cz
-                            high -= part
-                    high -= 0.5 * part
+            # Where tissue is squeezed there is more of it between two samples.
+            parts = np.int64(1)
+            if element >= 0 and was != NOTHING:
+                apart = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >> _BITS
+                parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
+            length = half if s == 0 else np.float32(1.0 / parts)
+            lx, ly, lz = px, py, pz
+            for q in range(1, parts + 1):
+                nx, ny, nz, now = x, y, z, medium
+                if q < parts:
+                    nx, ny, nz = (
+                        px + (x - px) * q // parts,
+                        py + (y - py) * q // parts,
+                        pz + (z - pz) * q // parts,
+                    )
+                    now = _medium_in(nx, ny, nz, voxels, sides, of_label)
+                if now == was:
+                    soft += length * media.loss[now]
+                    if media.blocks[now]:
+                        loss = length * media.shadow[now]
+                        where = _blocked_at(where, hard, loss, s)
+                        hard += loss
                 else:
-                    high = 0.5
-                t = np.float32(high)
-                rest = length - t
-                border = media.crossing[was, medium]
-                soft += t * media.loss[was]
-                if media.blocks[was]:
-                    loss = t * media.shadow[was]
-                    where = _blocked_at(where, hard, loss, s)
-                    hard += loss
-                if was != NOTHING and medium != NOTHING and found < room:
-                    crossings.beam[found] = k
-                    crossings.distance[found] = np.float32(s) - one + t
-                    crossings.media[found, 0] = was
-                    crossings.media[found, 1] = medium
-                    crossings.element[found] = element
-                    crossings.voxel[found, 0] = bx * _UNIT - _HALF
-                    crossings.voxel[found, 1] = by * _UNIT - _HALF
-                    crossings.voxel[found, 2] = bz * _UNIT - _HALF
-                    crossings.slope[found, 0] = (x - px) * _UNIT
-                    crossings.slope[found, 1] = (y - py) * _UNIT
-                    crossings.slope[found, 2] = (z - pz) * _UNIT
-                    crossings.level[found] = time_gain[s] - soft - hard
-                    found += 1
-                if media.blocks[was] or media.blocks[medium]:
-                    where = _blocked_at(where, hard, border, s)
-                    hard += border
-                else:
-                    soft += border
-                soft += rest * media.loss[medium]
-                if media.blocks[medium]:
-                    loss = rest * media.shadow[medium]
-                    where = _blocked_at(where, hard, loss, s)
-                    hard += loss
-                was = medium
+                    high = 1.0
+                    if s == 0:
+                        high = 0.0
+                    elif was != NOTHING and now != NOTHING:
+                        part = 1.0
+                        ax, ay, az = lx, ly, lz  # still before the border
+                        bx, by, bz = nx, ny, nz  # behind it
+                        for _ in range(_HALVINGS):
+                            part *= 0.5
+                            cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
+                            if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
+                                ax, ay, az = cx, cy, cz
+                            else:
+                                bx, by, bz = cx, cy, cz
+                                high -= part
+                        high -= 0.5 * part
+                    else:
+                        high = 0.5
+                    t = np.float32(high) * length
+                    rest = length - t
+                    border = media.crossing[was, now]
+                    soft += t * media.loss[was]
+                    if media.blocks[was]:
+                        loss = t * media.shadow[was]
+                        where = _blocked_at(where, hard, loss, s)
+                        hard += loss
+                    if was != NOTHING and now != NOTHING and found < room:
+                        crossings.beam[found] = k
+                        crossings.distance[found] = np.float32(s) - one + (q - 1) * length + t
+                        crossings.media[found, 0] = was
+                        crossings.media[found, 1] = now
+                        crossings.element[found] = element
+                        crossings.voxel[found, 0] = bx * _UNIT - _HALF
+                        crossings.voxel[found, 1] = by * _UNIT - _HALF
+                        crossings.voxel[found, 2] = bz * _UNIT - _HALF
+                        crossings.slope[found, 0] = (x - px) * _UNIT
+                        crossings.slope[found, 1] = (y - py) * _UNIT
+                        crossings.slope[found, 2] = (z - pz) * _UNIT
+                        crossings.level[found] = time_gain[s] - soft - hard
+                        found += 1
+                    if media.blocks[was] or media.blocks[now]:
+                        where = _blocked_at(where, hard, border, s)
+                        hard += border
+                    else:
+                        soft += border
+                    soft += rest * media.loss[now]
+                    if media.blocks[now]:
+                        loss = rest * media.shadow[now]
+                        where = _blocked_at(where, hard, loss, s)
+                        hard += loss
+                    was = now
+                lx, ly, lz = nx, ny, nz
             level = time_gain[s] - soft + media.scattering[medium]
             direction = media.fibres[medium]
             if direction >= 0:
