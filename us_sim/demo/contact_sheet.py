@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from us_sim.demo.colour_pictures import TILT, colour_pictures
 from us_sim.demo.session import LumenAreas, Session
+from us_sim.demo.strain_pictures import strain_pictures
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of
@@ -31,8 +32,9 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         BagError: the session has no image.
     """
     moments = _moments(session)
-    colours = colour_pictures(session, scene)
-    heights = [1.0, 1.0, *[1.0] * bool(colours), *[0.55] * (areas is not None)]
+    strained, colours = strain_pictures(session, scene), colour_pictures(session, scene)
+    more = [each for each in (strained, _flowing(colours)) if each]
+    heights = [1.0, 1.0, *[1.0] * len(more), *[0.55] * (areas is not None)]
     height = 4.5 * sum(heights[:-1]) + (4.5 if areas is None else 3.5)
     figure = Figure(figsize=(15, height), layout="constrained")
     FigureCanvasAgg(figure)
@@ -57,17 +59,24 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes.tick_params(labelsize=8)
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
-    for i, (title, picture) in enumerate(colours.items()):
-        axes = figure.add_subplot(grid[2, i])
-        axes.imshow(picture)
-        axes.set_title(f"flow, {title}; plane tilted {TILT:g}° along the vessels", fontsize=11)
-        axes.axis("off")
+    for row, pictures in enumerate(more, 2):
+        for i, (title, picture) in enumerate(pictures.items()):
+            axes = figure.add_subplot(grid[row, i])
+            axes.imshow(picture)
+            axes.set_title(title, fontsize=11)
+            axes.axis("off")
     if areas is not None:
         of_vessels = {name: _colour(scene, name) for name in areas.area}
         times = [(stamp - first) * 1e-9 for _, stamp in moments]
         _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, of_vessels)
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
     figure.savefig(file, dpi=80)
+
+
+def _flowing(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.uint8]]:
+    """Pictures of flow with whole titles."""
+    beside = f"plane tilted {TILT:g}° along the vessels"
+    return {f"flow, {title}; {beside}": picture for title, picture in pictures.items()}
 
 
 def _moments(session: Session) -> list[tuple[str, int]]:

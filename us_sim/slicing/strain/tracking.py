@@ -10,7 +10,7 @@ parabola is exact where nothing remains.
 >>> import numpy as np
 >>> from us_sim.slicing.strain.tracking import track
 >>> rng = np.random.default_rng(1)
->>> speckle = np.cumsum(rng.normal(size=(200, 30)), axis=0)
+>>> speckle = 20.0 * np.cumsum(rng.normal(size=(200, 30)), axis=0)
 >>> place = np.arange(200.0)
 >>> moved = np.stack([np.interp(place - 0.01 * place, place, line) for line in speckle.T], axis=1)
 >>> found, correlation = track(speckle, moved, window=(31, 5), search=4)
@@ -33,8 +33,11 @@ __all__ = ["track"]
 
 _PASSES = 2
 """How often the image is warped and what remains is looked for."""
-_FLAT = 1e-3
-"""Variance of grey values (in squared levels) below which a window has nothing to be found by."""
+_FLAT = 6.0**2
+"""Variance of grey values (in squared levels) below which a window has nothing to be found by.
+
+Full speckle has four times that deviation where 60 dB are shown; a shadow's noise has less.
+"""
 
 Field = NDArray[Any]
 """float32."""
@@ -48,7 +51,7 @@ def track(
     """How far what each sample of the later image shows has come along its beam, in samples.
 
     Args:
-        earlier, later: (samples, lines) of any numbers.
+        earlier, later: (samples, lines) of grey values, 0 to 255.
         window: samples and lines of what is looked for, odd.
         search: samples to either side.
 
