@@ -31,6 +31,7 @@ _THICKEST = 5e-3
 """m, of a layer that is filled: what is more is not the mesh's coarseness."""
 
 _TRIES, _NEARER = 4, 0.8
+_BESIDE = (0, 1, -1)  # columns
 _NOT_FILLED = -1.0  # in place of how thick the layer is
 
 
@@ -96,11 +97,12 @@ def _mirror(image, row, column, line, distance, along, thick, margin, out):
         if distance[p] >= end:
             continue
         away = 2.0 * (end - distance[p])
-        # At a fan's side the mirrored place may be beyond it: then what is nearer.
-        for _ in range(_TRIES):
-            c = int(column[p] + away * along[0, p] + 0.5)
+        # At a fan's side the mirrored place may be beyond it: then one beside it, or nearer.
+        for attempt in range(_TRIES * len(_BESIDE)):
+            c = int(column[p] + away * along[0, p] + 0.5) + _BESIDE[attempt % len(_BESIDE)]
             r = int(row[p] + away * along[1, p] + 0.5)
             if 0 <= c < columns and 0 <= r < rows and image[r, c] > 0:
                 out[row[p], column[p]] = image[r, c]
                 break
-            away *= _NEARER
+            if attempt % len(_BESIDE) == len(_BESIDE) - 1:
+                away *= _NEARER
