@@ -137,12 +137,11 @@ class BeamAcoustics:
             self._lines, self._across, self._along, self._media, self._time_gain, fibre,
             self._gain, self._blocked, self._blocker, self._crossings,
         )  # fmt: skip
-        if first < grid.samples:
-            sharpen_edges(
-                self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
-                self._voxels, self._shape, self._lines, self._media, grid.samples, grid.beams,
-                self._blocked, self._blocker,
-            )  # fmt: skip
+        sharpen_edges(
+            self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
+            self._voxels, self._shape, self._lines, self._media, grid.samples, grid.beams,
+            self._blocked, self._blocker,
+        )  # fmt: skip
         cast_shadows(
             first, grid.beams, self._blocked, self._blocker, grid.distance, grid.aperture,
             grid.spacing, AMPLITUDES, self._gain,
