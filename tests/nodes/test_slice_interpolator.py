@@ -20,6 +20,8 @@ from us_sim.nodes.conversions import (
     pose_from,
     tetrahedra_message,
 )
+from us_sim.nodes.frame_streams.m_mode_stream import MModeStream
+from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.scene.building import probe_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
@@ -56,6 +58,20 @@ def slicer(bench, small_scene):
     nodes = bench.publisher(PointCloud2, "tissue/nodes")
     bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image") > 0)
     return node, mesh, images, poses, nodes
+
+
+def test_the_images_topic_is_there_once_all_is_prepared(bench, small_scene, monkeypatch):
+    """What plays poses waits for it, so that no pose is lost to what is still being loaded."""
+    made = []
+    stream = SceneNode.stream
+    monkeypatch.setattr(
+        SceneNode,
+        "stream",
+        lambda node, kind, topic: made.append(topic) or stream(node, kind, topic),
+    )
+    monkeypatch.setattr(MModeStream, "prepare", lambda *_: made.append("prepared"))
+    bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
+    assert made.index("ultrasound/image") > made.index("prepared")
 
 
 def test_a_mesh_of_nothing_leaves_the_one_before(bench, slicer):

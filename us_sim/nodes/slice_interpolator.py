@@ -62,9 +62,7 @@ class SliceInterpolator(SceneNode):
         self._is_said = False  # that the image is too deep
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
-        self._streams = frame_streams(self, volume)
-        for stream in self._streams:
-            stream.prepare(probe)
+        self._streams = frame_streams(self, volume, probe)
         self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
         self._places.publish(affine_message(probe.image_to_probe))
         self._annotated = AnnotatedImage(self, probe, volume.label_names, self._streams)
