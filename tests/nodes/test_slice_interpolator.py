@@ -23,7 +23,7 @@ from us_sim.nodes.conversions import (
 from us_sim.nodes.frame_streams.m_mode_stream import MModeStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.slice_interpolator import SliceInterpolator
-from us_sim.scene.building import probe_of, tissue_model_of, volume_of
+from us_sim.scene.building import probe_of, skin_surface_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
@@ -72,6 +72,39 @@ def test_the_images_topic_is_there_once_all_is_prepared(bench, small_scene, monk
     monkeypatch.setattr(MModeStream, "prepare", lambda *_: made.append("prepared"))
     bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
     assert made.index("ultrasound/image") > made.index("prepared")
+
+
+def test_the_face_meets_the_skin_where_the_scene_has_one(bench, small_scene):
+    file = small_scene.with_name("touching.yaml")
+    file.write_text(small_scene.read_text() + "imaging: {contact: true}\n")
+    node = bench.make(SliceInterpolator, scene=str(file), lockstep=True)
+    scene = load_scene(file)
+    mesh, skin = tissue_model_of(scene, volume_of(scene)).mesh, skin_surface_of(scene).vertices
+    images = bench.collect(Image, "ultrasound/image")
+    bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT).publish(
+        cloud(mesh.nodes, pose_at(0.0, 1))
+    )
+    bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", KEPT).publish(
+        tetrahedra_message(mesh.tetrahedra)
+    )
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    nodes = bench.publisher(PointCloud2, "tissue/nodes")
+    skins = bench.publisher(PointCloud2, "skin/nodes")
+    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image") > 0)
+    bench.spin_until(lambda: bench.peer.count_subscribers("skin/nodes") > 0)
+    for number, lower in enumerate((0.0, 0.01), start=1):
+        pose = pose_at(0.003, number)
+        poses.publish(pose)
+        nodes.publish(cloud(mesh.nodes, pose))
+        bench.spin_until(lambda: node._unpaired is not None)
+        assert len(images) == number - 1  # in lockstep the skin is waited for
+        skins.publish(cloud(np.add(skin, [0.0, 0.0, lower]), pose))
+        bench.spin_until(lambda number=number: len(images) == number)
+    touching, in_air = (pixels_from(image)[40:] for image in images)
+    assert touching.mean() > 20.0
+    assert in_air.mean() < 0.2 * touching.mean()
+    skins.publish(cloud(skin[1:], pose_at(0.003, 3)))
+    bench.spin_until(lambda: node.health.problems("skin") == 1)
 
 
 def test_a_mesh_of_nothing_leaves_the_one_before(bench, slicer):

@@ -23,6 +23,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scanner_console import ScannerConsole
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.skin_shapes import SkinShapes
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.formation.imaging import Imaging
@@ -62,6 +63,7 @@ class SliceInterpolator(SceneNode):
         self._is_said = False  # that the image is too deep
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
+        self._skin: SkinShapes | None = None
         self._streams = frame_streams(self, volume, probe)
         self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
         self._places.publish(affine_message(probe.image_to_probe))
@@ -71,6 +73,8 @@ class SliceInterpolator(SceneNode):
         else:
             self.listen(PointCloud2, "tissue/rest", self._take_rest, LATCHED)
             self.listen(Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra, LATCHED)
+            if self.scene.skin is not None and imaging.contact:
+                self._skin = SkinShapes(self, self._scanner, self._image_unpaired)
             self.listen(PoseStamped, "probe/pose", self._remember)
             self.newest(PointCloud2, "tissue/nodes", self._image_deformed)
         self.health.state = "ready"
@@ -112,8 +116,7 @@ class SliceInterpolator(SceneNode):
         self._poses[_nanoseconds(message)] = self._pose(message)
         while len(self._poses) > REMEMBERED:
             del self._poses[next(iter(self._poses))]
-        if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
-            self._image_deformed(self._unpaired)
+        self._image_unpaired()
 
     def _pose(self, message: PoseStamped) -> Pose:
         """The pose in a message."""
@@ -121,9 +124,16 @@ class SliceInterpolator(SceneNode):
         self._annotated.pose_came(message.header.stamp)
         return pose
 
+    def _image_unpaired(self) -> None:
+        """Make the image whose other half may have come."""
+        if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
+            self._image_deformed(self._unpaired)
+
     def _image_deformed(self, message: PointCloud2) -> None:
-        pose = self._poses.get(_nanoseconds(message))
-        if pose is None or not self._carried:
+        stamp = _nanoseconds(message)
+        pose = self._poses.get(stamp)
+        awaited = self._skin is not None and self._skin.is_awaited(stamp)
+        if pose is None or not self._carried or awaited:
             self._unpaired = message
             return
         self._unpaired = None
@@ -142,8 +152,9 @@ class SliceInterpolator(SceneNode):
             return
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
-        time = 1e-9 * nanoseconds_of(stamp)
-        frame = self._scanner.frame(pose, nodes, number=self._number, time=time)
+        came = nanoseconds_of(stamp)
+        skin = None if self._skin is None else self._skin.at(came)
+        frame = self._scanner.frame(pose, nodes, skin=skin, number=self._number, time=1e-9 * came)
         self.health.values = self._reach(pose)  # what streams say of this frame comes on top
         for stream in wanted:
             stream.show(frame, stamp)

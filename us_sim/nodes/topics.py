@@ -190,6 +190,7 @@ TOPICS = (
         "sensor_msgs/PointCloud2",
         "where the skin's vertices are, with normals",
         publishers=("skin_deformer",),
+        subscribers=("slice_interpolator",),
     ),
     Topic(
         "skin/marker",

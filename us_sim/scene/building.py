@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
     from us_sim.recording.path import ProbePath
     from us_sim.skin.membrane import SkinMembrane
+    from us_sim.skin.surface import TriangleSurface
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe.probe import Probe
     from us_sim.tissue.elasticity.material import Material
@@ -237,23 +238,33 @@ def _materials(
     return average_over_labels(fractions, by_label)
 
 
-def membrane_of(scene: Scene) -> SkinMembrane:
-    """The scene's skin, pressed by the scene's probe."""
+def skin_surface_of(scene: Scene) -> TriangleSurface:
+    """The scene's skin at rest.
+
+    Raises:
+        SceneError: the scene has none.
+        MeshError: its file cannot be used.
+    """
     from us_sim.skin import surface
-    from us_sim.skin.membrane import SkinMembrane
 
     section = scene.skin
     if section is None:
         raise SceneError(f"{scene.origin}: skin: is missing")
     if section.file:
-        sheet = surface.read_surface(Path(section.file))
-    elif section.flat_width >= section.size[0]:
-        sheet = surface.plane_surface(section.size, section.spacing)
-    else:
-        sheet = surface.bent_surface(
-            section.size, section.spacing, flat_width=section.flat_width, radius=section.radius
-        )
-    return SkinMembrane(sheet, collider_of(scene), section)
+        return surface.read_surface(Path(section.file))
+    if section.flat_width >= section.size[0]:
+        return surface.plane_surface(section.size, section.spacing)
+    return surface.bent_surface(
+        section.size, section.spacing, flat_width=section.flat_width, radius=section.radius
+    )
+
+
+def membrane_of(scene: Scene) -> SkinMembrane:
+    """The scene's skin, pressed by the scene's probe."""
+    from us_sim.skin.membrane import SkinMembrane
+
+    sheet = skin_surface_of(scene)
+    return SkinMembrane(sheet, collider_of(scene), scene.skin)
 
 
 def _mesh(

@@ -76,6 +76,7 @@ class BMode:
         self._mesh: tuple[NDArray[np.float64], NDArray[np.int32]] | None = None
         self._slicer: Slicer | None = None
         self._surface: ContactSurface | None = None
+        self._skin: ContactSurface | None = None
         self._acoustics: LiveAcoustics | None = None
         self._prepared: tuple[Probe, Acoustics, LiveAcoustics] | None = None
         self.use(probe, imaging or Imaging(), acoustics)
@@ -149,11 +150,27 @@ class BMode:
         if self._acoustics is not None:
             self._acoustics.carry(*self._mesh)
 
+    def touch(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
+        """Let the face touch this skin, where a frame says how it lies.
+
+        Args:
+            vertices: (V, 3) m, at rest.
+            triangles: (T, 3) indices into them, normals out of the body.
+
+        Raises:
+            MeshError: the arrays do not have those shapes, or a triangle names a vertex that is not
+                there.
+        """
+        from us_sim.slicing.formation.coupling import ContactSurface
+
+        self._skin = ContactSurface(vertices, triangles, is_outward=True)
+
     def frame(
         self,
         pose: Pose,
         nodes: NDArray[np.float64] | None = None,
         *,
+        skin: NDArray[np.float64] | None = None,
         number: int = 0,
         time: float = 0.0,
     ) -> Frame:
@@ -162,6 +179,7 @@ class BMode:
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
+            skin: (V, 3) m, where the vertices given to `touch` are.
             number: of the poses so far.
             time: s since 1970, of the pose.
         """
@@ -173,6 +191,7 @@ class BMode:
             self._slicer,
             partial(self._form, self._formation, self._acoustics),
             meet=self._meet if self._formation.needs_contact else None,
+            skin=skin,
             mesh=self._mesh if nodes is not None else None,
             number=number,
             time=time,
@@ -218,10 +237,16 @@ class BMode:
         return formation.form(slices, coupling, gap, heard)
 
     def _meet(self, frame: Frame) -> Contact:
-        """How each line of a frame meets the skin."""
+        """How each line of a frame meets the skin, and how far the mesh is under it.
+
+        Without a skin the mesh's own surface stands for it.
+        """
         surface = self._contact_surface(frame.nodes is not None)
         where = surface.rest_nodes if frame.nodes is None else frame.nodes
-        return surface.contact(where, frame.probe, frame.pose)
+        coupling, gap = surface.contact(where, frame.probe, frame.pose)
+        if self._skin is not None and frame.skin is not None:
+            coupling, _ = self._skin.contact(frame.skin, frame.probe, frame.pose)
+        return coupling, gap
 
     def _live_acoustics(self, probe: Probe, acoustics: Acoustics | None) -> LiveAcoustics | None:
         """What follows the beams; imported only where it is asked for."""

@@ -54,6 +54,7 @@ class Frame:
         slicer: of the mesh; needed where there are nodes.
         form: makes the picture of the frame.
         meet: how each line meets the skin, see `contact`; None where all are taken to meet it.
+        skin: (V, 3) m, where the skin's vertices are; None where it is not known.
         mesh: rest nodes (N, 3) m and tetrahedra (M, 4) that carry the volume; None without nodes.
         number: of the poses so far; frames with successive numbers follow one another.
         time: s since 1970, of the pose; what moves by itself, as blood does, moves with it.
@@ -70,6 +71,7 @@ class Frame:
         form: Callable[[Frame], NDArray[np.uint8]],
         *,
         meet: Callable[[Frame], Contact] | None = None,
+        skin: NDArray[np.float64] | None = None,
         mesh: Mesh | None = None,
         number: int = 0,
         time: float = 0.0,
@@ -82,6 +84,7 @@ class Frame:
         self._slicer = slicer if nodes is not None else None
         self._form = form
         self._meet = meet
+        self.skin = skin
         self.mesh = mesh
         self.number = number
         self.time = time

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
+from us_sim.skin.surface import plane_surface
 from us_sim.slicing.formation.coupling import FULL_PRESS, GEL_FILM, LIGHT_CONTACT, ContactSurface
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.probe import LinearProbe
@@ -30,6 +31,21 @@ def test_the_gap_is_the_height_above_flat_skin(height):
     gap, press = SURFACE.gaps(BLOCK.nodes, PROBE, Pose([0.003, 0.0011, -height]))
     np.testing.assert_allclose(gap, height, atol=1e-12)
     np.testing.assert_allclose(press, -height, atol=1e-12)
+
+
+@pytest.mark.parametrize("away", [0.0, 0.3, -0.3])
+@pytest.mark.parametrize("degrees", [0.0, 8.0, 25.0])
+def test_an_open_skin_is_met_as_the_block_that_it_covers(degrees, away):
+    """Wherever it lies: an open surface has no volume that would tell its outside."""
+    sheet, shift = plane_surface((0.1, 0.06), 0.005), np.array([0.1, -0.2, away])
+    skin = ContactSurface(sheet.vertices + shift, sheet.triangles, is_outward=True)
+    pose = tilted(degrees, 0.002)
+    moved = Pose(pose.position + shift, pose.orientation)
+    expected = SURFACE.contact(BLOCK.nodes, PROBE, pose)
+    found = skin.contact(sheet.vertices + shift, PROBE, moved)
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-9)
+    assert found[0].max() > 0.0
 
 
 def test_coupling_from_air_to_full_contact():

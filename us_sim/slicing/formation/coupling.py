@@ -47,13 +47,17 @@ class ContactSurface:
     Args:
         rest_nodes: (N, 3) m, frame ``patient``.
         triangles: (T, 3) indices into them; closed surfaces, all normals outward or all inward.
+        is_outward: of an open surface, such as the skin over a part of the body: all normals are
+            outward.
 
     Raises:
         MeshError: the arrays do not have those shapes, or a triangle names a node that is not
             there.
     """
 
-    def __init__(self, rest_nodes: ArrayLike, triangles: ArrayLike) -> None:
+    def __init__(
+        self, rest_nodes: ArrayLike, triangles: ArrayLike, *, is_outward: bool = False
+    ) -> None:
         nodes = np.array(rest_nodes, dtype=np.float64)
         corners = np.array(triangles, dtype=np.int32)
         if nodes.ndim != 2 or nodes.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3:
@@ -67,7 +71,8 @@ class ContactSurface:
                 f"{corners.min()} to {corners.max()}"
             )
         a, b, c = (nodes[corners[:, i]] for i in range(3))
-        if np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0:  # six times the volume
+        # Six times the volume.
+        if not is_outward and np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0:
             corners = corners[:, ::-1].copy()
         self.rest_nodes = nodes
         self._triangles = corners
