@@ -42,6 +42,7 @@ def scenes(tmp_path, small_scene):
         keys = TRACKER_KEYS.get(source)
         file.write_text(
             small_scene.read_text()
+            + "imaging: {contact: true}  # so that images ask for the skin\n"
             + "structures: {vein: {flow: {kind: venous, direction: [0, 1, 0], "
             + "peak_velocity: 0.2, mean_velocity: 0.07}}}\n"
             + f"tracker: {{source: {source}{', ' + keys if keys else ''}}}\n"
