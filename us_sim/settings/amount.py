@@ -6,6 +6,8 @@
 ('0.3 mm', '12 kPa', '2')
 >>> span(Quantity("length", 0.003, 0.2)), span(Quantity("level", -60.0, 0.0))
 ('3 to 200 mm', '-60 to 0 dB')
+>>> dial_unit(Quantity("frequency", 5e5, 5e7)), dial_unit(Quantity("rate", 0.02, 5.0))
+('MHz', '/min')
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import math
 
 from us_sim.settings.quantity import Quantity
 
-__all__ = ["amount", "span"]
+__all__ = ["amount", "dial_unit", "span"]
 
 _HANDY = {
     "length": ("mm", "m", "um"),
@@ -25,6 +27,13 @@ _HANDY = {
     "acoustic impedance": ("MRayl", "Rayl"),
 }
 """Units that people use, the most usual first; of other dimensions it is the SI unit."""
+
+_ON_A_DIAL = {"rate": "/min", "angular speed": "deg/s"}
+"""Units of other dimensions, where a number is turned up and down."""
+_SLOW = 5.0
+"""m/s; speeds up to here, those of blood, are told in cm/s."""
+_OF_SOUND = 1e5
+"""Hz; frequencies from here on are told in MHz."""
 
 _EXACT = 1e-12
 """How far, relatively, a number in another unit may be from the number: only by rounding."""
@@ -47,6 +56,17 @@ def span(quantity: Quantity) -> str:
     if low_unit == high_unit:
         return f"{low} to {high} {high_unit}".rstrip()
     return f"{low} {low_unit} to {high} {high_unit}"
+
+
+def dial_unit(quantity: Quantity) -> str:
+    """The one unit in which all of a quantity's range is shown where a person turns it."""
+    dimension = quantity.dimension
+    if dimension == "frequency" and quantity.minimum >= _OF_SOUND:
+        return "MHz"
+    if dimension == "speed" and quantity.maximum <= _SLOW:
+        return "cm/s"
+    handy = _HANDY.get(dimension, (quantity.unit,))[0]
+    return _ON_A_DIAL.get(dimension, handy)
 
 
 def _split(value: float, dimension: str) -> tuple[str, str]:

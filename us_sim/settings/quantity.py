@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from us_sim.errors import SettingsError
 from us_sim.settings.spelling import shown, unknown
 
-__all__ = ["Quantity"]
+__all__ = ["Quantity", "units_of"]
 
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -41,6 +41,18 @@ _UNITS: dict[str, dict[str, float]] = {
     "number": {},
 }
 _NUMBER = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+def units_of(unit: str) -> dict[str, float]:
+    """Units that measure the same as an SI unit, each with how many of the SI unit it is.
+
+    There are none for a text that is no SI unit here.
+    """
+    same: dict[str, float] = {}
+    for units in _UNITS.values():
+        if next(iter(units), None) == unit:
+            same |= units
+    return same
 
 
 @dataclass(frozen=True)

@@ -84,8 +84,14 @@ FILTERS = Choice(
     key="method",
     error=TrackingError,
     none="us_sim.tracking.filter.pose_filter:Unfiltered",
-    one_euro="us_sim.tracking.filter.one_euro:OneEuro",
-    kalman="us_sim.tracking.filter.kalman:ConstantVelocityKalman",
+    one_euro=Option(
+        "us_sim.tracking.filter.one_euro:OneEuro",
+        "us_sim.tracking.filter.settings:OneEuroSettings",
+    ),
+    kalman=Option(
+        "us_sim.tracking.filter.kalman:ConstantVelocityKalman",
+        "us_sim.tracking.filter.settings:KalmanSettings",
+    ),
 )
 
 _NOTHING = "us_sim.settings.setting:Settings"
@@ -132,6 +138,7 @@ EVALUATIONS = Choice(
     tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
     image=Option(f"{_EVALUATION}.image.measure:evaluate_image", _NOTHING),
     latency=Option(f"{_EVALUATION}.latency.measure:evaluate_latency", _NOTHING),
+    viewer=Option(f"{_EVALUATION}.viewer.measure:evaluate_viewer", _NOTHING),
 )
 
 _CALIBRATION = "us_sim.tracking.calibration"

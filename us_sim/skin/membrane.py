@@ -91,7 +91,7 @@ class SkinMembrane:
         collider: Collider,
         settings: MembraneSettings | None = None,
     ) -> None:
-        settings = settings or MembraneSettings()
+        self.settings = settings = settings or MembraneSettings()
         self.surface = surface
         self._collider = collider
         self._stiffness = settings.stiffness
@@ -134,6 +134,10 @@ class SkinMembrane:
             surface.vertices, vertex_normals(surface.vertices, surface.triangles), 0.0, ""
         )
         self.reset()
+
+    def with_settings(self, settings: MembraneSettings) -> SkinMembrane:
+        """The same surface and probe with other settings, at rest."""
+        return SkinMembrane(self.surface, self._collider, settings)
 
     def reset(self) -> None:
         """Back to the rest shape, without a probe."""

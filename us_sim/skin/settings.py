@@ -24,28 +24,37 @@ class MembraneSettings(Settings):
     section = "skin"
     error = SolverError
 
-    stiffness: float = setting(Quantity("stiffness", 0.0, 1e9), "of an edge's spring", default=40.0)
+    stiffness: float = setting(
+        Quantity("stiffness", 0.0, 1e9), "of an edge's spring", default=40.0, live=True
+    )
+
     anchor_stiffness: float = setting(
-        _STIFFNESS, "of the zero-length spring that ties a vertex to its place", default=4.0
+        _STIFFNESS,
+        "of the zero-length spring that ties a vertex to its place",
+        default=4.0,
+        live=True,
     )
     damping: float = setting(
         Quantity("number", 1.0, 1e6),
         "damping ratio of an anchored vertex: 1 is critical, and skin is overdamped",
         default=1.0,
+        live=True,
     )
     density: float = setting(
         Quantity("mass per area", 1e-9, 1e6),
         "mass per area; where a vertex would be too light for a stable step its mass is raised",
         default=2.0,
+        live=True,
     )
     prestrain: float = setting(
-        Quantity("number", 0.0, 0.999), "of the springs at rest", default=0.2
+        Quantity("number", 0.0, 0.999), "of the springs at rest", default=0.2, live=True
     )
-    time_step: float = setting(Quantity("time", 1e-9, 10.0), "of a step", default=0.01)
+    time_step: float = setting(Quantity("time", 1e-9, 10.0), "of a step", default=0.01, live=True)
     steps: int = setting(
         Quantity("number", 1, 400),
         "in a frame; a probe that moves far takes more",
         default=10,
+        live=True,
     )
 
 

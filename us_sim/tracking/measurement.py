@@ -36,6 +36,7 @@ class Measurement:
     pose: Pose
     covariance: NDArray[np.float64] | None = None  # (6, 6) m², m rad, rad²
     error: float | None = None  # what the device says of its fit, in its own unit (pixels, mm)
+    of_probe: bool = False  # the pose is the probe's own in ``patient``, and the clock is ours
 
     def __post_init__(self) -> None:
         if self.covariance is None:

@@ -112,7 +112,7 @@ class ProbeTracking:
         "order" (not newer than one before), "covariance" (of no distribution) or "gate".
 
         Args:
-            measurement: the tracked body in the device's frame.
+            measurement: the tracked body in the device's frame, or the probe in ``patient``.
             now_ns: when it arrived.
         """
         if not self._in_order(measurement.stamp):
@@ -162,6 +162,8 @@ class ProbeTracking:
 
     def _of_probe(self, measurement: Measurement) -> Measurement:
         """The probe in ``patient`` as measured, with the covariance there."""
+        if measurement.of_probe:
+            return measurement
         body = measurement.pose
         lever = body.rotation @ self._calibration.position
         turned = product(self._registration.orientation, body.orientation)

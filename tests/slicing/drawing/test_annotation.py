@@ -214,16 +214,17 @@ def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, de
     np.testing.assert_array_equal(picture, again)
 
 
-def test_a_picture_of_512_by_512_is_drawn_faster_than_a_hundred_thousand_numbers_are_sorted():
+def test_a_picture_of_512_by_512_is_drawn_faster_than_thirty_thousand_numbers_are_sorted():
     structures = {n: (f"label {n}", (0.2, 0.5, 0.8)) for n in range(1, 7)}
     annotation = Annotation(LINEAR, structures)
     image = np.random.default_rng(2).integers(0, 256, (512, 512), dtype=np.uint8)
     labels = black(LINEAR)
     for n in range(1, 7):
         disk(labels, 70 + 130 * (n % 3), 130 + 200 * (n // 4), 15 + 8 * n, n)
-    numbers = np.random.default_rng(3).integers(0, 2**31, 100_000)
+    # By Python: what NumPy takes depends on the processor by a factor of six.
+    numbers = np.random.default_rng(3).integers(0, 2**31, 30_000).tolist()
     drawing, sorting = [], []
     for _ in range(60):
         drawing.append(thread_seconds(lambda: annotation.draw(image, labels)))
-        sorting.append(thread_seconds(lambda: np.sort(numbers, kind="heapsort")))
+        sorting.append(thread_seconds(lambda: sorted(numbers)))
     assert min(drawing) < min(sorting)

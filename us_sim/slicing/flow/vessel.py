@@ -22,19 +22,16 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import SceneError, VolumeError
 from us_sim.slicing.flow.carried_lumen import CarriedLumen
 from us_sim.slicing.flow.circulation import Circulation
-from us_sim.slicing.flow.lumen import Lumen, lumen_of
+from us_sim.slicing.flow.lumen_map import mapped_lumen
 from us_sim.slicing.flow.settings import FlowSettings
 from us_sim.slicing.flow.waveform import Waveform
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-__all__ = ["LumenMap", "Vessel"]
+__all__ = ["Vessel"]
 
 _ALONG = 0.25
 """Least cosine between the direction that is set and the vessel's own."""
-
-_OUTSIDE = 3.0  # radial coordinate that is well outside the wall
-_MARGIN = 2  # voxels beyond the wall in which coordinates are known
 
 
 class Vessel:
@@ -54,14 +51,12 @@ class Vessel:
     """
 
     def __init__(self, name: str, volume: Volume, label: int, settings: FlowSettings) -> None:
-        assert volume.labels is not None
         self.name = name
         try:
-            lumen = lumen_of(volume.labels == label, volume.index_to_patient)
+            lumen, self.map = mapped_lumen(volume, label)
         except VolumeError as error:
             raise SceneError(f"{name}.flow: the structure {error}: a flow needs a tube") from error
         self._plain = lumen
-        self.map = LumenMap(lumen, volume, label)
         self._mesh: TetrahedralMesh | None = None
         self._carried = CarriedLumen(lumen, None)
         self._now = self._carried.rest
@@ -142,24 +137,3 @@ class Vessel:
         speed = np.where(self._now.filled > 1e-12, self._sign * self._flow / filled, 0.0)
         #: (S, 3) m/s, on the axis at each station, averaged over the pulse.
         self.axis_velocity = speed[:, None] * self._now.tangents
-
-
-class LumenMap:
-    """Place along a vessel, and offset across it as `Lumen.locate` says, of voxels around it.
-
-    The offset is kept and not the radial coordinate, since it is as good as linear from voxel to
-    voxel. Cell (0, 0, 0) is the volume's voxel at ``corner`` (3,).
-    """
-
-    def __init__(self, lumen: Lumen, volume: Volume, label: int) -> None:
-        assert volume.labels is not None
-        inside = np.argwhere(volume.labels == label)
-        low, high = inside.min(axis=0) - _MARGIN, inside.max(axis=0) + _MARGIN + 1
-        shape = tuple(high - low)
-        index = np.indices(shape).reshape(3, -1).T + low
-        to_patient = volume.index_to_patient
-        points = index @ to_patient[:3, :3].T + to_patient[:3, 3]
-        station, offset = lumen.locate(points)
-        self.station = station.astype(np.float32).reshape(shape)
-        self.offset = np.clip(offset, -_OUTSIDE, _OUTSIDE).astype(np.float32).reshape(*shape, 2)
-        self.corner = low

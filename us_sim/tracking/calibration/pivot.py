@@ -9,8 +9,8 @@ A pose (R, p) of the body puts the tip t at R t + p, which is the same point c f
 >>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
 >>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
 >>> poses = [Pose(hole - turn.apply(tip), turn.orientation) for turn in turns]
->>> calibrate_pivot(poses).tip.round(6)
-array([-0.  , -0.  ,  0.15])
+>>> calibrate_pivot(poses).tip.round(6) + 0.0
+array([0.  , 0.  , 0.15])
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ class OneEuroSettings(Settings):
 
     section = "filter"
     error = TrackingError
+    live = True
 
     minimum_cutoff: float = setting(
         _CUTOFF, default=1.5, description="cutoff of the position at rest"
@@ -66,6 +67,7 @@ class KalmanSettings(Settings):
 
     section = "filter"
     error = TrackingError
+    live = True
 
     acceleration: float = setting(
         Quantity("acceleration noise", 1e-6, 1e4),

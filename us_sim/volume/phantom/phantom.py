@@ -17,11 +17,11 @@ from threadpoolctl import threadpool_limits
 
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import PHANTOMS
-from us_sim.volume.phantom.phantom_cache import kept_volume
+from us_sim.volume.phantom.phantom_cache import cache_folder, kept_volume
 from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.volume import Volume
 
-__all__ = ["cached_phantom", "upper_arm"]
+__all__ = ["cached_phantom", "is_phantom_kept", "upper_arm"]
 
 Progress = Callable[[float, str], None]
 
@@ -115,14 +115,24 @@ def cached_phantom(
         VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
-    decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
-    key = f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
+    key = _key(name, seed, voxel_size)
 
     def waiting() -> None:
         if progress is not None:
             progress(0.0, "waiting for another process that makes it")
 
     return kept_volume(key, lambda: make(seed, voxel_size, progress), waiting)
+
+
+def is_phantom_kept(name: str, seed: int, voxel_size: float) -> bool:
+    """Whether a phantom is in the user's cache folder; it may be damaged."""
+    return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
+
+
+def _key(name: str, seed: int, voxel_size: float) -> str:
+    """A file name that says all that decides the phantom's bytes."""
+    decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
+    return f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
 
 
 def _silent(fraction: float, text: str) -> None:
