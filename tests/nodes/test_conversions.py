@@ -22,6 +22,8 @@ from us_sim.nodes.conversions import (
     cloud_message,
     colour_image_message,
     image_message,
+    line_from,
+    mesh_from,
     mesh_message,
     nanoseconds_of,
     pixels_from,
@@ -32,6 +34,8 @@ from us_sim.nodes.conversions import (
     surface_marker,
     tetrahedra_from,
     tetrahedra_message,
+    transducer_markers,
+    triangles_from,
     vectors_from,
 )
 
@@ -106,19 +110,33 @@ def test_poses_round_trip():
 def test_a_marker_has_each_corner_of_each_triangle(frame, count):
     rng = np.random.default_rng(5)
     vertices, triangles = rng.normal(size=(9, 3)), rng.integers(0, 9, (count, 3))
-    marker = deserialize_message(surface_marker(vertices, triangles, STAMP, frame), Marker)
+    serialized = surface_marker(vertices, triangles, STAMP, frame, 0.25)
+    marker = deserialize_message(serialized, Marker)
     received = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3)
     np.testing.assert_array_equal(received, vertices[triangles.ravel()])
     assert marker.header.frame_id == frame
     assert (marker.ns, marker.colors, marker.text) == ("skin", [], "")
     assert marker.pose.orientation.w == 1.0
-    assert len(serialize_message(marker)) == len(surface_marker(vertices, triangles, STAMP, frame))
+    assert marker.color.a == 0.25
+    assert len(serialize_message(marker)) == len(serialized)
 
 
 def test_a_mesh_has_vertices_and_triangles():
     mesh = mesh_message(np.eye(3), np.array([[2, 1, 0]]))
     assert [list(t.vertex_indices) for t in mesh.triangles] == [[2, 1, 0]]
     assert [(v.x, v.y, v.z) for v in mesh.vertices] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    vertices, triangles = mesh_from(mesh)
+    np.testing.assert_array_equal(vertices, np.eye(3))
+    np.testing.assert_array_equal(triangles, [[2, 1, 0]])
+
+
+def test_a_mesh_of_vertices_that_are_not_there_is_refused():
+    mesh = mesh_message(np.eye(3), np.array([[2, 1, 3]]))
+    with pytest.raises(MeshError, match="name vertex 3, but it has 3"):
+        mesh_from(mesh)
+    mesh = mesh_message(np.full((3, 3), np.inf), np.array([[2, 1, 0]]))
+    with pytest.raises(MeshError, match="not finite"):
+        mesh_from(mesh)
 
 
 def test_what_does_not_fit_is_refused():
@@ -278,3 +296,39 @@ def test_what_is_no_affine_map_is_refused():
     for matrix in (np.diag([1.0, np.nan, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0])):
         with pytest.raises(ProbeError, match="give finite numbers, and 0 0 0 1"):
             affine_from(affine_message(matrix))
+
+
+def test_a_transducers_markers_are_read_as_they_were_made():
+    corners = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]])
+    triangles = np.array([[0, 2, 1], [0, 1, 3]])
+    outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04]])
+    parts = [("face", (0.2, 0.2, 0.25, 1.0), corners, triangles)]
+    data = transducer_markers(parts, outline, STAMP, "probe")
+    message = deserialize_message(data, MarkerArray)
+    assert serialize_message(message) == data
+    assert [marker.type for marker in message.markers] == [Marker.TRIANGLE_LIST, Marker.LINE_STRIP]
+    ((name, colour, read),) = triangles_from(message, "probe")
+    assert name == "face"
+    assert colour == pytest.approx((0.2, 0.2, 0.25))
+    np.testing.assert_array_equal(read, corners[triangles.ravel()])
+    np.testing.assert_array_equal(line_from(message, "probe"), outline)
+    with pytest.raises(MessageError, match="is in frame 'probe', not 'patient'"):
+        triangles_from(message, "patient")
+
+
+@pytest.mark.parametrize("wrong", ["nan", "two corners"])
+def test_markers_that_are_no_triangles_are_refused(wrong):
+    marker = Marker(type=Marker.TRIANGLE_LIST, ns="vein")
+    last = Point(x=float("nan")) if wrong == "nan" else None
+    marker.points = [Point(), Point(x=1.0), *([last] if last else [])]
+    with pytest.raises(MeshError, match="vein: "):
+        triangles_from(MarkerArray(markers=[marker]), "")
+
+
+def test_a_markers_pose_places_its_triangles():
+    marker = Marker(type=Marker.TRIANGLE_LIST, ns="bone")
+    marker.points = [Point(), Point(x=1.0), Point(y=1.0)]
+    marker.pose.position.z = 2.0
+    marker.pose.orientation.w, marker.pose.orientation.z = 0.5**0.5, 0.5**0.5  # a quarter turn
+    ((_, _, corners),) = triangles_from(MarkerArray(markers=[marker]), "")
+    np.testing.assert_allclose(corners, [[0, 0, 2], [0, 1, 2], [-1, 0, 2]], atol=1e-12)

@@ -14,6 +14,7 @@ from us_sim.errors import UsSimError
 from us_sim.nodes.settings import NODES, checked_parameters, is_live, parameters_of
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.scene.reading import load_scene
+from us_sim.settings.amount import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import shared_path
 from us_sim.tissue.solvers.switching import SwitchableTissue
@@ -84,6 +85,8 @@ def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene
         unit = rule.quantity.unit if rule.quantity else ""
         assert rule.description, parameter
         assert shown.description == (f"{rule.description} ({unit})" if unit else rule.description)
+        dial = dial_unit(rule.quantity) if rule.quantity else ""
+        assert (f"shown in {dial}" in shown.additional_constraints) == (dial != unit)
         assert ("may change while running" in shown.additional_constraints) == (
             is_live(settings, field)
         )
@@ -103,7 +106,7 @@ def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene
             assert "read-only" in refused.reason
 
 
-LIVE = ["tissue_deformer", "skin_deformer", "slice_interpolator"]
+LIVE = ["tissue_deformer", "skin_deformer", "slice_interpolator", "probe_tracker"]
 
 
 @pytest.mark.parametrize("name", LIVE)

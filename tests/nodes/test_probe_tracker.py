@@ -6,9 +6,12 @@ import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.settings.registry import PROBES
 
 
 @pytest.fixture
@@ -104,3 +107,42 @@ def test_diagnostics_say_what_was_refused(bench, tracker):
         )
     )
     assert reports[0].status[0].name == node.get_fully_qualified_name()
+
+
+def test_the_filter_and_its_settings_may_change_while_poses_come(bench, tracker):
+    node, poses, publisher = tracker
+    bench.spin_until(lambda: bench.peer.count_publishers("probe/pose") > 0)
+
+    def step(second: int, z: float) -> float:
+        count = len(poses)
+        publisher.publish(pose_at(z, second))
+        bench.spin_until(lambda: len(poses) > count)
+        return poses[-1].pose.position.z
+
+    def put(**values: object) -> bool:
+        given = [Parameter(name.replace("__", "."), value=v) for name, v in values.items()]
+        return node.set_parameters_atomically(given).successful
+
+    assert (step(1, 0.0), step(2, 0.001)) == (0.0, 0.001)  # as it is measured
+    assert put(filter="one_euro", one_euro__speed_coefficient=0.0, one_euro__minimum_cutoff=0.001)
+    assert step(3, 0.001) == 0.001  # the first that this filter gets
+    # A low pass of 1 mHz with samples 1 s apart: 1 - 1 / (1 + 2 π · 0.001).
+    assert step(4, 0.002) == pytest.approx(0.001 + 0.001 * 0.0062439, rel=1e-3)
+    refused = node.set_parameters([Parameter("kalman.acceleration", value=-1.0)])[0]
+    assert not refused.successful
+    assert put(filter="none")
+    assert step(5, 0.003) == 0.003
+
+
+def test_the_transducer_is_there_for_who_comes_later(bench, tracker):
+    markers = bench.collect(MarkerArray, "probe/marker", latched=True)
+    bench.spin_until(lambda: markers)
+    assert {marker.header.frame_id for marker in markers[0].markers} == {"probe"}
+    *parts, outline = markers[0].markers
+    assert [part.ns for part in parts] == ["face", "housing", "cable", "notch"]
+    assert outline.type == Marker.LINE_STRIP
+    image = tracker[0].scene.probe.array.settings(PROBES)
+    width = max(point.x for point in outline.points) - min(point.x for point in outline.points)
+    assert width == pytest.approx(image.aperture)
+    assert max(point.z for point in outline.points) == pytest.approx(image.depth)
+    assert max(point.z for part in parts for point in part.points) == pytest.approx(0.0, abs=1e-9)

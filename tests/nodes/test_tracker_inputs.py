@@ -64,6 +64,27 @@ def test_a_scene_registers_the_device_and_calibrates_the_probe(bench, tracker):
     assert (poses[0].header.stamp.sec, poses[0].header.stamp.nanosec) == (6, 500_000_000)
 
 
+def test_a_pose_in_patient_is_the_probes_own_where_the_device_has_another_frame(bench, tracker):
+    _, poses = tracker("""
+  frame: ndi
+  registration: {position: [0, 0, -0.5]}
+  calibration: {position: [0, 0, 0.1]}
+  time_offset: -0.5 s""")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    publisher.publish(pose_at(0.007, 7, frame="patient"))
+    bench.spin_until(lambda: poses)
+    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.007], atol=1e-12)
+    assert (poses[0].header.stamp.sec, poses[0].header.stamp.nanosec) == (7, 0)
+
+
+def test_a_pose_in_patient_is_calibrated_where_that_is_the_devices_frame(bench, tracker):
+    _, poses = tracker("{calibration: {position: [0, 0, 0.1]}}")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    publisher.publish(pose_at(-0.09, 7, frame="patient"))
+    bench.spin_until(lambda: poses)
+    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.01], atol=1e-12)
+
+
 def test_one_body_of_several_in_a_message(bench, tracker):
     node, poses = tracker("{source: pose_array, entry: 1}")
     publisher = bench.publisher(PoseArray, "tracker/poses")

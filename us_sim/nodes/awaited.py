@@ -5,7 +5,7 @@ from __future__ import annotations
 from rclpy.node import Node
 
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.settings import AwaitedSettings
+from us_sim.nodes.session_settings import AwaitedSettings
 
 __all__ = ["Awaited"]
 

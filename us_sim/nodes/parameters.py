@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from array import array
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -23,9 +23,10 @@ from rclpy.parameter import Parameter
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import is_live
+from us_sim.settings.amount import dial_unit
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
 
-__all__ = ["Group", "LiveSettings", "declared"]
+__all__ = ["Group", "LiveSettings", "changed", "declared", "parameters_with"]
 
 S = TypeVar("S", bound=Settings)
 
@@ -120,11 +121,24 @@ class LiveSettings:
                 self._use(wanted)
 
     def _with(self, parameters: list[Parameter]) -> dict[str, Any]:
-        values = {parameter.name: parameter.value for parameter in parameters}
         return {
-            key: _changed(settings, values, self._groups[key].prefix)
+            key: changed(settings, parameters, self._groups[key].prefix)
             for key, settings in self.values.items()
         }
+
+
+def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "") -> S:
+    """The settings with the values of parameters that are theirs.
+
+    Raises:
+        SettingsError: or the settings' own error: a value will not do.
+    """
+    return _changed(settings, {each.name: each.value for each in parameters}, prefix)
+
+
+def parameters_with(settings: Settings) -> list[Parameter]:
+    """The parameters that settings are."""
+    return [Parameter(name, value=_default(settings, name)) for name in rules_of(type(settings))]
 
 
 def _changed(settings: S, values: Mapping[str, Any], prefix: str, before: str = "") -> S:
@@ -184,6 +198,8 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
         is_text = str in get_args(kind)
         none = "''" if is_text else "0"
         constraints.insert(0, f"{none} for none")
+    if rule.quantity and (dial := dial_unit(rule.quantity)) != unit:
+        constraints.append(f"shown in {dial}")
     descriptor = ParameterDescriptor(
         description=f"{rule.description} ({unit})" if unit else rule.description,
         additional_constraints="; ".join(constraints),

@@ -8,36 +8,43 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.transducer_mesh import transducer_mesh
 from us_sim.nodes.conversions import (
     nanoseconds_of,
     pose_from,
     pose_message,
     stamp_message,
+    transducer_markers,
     transform_message,
 )
 from us_sim.nodes.guarded_node import kind_of
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ProbeTrackerSettings
-from us_sim.nodes.tracker_inputs.device import TrackerInput
+from us_sim.nodes.tracker_inputs.device import PATIENT, TrackerInput
+from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.tracker_building import source_settings, tracking_of
-from us_sim.settings.registry import TRACKERS
+from us_sim.settings.registry import FILTERS, TRACKERS
+from us_sim.slicing.probe.outline import image_outline
+from us_sim.tracking.filter.pose_filter import PoseFilter, create_filter
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.state import TrackingState
 
 __all__ = ["ProbeTracker", "main"]
 
-PATIENT = "patient"
+OWN = "probe_tracker"
 FARTHEST = 100.0
 """m from the device's origin, beyond which a pose is in another unit, or nonsense."""
 ROUNDED = 1e-2
@@ -58,18 +65,26 @@ class ProbeTracker(SceneNode):
     What it listens to is up to ``tracker.source`` of the scene, or the parameter ``source``, see
     `tracker_inputs`. A pose goes
     out once, with the stamp of its measurement. ``probe/status``, latched, says whether the probe
-    is ``tracked``, ``coasting`` or ``lost``, each time that changes.
+    is ``tracked``, ``coasting`` or ``lost``, each time that changes. ``probe/marker``, latched, is
+    the transducer to look at. The filter and its settings may change while running.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("probe_tracker", **kwargs)
-        given = declared(self, ProbeTrackerSettings()).source
-        self._source = given or self.scene.tracker.source.name
-        self._tracking = tracking_of(self.scene)
+        chosen = self.scene.tracker.filter
+        groups = {OWN: Group(ProbeTrackerSettings(filter=chosen.name))}
+        for name in FILTERS:
+            default = FILTERS.settings(name)()
+            given = chosen.given if chosen.name == name and chosen.given else default
+            groups[name] = Group(given, prefix=f"{name}.")
+        live = LiveSettings(self, groups, use=self._use)
+        self._source = live.values[OWN].source or self.scene.tracker.source.name
+        self._tracking = tracking_of(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
         self._status = self.latched(DiagnosticStatus, "probe/status")
+        self.latched(MarkerArray, "probe/marker").publish(self._transducer())
         self._input: TrackerInput = TRACKERS.load(self._source)(
             self, source_settings(self.scene, self._source)
         )
@@ -77,6 +92,18 @@ class ProbeTracker(SceneNode):
         self._say_status()
         if not self.lockstep:
             self.create_timer(1.0 / CHECKS, self._check)
+
+    def _transducer(self) -> bytes:
+        """The scene's transducer and the outline of its image; without a collider the latter."""
+        section = self.scene.probe.collider
+        parts = transducer_mesh(collider_of(self.scene)) if section is not None else []
+        surfaces = [(p.name, (*p.colour, 1.0), p.vertices, p.triangles) for p in parts]
+        outline = image_outline(probe_of(self.scene))
+        return transducer_markers(surfaces, outline, TimeMessage(), "probe")
+
+    def _use(self, values: dict[str, Any]) -> None:
+        """Filter as was set from the next pose on; what another filter knew is forgotten."""
+        self._tracking.filter = _filter(values)
 
     def destroy_node(self) -> None:
         """Let go of the device, where it is held by more than subscriptions."""
@@ -147,9 +174,9 @@ class ProbeTracker(SceneNode):
         """Tell a person that something is amiss."""
         self.get_logger().warning(sentence)
 
-    def is_in_frame(self, header: Header, topic: str) -> bool:
-        """Whether a device's message is in the frame that the scene says; said when it is not."""
-        frame = self.scene.tracker.frame
+    def is_in_frame(self, header: Header, topic: str, frame: str | None = None) -> bool:
+        """Whether a device's message is in a frame, that of the scene's; said when it is not."""
+        frame = frame or self.scene.tracker.frame
         if header.frame_id == frame:
             return True
         self.refuse(
@@ -168,9 +195,9 @@ class ProbeTracker(SceneNode):
             stamp = self.now()
         return stamp
 
-    def pose_in(self, message: PoseStamped, topic: str) -> Pose | None:
-        """A device's pose, if it is one and in the frame that the scene says; said when not."""
-        if not self.is_in_frame(message.header, topic):
+    def pose_in(self, message: PoseStamped, topic: str, frame: str | None = None) -> Pose | None:
+        """A device's pose, if it is one and in a frame, that of the scene's; said when not."""
+        if not self.is_in_frame(message.header, topic, frame):
             return None
         try:
             pose = pose_from(message)
@@ -264,6 +291,12 @@ class ProbeTracker(SceneNode):
     def now(self) -> int:
         """The present, ns."""
         return int(self.get_clock().now().nanoseconds)
+
+
+def _filter(values: dict[str, Any]) -> PoseFilter:
+    """The filter that was set."""
+    name = values[OWN].filter
+    return create_filter(name, values[name])
 
 
 def main(args: list[str] | None = None) -> int:

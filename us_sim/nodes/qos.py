@@ -3,7 +3,7 @@
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-__all__ = ["EVERY", "FOREIGN", "LATCHED", "STREAM", "overridable"]
+__all__ = ["CATALOGUE", "EVERY", "FOREIGN", "LATCHED", "STREAM", "overridable"]
 
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -28,6 +28,14 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """What is published once, for those who come later too."""
+
+CATALOGUE = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=200,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Likewise, where each message is about another thing."""
 
 FOREIGN = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,

@@ -17,26 +17,32 @@ from us_sim.nodes.image_settings import (
     PoseAgeSettings,
     image_parameters,
 )
+from us_sim.nodes.session_settings import (
+    BEGUN,
+    AwaitedSettings,
+    PathPlayerSettings,
+    SessionControlSettings,
+    SessionPlayerSettings,
+    SessionRecorderSettings,
+)
+from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.registry import SOLVERS, TRACKERS
+from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
 from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.formation.imaging import Imaging
-from us_sim.volume.reconstruction.live import LiveBox, LiveVolume
+from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
 __all__ = [
     "NODES",
-    "AwaitedSettings",
     "CameraDriverSettings",
     "ImageWriterSettings",
     "OpenIGTLinkBridgeSettings",
-    "PathPlayerSettings",
     "ProbeTrackerSettings",
     "SceneNodeSettings",
-    "SessionPlayerSettings",
-    "SessionRecorderSettings",
     "SkinDeformerSettings",
     "SpaceMouseDriverSettings",
     "StructureMarkersSettings",
@@ -46,11 +52,7 @@ __all__ = [
     "parameters_of",
 ]
 
-_SPEED = Quantity("number", 0.01, 100.0)
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
-_SPAN = Quantity("time", 0.0, 1e6)
-_BYTES = Quantity("number", 0, 2**53)
-_BEGUN = Quantity("time", 0.0, 1e10)
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,12 @@ class ProbeTrackerSettings(Settings):
 
     source: str | None = setting(
         description="replaces tracker.source of the scene", choice=TRACKERS, default=None
+    )
+    filter: str = setting(
+        description="of the poses; in place of tracker.filter.method of the scene",
+        choice=FILTERS,
+        default="none",
+        live=True,
     )
 
 
@@ -122,101 +130,12 @@ class SkinDeformerSettings(Settings):
     """Of ``skin_deformer``."""
 
     marker_rate: float = setting(_MARKERS, "markers are sent at most", default=20.0, live=True)
-
-
-@dataclass(frozen=True)
-class AwaitedSettings(Settings):
-    """Of nodes that play: when they begin."""
-
-    await_topics: tuple[str, ...] = setting(
-        description="begin when each of these has a publisher", default=()
+    marker_opacity: float = setting(
+        Quantity("number", 0.0, 1.0),
+        "of the skin's markers, 1 hides what lies below",
+        default=0.6,
+        live=True,
     )
-    await_subscriber: str | None = setting(
-        description="and this node subscribes to each", default=None
-    )
-
-
-@dataclass(frozen=True)
-class PathPlayerSettings(Settings):
-    """Of ``path_player``."""
-
-    path: str | None = setting(
-        description="bag or tracker recording to play", default=None, file=True
-    )
-    topic: str | None = setting(
-        description="in the bag; not given: the only one of PoseStamped", default=None
-    )
-    rate: float = setting(_SPEED, "speed factor", default=1.0)
-    loop: bool = setting(description="start again at the end", default=False)
-    restamp: bool = setting(
-        description="stamp poses when they are sent, else as recorded", default=True
-    )
-    lockstep: bool = setting(
-        description="send the next pose when the image of the last has come", default=False
-    )
-    begun: float = setting(
-        _BEGUN,
-        "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
-        "the start",
-        default=0.0,
-    )
-
-
-@dataclass(frozen=True)
-class SessionPlayerSettings(Settings):
-    """Of ``session_player``."""
-
-    path: str | None = setting(description="bag to play", default=None, file=True)
-    rate: float = setting(_SPEED, "speed factor", default=1.0)
-    loop: bool = setting(description="start again at the end", default=False)
-
-
-@dataclass(frozen=True)
-class SessionRecorderSettings(Settings):
-    """Of ``session_recorder``."""
-
-    file: str = setting(
-        description="MCAP file to write, or a new folder for a bag", default="session.mcap"
-    )
-    if_exists: str = setting(
-        description="a recording of that name that is there already: refuse to start, or go on in "
-        "a further file beside it",
-        choices=("refuse", "further"),
-        default="refuse",
-    )
-    compression: str = setting(
-        description="of the file's chunks", choices=("none", "zstd"), default="none"
-    )
-    topics: tuple[str, ...] = setting(description="full names; none: all", default=())
-    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
-    max_cache_size: int = setting(
-        _BYTES,
-        "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
-        default=100 * 1024 * 1024,
-    )
-    max_bagfile_size: int = setting(
-        _BYTES, "bytes after which a further file is begun; 0: never", default=0
-    )
-    max_bagfile_duration: float = setting(
-        _SPAN, "after which a further file is begun; 0: never", default=0.0
-    )
-    start_paused: bool = setting(description="wait for the service ~/resume", default=False)
-    snapshot_mode: bool = setting(
-        description="keep messages in memory, max_cache_size at most, until ~/snapshot writes them",
-        default=False,
-    )
-    snapshot_duration: float = setting(_SPAN, "how old they may be; 0: any", default=0.0)
-    scene: str | None = setting(
-        description="scene that is recorded, to be attached with the files that it names",
-        default=None,
-    )
-    volume: str | None = setting(
-        description="volume file in place of the scene's", default=None, file=True
-    )
-    parameters: str = setting(
-        description="those of all nodes, as YAML: attached as parameters.yaml", default=""
-    )
-    attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
 
 @dataclass(frozen=True)
@@ -259,7 +178,7 @@ class CameraDriverSettings(Settings):
         default=0.0,
     )
     begun: float = setting(
-        _BEGUN,
+        BEGUN,
         "since 1970, when a file's first image was shown: play on where it would be by now; 0: "
         "from the start",
         default=0.0,
@@ -306,9 +225,11 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "path_player": (PathPlayerSettings, AwaitedSettings),
     "session_player": (SessionPlayerSettings,),
     "session_recorder": (SessionRecorderSettings,),
+    "session_control": (SessionControlSettings,),
     "camera_driver": (CameraDriverSettings, AwaitedSettings),
     "space_mouse_driver": (SpaceMouseDriverSettings,),
     "image_writer": (ImageWriterSettings,),
+    "viewer": (ViewerSettings,),
     "volume_reconstructor": (LiveVolume, LiveBox),
 }
 """The settings whose fields are a node's parameters; those of parts of a scene come on top."""
@@ -331,6 +252,12 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
     """
     for settings in NODES[node]:
         yield "", settings
+    if node == "probe_tracker":
+        for name in FILTERS:
+            if rules_of(FILTERS.settings(name)):
+                yield f"{name}.", FILTERS.settings(name)
+    if node == "skin_deformer":
+        yield "membrane.", MembraneSettings
     if scene is None:
         return
     if node == "slice_interpolator":
@@ -342,12 +269,14 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
             yield f"materials.{label}.", type(material)
 
 
-def checked_parameters(node: str, scene: Scene, given: Mapping[str, str]) -> dict[str, object]:
+def checked_parameters(
+    node: str, scene: Scene | None, given: Mapping[str, str]
+) -> dict[str, object]:
     """Values of a node's parameters from what a person wrote, in SI units.
 
     Args:
         node: its name.
-        scene: it works on.
+        scene: it works on, if it works on one.
         given: YAML texts by name.
 
     Raises:

@@ -23,6 +23,8 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import SkinDeformerSettings
 from us_sim.scene.building import membrane_of
+from us_sim.settings.setting import rules_of
+from us_sim.skin.settings import MembraneSettings, SkinSettings
 
 __all__ = ["SkinDeformer", "main"]
 
@@ -30,13 +32,18 @@ __all__ = ["SkinDeformer", "main"]
 class SkinDeformer(SceneNode):
     """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.
 
-    Its own parameters are those of `SkinDeformerSettings`; markers are for the eye.
+    Its own parameters are those of `SkinDeformerSettings`; markers are for the eye. Those of the
+    membrane may change, too: it is made anew, and settles under the probe again.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("skin_deformer", **kwargs)
-        self._settings = LiveSettings(self, {"markers": Group(SkinDeformerSettings())})
-        self._membrane = membrane_of(self.scene)
+        skin = self.scene.skin or SkinSettings()
+        membrane = Group(skin, "membrane.", rules_of(MembraneSettings))
+        self._settings = LiveSettings(
+            self, {"markers": Group(SkinDeformerSettings()), "skin": membrane}, use=self._use
+        )
+        self._membrane = membrane_of(self.scene, self._settings.values["skin"])
         surface = self._membrane.surface
         self._triangles = surface.triangles
         self._marked = 0
@@ -48,6 +55,11 @@ class SkinDeformer(SceneNode):
         self.newest(PoseStamped, "probe/pose", self._deform)
         self.health.state = "ready"
         self.get_logger().info("ready")
+
+    def _use(self, values: dict[str, Any]) -> None:
+        """Go on with these settings."""
+        if values["skin"] != self._membrane.settings:
+            self._membrane = self._membrane.with_settings(values["skin"])
 
     def _deform(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
@@ -71,7 +83,9 @@ class SkinDeformer(SceneNode):
             )
             self.health.published("skin/nodes", stamp)
         if shown:
-            self._marker.publish(surface_marker(skin.vertices, self._triangles, stamp, "patient"))
+            opacity = self._settings.values["markers"].marker_opacity
+            marker = surface_marker(skin.vertices, self._triangles, stamp, "patient", opacity)
+            self._marker.publish(marker)
             self.health.published("skin/marker")
         self.health.state = "running"
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}

@@ -30,13 +30,13 @@ class Topic:
         return set(self.publishers) <= _IN_PLACE_OF_DRIVERS
 
 
-_IN_PLACE_OF_DRIVERS = {"path_player", "camera_driver", "space_mouse_driver"}
+_IN_PLACE_OF_DRIVERS = {"path_player", "camera_driver", "space_mouse_driver", "viewer"}
 
 _REPORTING = (
     *("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"),
     *("haptic_renderer", "openigtlink_bridge", "path_player", "session_player"),
     *("session_recorder", "camera_driver", "space_mouse_driver", "session_monitor"),
-    "volume_reconstructor",
+    *("volume_reconstructor", "session_control", "viewer"),
 )
 
 TOPICS = (
@@ -44,7 +44,7 @@ TOPICS = (
         "tracker/pose",
         "geometry_msgs/PoseStamped",
         "the tracked body in the device's frame, stamped when it was measured; source `pose`",
-        publishers=("path_player",),
+        publishers=("path_player", "viewer"),
         subscribers=("probe_tracker",),
     ),
     Topic(
@@ -124,6 +124,7 @@ TOPICS = (
         "the probe in `patient`: registered, checked, filtered; once for each measurement",
         publishers=("probe_tracker",),
         subscribers=(
+            "viewer",
             *("tissue_deformer", "skin_deformer", "slice_interpolator"),
             *("openigtlink_bridge", "volume_reconstructor"),
         ),
@@ -136,24 +137,34 @@ TOPICS = (
         latched=True,
     ),
     Topic(
+        "probe/marker",
+        "visualization_msgs/MarkerArray",
+        "a transducer as the scene's probe is shaped, and the outline of its image, in frame "
+        "`probe`",
+        publishers=("probe_tracker",),
+        subscribers=("viewer",),
+        latched=True,
+    ),
+    Topic(
         "probe/wrench",
         "geometry_msgs/WrenchStamped",
         "the tissue's force and torque on the probe, in frame `probe`",
         publishers=("tissue_deformer",),
+        subscribers=("viewer",),
     ),
     Topic(
         "tissue/nodes",
         "sensor_msgs/PointCloud2",
         "where the deformed mesh's nodes are, in mesh order",
         publishers=("tissue_deformer",),
-        subscribers=("slice_interpolator",),
+        subscribers=("slice_interpolator", "viewer"),
     ),
     Topic(
         "tissue/rest",
         "sensor_msgs/PointCloud2",
         "where they are at rest",
         publishers=("tissue_deformer",),
-        subscribers=("slice_interpolator",),
+        subscribers=("slice_interpolator", "viewer"),
         latched=True,
     ),
     Topic(
@@ -161,7 +172,7 @@ TOPICS = (
         "std_msgs/Int32MultiArray",
         "four nodes of each tetrahedron, N × 4",
         publishers=("tissue_deformer",),
-        subscribers=("slice_interpolator",),
+        subscribers=("slice_interpolator", "viewer"),
         latched=True,
     ),
     Topic(
@@ -170,6 +181,7 @@ TOPICS = (
         "vessels, nerves and bones as deformed, where the scene names `structures`",
         publishers=("tissue_deformer",),
         on_demand=True,
+        subscribers=("viewer",),
     ),
     Topic(
         "tissue/contact_model",
@@ -183,6 +195,7 @@ TOPICS = (
         "shape_msgs/Mesh",
         "the skin at rest",
         publishers=("skin_deformer",),
+        subscribers=("viewer",),
         latched=True,
     ),
     Topic(
@@ -190,7 +203,7 @@ TOPICS = (
         "sensor_msgs/PointCloud2",
         "where the skin's vertices are, with normals",
         publishers=("skin_deformer",),
-        subscribers=("slice_interpolator",),
+        subscribers=("slice_interpolator", "viewer"),
     ),
     Topic(
         "skin/marker",
@@ -203,7 +216,10 @@ TOPICS = (
         "sensor_msgs/Image",
         "`mono8`, in frame `probe`: columns along the array, rows along the depth",
         publishers=("slice_interpolator",),
-        subscribers=("openigtlink_bridge", "image_writer", "path_player", "volume_reconstructor"),
+        subscribers=(
+            *("openigtlink_bridge", "image_writer", "path_player", "volume_reconstructor"),
+            "viewer",
+        ),
     ),
     Topic(
         "ultrasound/image_annotated",
@@ -281,13 +297,37 @@ TOPICS = (
         "std_msgs/Float64MultiArray",
         "4 × 4, from (column, row, 0, 1) of a pixel to metres in frame `probe`",
         publishers=("slice_interpolator",),
-        subscribers=("openigtlink_bridge", "volume_reconstructor"),
+        subscribers=("openigtlink_bridge", "volume_reconstructor", "viewer"),
         latched=True,
     ),
     Topic(
         "session/marker",
         "std_msgs/String",
         "a text that marks a moment of the recording",
+    ),
+    Topic(
+        "session/scenes",
+        "diagnostic_msgs/DiagnosticArray",
+        "scenes and cases that can be loaded: name, description, what loads it, and more",
+        publishers=("session_control",),
+        latched=True,
+        on_demand=True,
+    ),
+    Topic(
+        "session/thumbnails",
+        "sensor_msgs/CompressedImage",
+        "JPEG of what the probe sees in each of them; the frame is what loads it",
+        publishers=("session_control",),
+        latched=True,
+        on_demand=True,
+    ),
+    Topic(
+        "session/bags",
+        "diagnostic_msgs/DiagnosticArray",
+        "bags that can be played: those of the folder `us-sim` runs in, and installed ones",
+        publishers=("session_control",),
+        latched=True,
+        on_demand=True,
     ),
     Topic(
         "events/write_split",

@@ -22,7 +22,8 @@ from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED, overridable
 from us_sim.volume.files.writing import write_volume
-from us_sim.volume.reconstruction.live import LiveBox, LiveReconstruction, LiveVolume
+from us_sim.volume.reconstruction.live import LiveReconstruction
+from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
 __all__ = ["VolumeReconstructor", "main"]
 

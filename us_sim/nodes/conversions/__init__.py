@@ -15,18 +15,31 @@ from us_sim.nodes.conversions.images import (
     affine_message,
     bgr_image_message,
     colour_image_message,
+    colour_pixels_from,
     field_from,
     field_message,
     image_message,
     pixels_from,
 )
-from us_sim.nodes.conversions.markers import structure_markers, surface_marker
-from us_sim.nodes.conversions.meshes import mesh_message, tetrahedra_from, tetrahedra_message
+from us_sim.nodes.conversions.markers import (
+    line_from,
+    structure_markers,
+    surface_marker,
+    transducer_markers,
+    triangles_from,
+)
+from us_sim.nodes.conversions.meshes import (
+    mesh_from,
+    mesh_message,
+    tetrahedra_from,
+    tetrahedra_message,
+)
 from us_sim.nodes.conversions.poses import (
     pose_from,
     pose_message,
     transform_from,
     transform_message,
+    wrench_from,
     wrench_message,
     wrench_serialized,
 )
@@ -38,11 +51,14 @@ __all__ = [
     "bgr_image_message",
     "cloud_message",
     "colour_image_message",
+    "colour_pixels_from",
     "contact_model_from",
     "contact_model_message",
     "field_from",
     "field_message",
     "image_message",
+    "line_from",
+    "mesh_from",
     "mesh_message",
     "nanoseconds_of",
     "pixels_from",
@@ -54,9 +70,12 @@ __all__ = [
     "surface_marker",
     "tetrahedra_from",
     "tetrahedra_message",
+    "transducer_markers",
     "transform_from",
     "transform_message",
+    "triangles_from",
     "vectors_from",
+    "wrench_from",
     "wrench_message",
     "wrench_serialized",
 ]

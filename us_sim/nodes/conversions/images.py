@@ -19,6 +19,7 @@ __all__ = [
     "affine_message",
     "bgr_image_message",
     "colour_image_message",
+    "colour_pixels_from",
     "field_from",
     "field_message",
     "image_message",
@@ -71,15 +72,18 @@ def pixels_from(message: Image) -> NDArray[np.uint8]:
     """
     if message.encoding not in ("mono8", "8UC1"):
         raise VolumeError(f"the image is {message.encoding}; it must be mono8")
-    rows, columns = int(message.height), int(message.width)
-    step = int(message.step) or columns
-    if not rows or not columns or step < columns or len(message.data) < rows * step:
-        raise VolumeError(
-            f"the image holds {len(message.data)} bytes, but says it has {rows} rows of {columns} "
-            f"pixels in {step} bytes each"
-        )
-    flat = np.frombuffer(message.data, dtype=np.uint8, count=rows * step)
-    return flat.reshape(rows, step)[:, :columns]
+    return _lines(message, 1)
+
+
+def colour_pixels_from(message: Image) -> NDArray[np.uint8]:
+    """The (rows, columns, 3) pixels of an ``rgb8`` image: red, green, blue.
+
+    Raises:
+        VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
+    """
+    if message.encoding != "rgb8":
+        raise VolumeError(f"the image is {message.encoding}; it must be rgb8")
+    return _lines(message, 3).reshape(int(message.height), int(message.width), 3)
 
 
 def field_from(message: Image) -> NDArray[np.float32]:
@@ -94,16 +98,28 @@ def field_from(message: Image) -> NDArray[np.float32]:
         what = f"big-endian {message.encoding}" if message.is_bigendian else message.encoding
         raise VolumeError(f"the image is {what}; it must be 32FC1 to 32FC4, little-endian")
     count = int(form[1])
+    values = np.ascontiguousarray(_lines(message, 4 * count)).view("<f4")
     rows, columns = int(message.height), int(message.width)
-    step = int(message.step) or 4 * count * columns
-    if not rows or not columns or step < 4 * count * columns or len(message.data) < rows * step:
+    return values.reshape((rows, columns) if count == 1 else (rows, columns, count))
+
+
+def _lines(message: Image, size: int) -> NDArray[np.uint8]:
+    """The bytes of an image, row by row, without what fills the rows up.
+
+    Args:
+        message: the image.
+        size: bytes of a pixel.
+    """
+    rows, columns = int(message.height), int(message.width)
+    step = int(message.step) or size * columns
+    if not rows or not columns or step < size * columns or len(message.data) < rows * step:
+        bytes_each = f" of {size} bytes" if size > 1 else ""
         raise VolumeError(
             f"the image holds {len(message.data)} bytes, but says it has {rows} rows of {columns} "
-            f"pixels of {4 * count} bytes in {step} bytes each"
+            f"pixels{bytes_each} in {step} bytes each"
         )
-    lines = np.frombuffer(message.data, dtype=np.uint8, count=rows * step).reshape(rows, step)
-    values = np.ascontiguousarray(lines[:, : 4 * count * columns]).view("<f4")
-    return values.reshape((rows, columns) if count == 1 else (rows, columns, count))
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=rows * step)
+    return flat.reshape(rows, step)[:, : size * columns]
 
 
 def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:

@@ -11,7 +11,7 @@ from std_msgs.msg import Int32MultiArray, MultiArrayDimension
 from us_sim.errors import MeshError
 from us_sim.nodes.conversions.packing import packed
 
-__all__ = ["mesh_message", "tetrahedra_from", "tetrahedra_message"]
+__all__ = ["mesh_from", "mesh_message", "tetrahedra_from", "tetrahedra_message"]
 
 
 def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
@@ -46,6 +46,24 @@ def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer])
         vertices=_points(vertices),
         triangles=[MeshTriangle(vertex_indices=triple.astype(np.uint32)) for triple in triangles],
     )
+
+
+def mesh_from(message: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (N, 3) m and triangles (T, 3) of a shape.
+
+    Raises:
+        MeshError: a vertex is not finite, or a triangle names one that is not there.
+    """
+    vertices = np.array([(p.x, p.y, p.z) for p in message.vertices]).reshape(-1, 3)
+    indices = [triangle.vertex_indices for triangle in message.triangles]
+    triangles = np.array(indices, dtype=np.int64).reshape(-1, 3)
+    if not np.isfinite(vertices).all():
+        raise MeshError("a vertex of the mesh is not finite")
+    if triangles.size and triangles.max() >= len(vertices):
+        raise MeshError(
+            f"the mesh's triangles name vertex {triangles.max()}, but it has {len(vertices)}"
+        )
+    return vertices, triangles
 
 
 def _points(vertices: NDArray[np.floating]) -> list[Point]:

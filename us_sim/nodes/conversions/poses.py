@@ -10,7 +10,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
 from numpy.typing import NDArray
 
-from us_sim.errors import PoseError
+from us_sim.errors import MessageError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions.packing import CDR_LITTLE_ENDIAN
 from us_sim.nodes.conversions.stamps import require_frame
@@ -20,6 +20,7 @@ __all__ = [
     "pose_message",
     "transform_from",
     "transform_message",
+    "wrench_from",
     "wrench_message",
     "wrench_serialized",
 ]
@@ -96,6 +97,20 @@ def wrench_message(
     f.x, f.y, f.z = map(float, force)
     t.x, t.y, t.z = map(float, torque)
     return message
+
+
+def wrench_from(message: WrenchStamped, frame: str | None = None) -> NDArray[np.float64]:
+    """Force and torque (6,) N, N m about the origin of the message's frame.
+
+    Raises:
+        MessageError: a number is not finite, or it is in another frame.
+    """
+    require_frame(message.header, frame)
+    f, t = message.wrench.force, message.wrench.torque
+    wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z])
+    if not np.isfinite(wrench).all():
+        raise MessageError(f"the wrench is not finite: {wrench.tolist()}")
+    return wrench
 
 
 def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from us_sim.scene.scene import Scene
     from us_sim.tracking.measurement import Measurement
 
-__all__ = ["Device", "TrackerInput"]
+__all__ = ["PATIENT", "Device", "TrackerInput"]
+
+PATIENT = "patient"
+"""The frame of the tissue, and of the probe's poses."""
 
 
 class TrackerInput:
@@ -58,8 +61,8 @@ class Device(Protocol):
     def refuse(self, kind: str, sentence: str) -> None:
         """Count and say, now and then, why a measurement is not used."""
 
-    def pose_in(self, message: PoseStamped, topic: str) -> Pose | None:
-        """The pose in a message, if it is one and in the scene's frame; said when not."""
+    def pose_in(self, message: PoseStamped, topic: str, frame: str | None = None) -> Pose | None:
+        """The pose in a message, if it is one and in a frame, the scene's; said when not."""
 
     def stamp_of(self, header: Header, topic: str) -> int:
         """When a message was measured, ns; its arrival where it does not say.

@@ -1,4 +1,4 @@
-"""Poses of any driver: NDI, OptiTrack, Vicon, a recorded path."""
+"""Poses of any driver: NDI, OptiTrack, Vicon, a recorded path, or a hand in the viewer."""
 
 from __future__ import annotations
 
@@ -6,21 +6,28 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 
-from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.nodes.tracker_inputs.device import PATIENT, Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["PoseInput"]
 
 
 class PoseInput(TrackerInput):
-    """``tracker/pose`` in the frame that the scene names."""
+    """``tracker/pose`` in the frame that the scene names.
+
+    Where that is another one than ``patient``, a pose in ``patient`` is the probe's own: who knows
+    where the patient is needs neither registration nor calibration.
+    """
 
     def __init__(self, device: Device, settings: Any) -> None:
         super().__init__(device, settings)
+        self._frame = device.scene.tracker.frame
         device.listen_to_device(PoseStamped, "tracker/pose", self._take)
 
     def _take(self, message: PoseStamped) -> None:
-        pose = self._device.pose_in(message, "tracker/pose")
+        of_probe = message.header.frame_id == PATIENT != self._frame
+        frame = PATIENT if of_probe else self._frame
+        pose = self._device.pose_in(message, "tracker/pose", frame)
         if pose is not None:
             stamp = self._device.stamp_of(message.header, "tracker/pose")
-            self._device.take(Measurement(stamp, pose))
+            self._device.take(Measurement(stamp, pose, of_probe=of_probe))

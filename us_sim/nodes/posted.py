@@ -1,0 +1,53 @@
+"""Work that another thread has a node do in the thread that spins it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, TypeVar
+
+from rclpy.node import Node
+
+__all__ = ["Posted"]
+
+T = TypeVar("T")
+
+
+class Posted:
+    """Does what it is called with in the node's thread, in order; any thread may call.
+
+    Args:
+        node: that is spun.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._work: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._guard = node.create_guard_condition(self._turn)
+        self._closed = False
+
+    def __call__(self, work: Callable[[], T]) -> Future[T]:
+        """Have it done soon; the future holds what it returns or raises."""
+        future: Future[T] = Future()
+        if self._closed:
+            future.cancel()
+            return future
+        self._work.append((work, future))
+        self._guard.trigger()
+        return future
+
+    def close(self) -> None:
+        """The node ends: nothing more is done, and what waits is cancelled."""
+        self._closed = True
+        while self._work:
+            self._work.popleft()[1].cancel()
+
+    def _turn(self) -> None:
+        for _ in range(len(self._work)):
+            work, future = self._work.popleft()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(work())
+            except Exception as error:
+                future.set_exception(error)
