@@ -9,6 +9,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import Image
@@ -240,3 +241,58 @@ def test_a_recording_is_published_as_it_was(bench, shared_data):
     for received, recorded in zip(poses, expected, strict=True):
         assert received.pose.position.z == recorded.pose.position.z
         assert received.header.stamp.nanosec == recorded.header.stamp.nanosec
+
+
+def set_live(player, **values):
+    """Set parameters while it plays; the reason where that is refused."""
+    parameters = [Parameter(name, value=value) for name, value in values.items()]
+    return player.set_parameters_atomically(parameters).reason
+
+
+def test_a_path_is_held_still_gone_along_and_played_at_another_pace(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), paused=True, stay=True)
+    bench.spin_until(lambda: len(poses) > 5)
+    assert {round(pose.pose.position.z * 1e3) for pose in poses} == {0}
+    assert set_live(player, time=0.1) == ""  # the sixth pose
+    poses.clear()
+    bench.spin_until(lambda: len(poses) > 5)
+    assert {round(pose.pose.position.z * 1e3) for pose in poses[2:]} == {5}
+    assert player.health.values["position"] == "0.100"
+    assert player.health.values["duration"] == "0.180"
+    assert set_live(player, rate=0.01, paused=False) == ""
+    assert player.health.state == "playing"
+    assert "out of range" in set_live(player, rate=0.0)
+    assert set_live(player, rate=100.0) == ""
+    bench.spin_until(lambda: player.health.state == "finished")
+    assert not player.finished.done()
+    poses.clear()
+    assert set_live(player, time=0.1, rate=10.0) == ""
+    bench.spin_until(lambda: poses and round(poses[-1].pose.position.z * 1e3) == 9)
+    assert round(poses[0].pose.position.z * 1e3) == 5
+
+
+def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
+    file = tmp_path / "said.mcap"
+    with BagWriter(file) as bag:
+        bag.add_topic("/said", "std_msgs/msg/String")
+        bag.add_topic("/excluded", "std_msgs/msg/String")
+        for k in range(10):
+            data = bytes(serialize_message(String(data=str(k))))
+            bag.write("/said", data, EPOCH + k * 10**9)
+            bag.write("/excluded", data, EPOCH + k * 10**9)
+    said = bench.collect(String, "/said")
+    player = bench.make(
+        SessionPlayer, path=str(file), paused=True, stay=True, exclude=["/excluded"]
+    )
+    bench.spin_until(lambda: player.health.state == "paused")
+    assert set_live(player, time=5.0) == ""
+    bench.spin_until(lambda: said)
+    assert [message.data for message in said] == ["5"]  # a moment of it, though it is paused
+    assert player.health.values["position"] == "5.000"
+    assert set_live(player, paused=False, rate=100.0) == ""
+    bench.spin_until(lambda: player.health.state == "finished")
+    bench.spin_until(lambda: said[-1].data == "9")
+    assert [message.data for message in said] == ["5", "6", "7", "8", "9"]
+    assert not player.count_publishers("/excluded")
+    assert not player.finished.done()

@@ -72,6 +72,18 @@ def test_what_is_made_on_demand_is_recorded_only_by_name(bench, tmp_path, topic)
     bench.spin_until(lambda: shown.get_subscription_count() > 0)
 
 
+def test_what_is_made_on_demand_is_recorded_beside_all_others(bench, tmp_path):
+    names = ("tissue/structures", "tissue/nodes", "ultrasound/image_annotated")
+    structures, nodes, annotated = (bench.peer.create_publisher(String, name, 10) for name in names)
+    file = str(tmp_path / "more.mcap")
+    bench.make(SessionRecorder, file=file, also=["/tissue/structures"])
+    bench.spin_until(
+        lambda: structures.get_subscription_count() > 0 and nodes.get_subscription_count() > 0
+    )
+    bench.spin_for(30)
+    assert annotated.get_subscription_count() == 0
+
+
 def test_a_recording_is_not_overwritten(bench, tmp_path):
     file = tmp_path / "session.mcap"
     file.write_bytes(b"precious")

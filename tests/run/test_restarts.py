@@ -57,6 +57,12 @@ def test_a_player_goes_on_where_its_path_would_be():
     assert going_on(player, {"begun": "soon"}) is player
 
 
+def test_a_viewer_goes_on_where_pages_look_for_it():
+    viewer = NodeProcess("viewer", {"host": "127.0.0.1", "port": 0})
+    assert going_on(viewer, {"port": "41234"}).all_parameters["port"] == 41234
+    assert going_on(viewer, {"port": "any"}).all_parameters["port"] == 0
+
+
 def test_others_start_as_they_did():
     tissue = NodeProcess("tissue_deformer", {"scene": "upper_arm"}, {"solver": "msds"})
     assert going_on(tissue, {"state": "ready"}) is tissue

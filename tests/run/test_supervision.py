@@ -6,7 +6,7 @@ import pytest
 
 from us_sim.errors import UsSimError
 from us_sim.run.graph import INTERRUPTED, NodeProcess
-from us_sim.run.plan import Plan
+from us_sim.run.plan import Plan, goes_on
 from us_sim.run.supervision import Supervisor
 from us_sim.run.supervision_settings import SupervisionSettings
 
@@ -20,6 +20,7 @@ class Group:
         self.ended = {}
         self.hung = []
         self.killed = []
+        self.dismissed = {}  # and whether they had to be killed
 
     def start(self, processes):
         for process in processes:
@@ -42,6 +43,13 @@ class Group:
     def end(self, node):
         self.hung.append(node)
 
+    def dismiss(self, node):
+        del self.pids[node]
+        self.dismissed[node] = False
+
+    def leaving(self):
+        return self.dismissed
+
     def stop(self):
         return self.killed
 
@@ -63,6 +71,9 @@ class Monitor:
                 self.node.heard[node, pid] = self.node.heard.get((node, pid), 0) + 1
                 self.node.reports.setdefault(node, {})["pid"] = str(pid)
 
+    def follow(self, nodes):
+        self.nodes = nodes
+
     def waiting(self, pids):
         return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]
 
@@ -77,7 +88,7 @@ def session(tmp_path):
         NodeProcess("slice_interpolator"),
         NodeProcess("path_player"),
     ]
-    plan = Plan(None, processes, poses=600, duration=None)
+    plan = Plan(processes, poses=600)
     return Supervisor(plan, group, monitor, SupervisionSettings(restarts=2)), group, monitor
 
 
@@ -176,3 +187,63 @@ def test_a_recorder_that_had_to_be_killed_is_a_loss(session):
     group.killed = ["session_recorder"]
     supervisor.end()
     assert "did not end when it was told to and was killed" in supervisor.outcome(1.0).sentence()
+
+
+def test_another_plan_ends_what_it_lacks_and_starts_what_is_new_when_that_has_gone(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    before = dict(group.pids)
+    scene = NodeProcess("slice_interpolator", {"scene": "other"})
+    skin = NodeProcess("skin_deformer", {"scene": "other"})
+    file = group.started[0].parameters["file"]
+    recorder = NodeProcess("session_recorder", {"file": file, "parameters": "others'"})
+    supervisor.change(Plan([recorder, scene, skin]))
+    assert set(group.dismissed) == {"slice_interpolator", "path_player"}
+    assert len(group.started) == 3  # while the old still publishes
+    assert set(supervisor.waiting) == {"slice_interpolator", "skin_deformer"}
+    group.dismissed.clear()
+    supervisor.look()
+    assert group.started[3:] == [scene, skin]
+    assert group.pids["session_recorder"] == before["session_recorder"]
+    supervisor.look()
+    assert supervisor.waiting == []
+    assert not supervisor.losses
+    # How many images were made while something was recorded is not known then.
+    assert supervisor.outcome(1.0).sentence() == ""
+
+
+def test_a_recorder_that_takes_long_to_end_holds_up_nobody_else(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    skin = NodeProcess("skin_deformer")
+    supervisor.change(Plan([*group.started[1:], skin]))
+    assert group.started[3:] == [skin]
+    group.dismissed["session_recorder"] = True  # it had to be killed
+    supervisor.look()
+    assert supervisor.losses[-1].given_up == "its last messages may be missing"
+
+
+def test_parameters_that_were_set_meanwhile_are_those_of_the_next_process(session):
+    supervisor, group, _ = session
+    supervisor.look()
+    supervisor.keep("path_player", {"rate": 0.5})
+    group.ended = {"path_player": -9}
+    supervisor.look()
+    assert group.started[3].all_parameters["rate"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("node", "name", "stays"),
+    [
+        ("path_player", "rate", True),
+        ("path_player", "path", False),
+        ("session_recorder", "parameters", True),
+        ("session_recorder", "file", False),
+        ("tissue_deformer", "threads", False),
+    ],
+)
+def test_what_takes_another_process(node, name, stays):
+    before, after = NodeProcess(node, {name: "1"}), NodeProcess(node, {name: "2"})
+    assert goes_on(before, after) is stays
+    assert goes_on(before, before)
+    assert not goes_on(before, None)

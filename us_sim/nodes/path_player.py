@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from rclpy.time import Time
+from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
@@ -17,11 +19,12 @@ from us_sim.nodes.awaited import Awaited
 from us_sim.nodes.conversions import nanoseconds_of, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
-from us_sim.nodes.settings import PathPlayerSettings
+from us_sim.nodes.session_settings import PathPlayerSettings
 from us_sim.recording.path import ProbePath, read_path
+from us_sim.recording.playhead import Playhead
 
 __all__ = ["PathPlayer", "main"]
 
@@ -37,35 +40,43 @@ class PathPlayer(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("path_player", **kwargs)
-        settings = declared(self, PathPlayerSettings())
+        self._live = LiveSettings(self, {"player": Group(PathPlayerSettings())}, use=self._use)
+        settings = self._settings
         path = settings.path
-        self._rate, self._loop = settings.rate, settings.loop
-        self._restamp, self._lockstep = settings.restamp, settings.lockstep
         self._awaited = Awaited(self)
         if not path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
-        self._stamps = _rising_stamps(self._path) if self._lockstep else self._path.stamps
+        lockstep = settings.lockstep
+        self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
+        self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next = 0
+        self._playhead = Playhead(settings.rate)
         self._begun = round(1e9 * settings.begun)  # ns
-        self._half_period = 0.0
         self._checks = 0
+        self._ticking: Timer | None = None
         self.finished = Future()
         self.health = Health(self, str(path))
-        qos = EVERY if self._lockstep else STREAM
+        qos = EVERY if lockstep else STREAM
         self._poses = self.create_publisher(
             PoseStamped, "tracker/pose", qos, qos_overriding_options=overridable()
         )
-        if self._lockstep:
+        if lockstep:
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
         self.health.state = "waiting for the simulation"
         self._starting = self.create_timer(CHECK_S, self._begin)
+        self.add_post_set_parameters_callback(self._seek)
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
         if self._path.note:
             self.get_logger().warning(self._path.note)
+
+    @property
+    def _settings(self) -> PathPlayerSettings:
+        settings: PathPlayerSettings = self._live.values["player"]
+        return settings
 
     def _begin(self) -> None:
         """Start once somebody listens and the awaited topics have been there for a while.
@@ -78,44 +89,94 @@ class PathPlayer(GuardedNode):
             return
         self._starting.cancel()
         self.health.state = "playing"
-        if self._lockstep:
+        if self._settings.lockstep:
             self._send()
             return
-        steps = np.diff(self._path.log_times)
-        period = float(np.median(steps)) * 1e-9 / self._rate if len(steps) else 0.01
-        self._half_period = 0.5e9 * period
-        now = self.get_clock().now().nanoseconds
-        if not 0 < self._begun < now:
-            self._begun = now
+        now = self._now
+        begun = self._begun if 0 < self._begun < now else now
+        self._playhead.go_to(round(1e9 * self._settings.time), begun)
         self._skip(now)
         self.get_logger().info(f"playing from pose {self._next}")
-        self._say_progress()
-        self.health.report()
-        self.create_timer(max(period, 1e-4), self._tick)
+        self._tick_at_its_pace()
+        self._use()
+
+    def _tick_at_its_pace(self) -> None:
+        if self._ticking is not None:
+            self.destroy_timer(self._ticking)
+        self._ticking = self.create_timer(max(1e-9 * self._period, 1e-4), self._tick)
+
+    @property
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+    @property
+    def _period(self) -> float:
+        """ns from pose to pose as they are played."""
+        steps = np.diff(self._ages)
+        return float(np.median(steps)) / self._settings.rate if len(steps) else 0.01e9
 
     def _skip(self, now: int) -> None:
-        """Go where a path that began earlier is by now, ns: round and round if it loops."""
-        ages = (self._path.log_times - self._path.log_times[0]) / self._rate
-        turn = int(ages[-1] + 2 * self._half_period)
-        if self._loop and turn > 0:
-            self._begun += max(now - self._begun, 0) // turn * turn
-        due = ages <= now - self._begun - self._half_period
+        """Go where the playhead is by now; round and round if the path loops."""
+        turn = int(self._ages[-1] + self._period * self._settings.rate)
+        if self._settings.loop and turn > 0:
+            position = self._playhead.position(now)
+            self._playhead.go_to(position % turn, now)
+        due = self._ages <= self._playhead.position(now) - 0.5 * self._period * self._settings.rate
         self._next = min(int(due.sum()), self.pose_count - 1)
 
     def _say_progress(self) -> None:
-        """Tell diagnostics what it takes to go on from here in another process."""
-        self.health.values = {"played": str(self._next), "begun": f"{1e-9 * self._begun:.9f}"}
+        """Tell diagnostics where this is, and what it takes to go on in another process."""
+        position = min(self._playhead.position(self._now), int(self._ages[-1]))
+        self.health.values = {
+            "played": str(self._next),
+            "begun": f"{1e-9 * self._playhead.begun(self._now):.9f}",
+            "position": f"{1e-9 * max(position, 0):.3f}",
+            "duration": f"{1e-9 * self._ages[-1]:.3f}",
+        }
+
+    def _use(self, _: object = None) -> None:
+        """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
+        settings = self._settings
+        if self._ticking is None or settings.lockstep:
+            return
+        if settings.rate != self._playhead.rate:
+            self._playhead.run_at(settings.rate, self._now)
+            self._tick_at_its_pace()
+        self._playhead.hold(settings.paused, self._now)
+        if self.health.state != "finished" or settings.loop:
+            self.health.state = "paused" if settings.paused else "playing"
+        self._say_progress()
+        self.health.report()
+
+    def _seek(self, parameters: list[Parameter]) -> None:
+        """Play on at a time, each time that it is set, also to what it was."""
+        times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
+        if self._ticking is None or not times:
+            return
+        self._playhead.go_to(times[-1], self._now)
+        after = np.searchsorted(self._ages, times[-1])
+        self._next = min(int(after), self.pose_count - 1)
+        self.health.state = "paused" if self._settings.paused else "playing"
+        self._send()
+        self._say_progress()
+        self.health.report()
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
-        while not self.finished.done() and self._is_due():
+        if self.health.state == "finished":
+            if self._settings.loop:
+                self._again()
+            return
+        if self._settings.paused:
+            self._send()  # a probe that is held still is still there
+            return
+        while not self.finished.done() and self.health.state != "finished" and self._is_due():
             self._send()
             self._advance()
 
     def _is_due(self) -> bool:
-        elapsed = self.get_clock().now().nanoseconds - self._begun + self._half_period
-        times = self._path.log_times
-        return bool((times[self._next] - times[0]) / self._rate <= elapsed)
+        half = 0.5 * self._period * self._settings.rate
+        return bool(self._ages[self._next] <= self._playhead.position(self._now) + half)
 
     def _imaged(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)
@@ -125,9 +186,9 @@ class PathPlayer(GuardedNode):
                 self._send()
 
     def _send(self) -> None:
-        i = self._next
+        i = min(self._next, self.pose_count - 1)
         pose = self._path.pose(i)
-        restamp = self._restamp and not self._lockstep
+        restamp = self._settings.restamp and not self._settings.lockstep
         stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._stamps[i]))
         self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))
         self.health.published("tracker/pose")
@@ -137,13 +198,20 @@ class PathPlayer(GuardedNode):
         self._say_progress()
         if self._next < self.pose_count:
             return
-        if self._loop:
-            self._next = 0
-            self._begun = self.get_clock().now().nanoseconds + int(2 * self._half_period)
+        if self._settings.loop:
+            self._again()
             return
         self.health.state = "finished"
         self.get_logger().info("the path is at its end")
-        self.finished.set_result(None)
+        if self._settings.stay:
+            self.health.report()
+        else:
+            self.finished.set_result(None)
+
+    def _again(self) -> None:
+        self._next = 0
+        self.health.state = "playing"
+        self._playhead.go_to(0, self._now + int(self._period))
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:

@@ -56,6 +56,12 @@ class SessionMonitor(GuardedNode):
                 if key.startswith("published ")
             }
 
+    def follow(self, nodes: Collection[str]) -> None:
+        """Follow these nodes from now on."""
+        self._nodes = frozenset(nodes)
+        for name in self.reports.keys() - self._nodes:
+            del self.reports[name], self.messages[name]
+
     def tell_lost(self, losses: Sequence[str]) -> None:
         """Report what was lost so far, each in words, at once and from now on."""
         first = max(len(losses) - TOLD, 0)

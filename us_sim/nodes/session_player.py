@@ -7,17 +7,20 @@ from collections.abc import Iterator
 from typing import Any
 
 from rclpy.exceptions import NameValidationException
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from rclpy.timer import Timer
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.message_types import message_type
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
-from us_sim.nodes.settings import SessionPlayerSettings
+from us_sim.nodes.session_settings import SessionPlayerSettings
+from us_sim.recording.playhead import Playhead
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
 
@@ -28,6 +31,8 @@ _MOST_SAID = 10
 
 START_S = 0.5
 """For subscribers to find the publishers before the first message."""
+_SHOWN = 100_000_000
+"""ns of a recording that are published at once where it is gone to, so that there is an image."""
 
 
 class SessionPlayer(GuardedNode):
@@ -38,15 +43,18 @@ class SessionPlayer(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_player", **kwargs)
-        settings = declared(self, SessionPlayerSettings())
-        path, self._rate, self._loop = settings.path, settings.rate, settings.loop
+        self._live = LiveSettings(self, {"player": Group(SessionPlayerSettings())}, use=self._use)
+        settings = self._settings
+        path = settings.path
         if not path:
             raise BagError("session_player's parameter `path` is missing; name a bag to play")
         self._bag = read_bag(path)
         self.finished = Future()
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
-        left_out = [why for topic in self._bag.topics if (why := self._offer(topic))]
+        self._latched: set[str] = set()  # of them
+        offered = [topic for topic in self._bag.topics if topic.name not in settings.exclude]
+        left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
             raise BagError(f"{path} holds nothing that can be played: {_joined(left_out)}")
         if left_out:
@@ -59,9 +67,22 @@ class SessionPlayer(GuardedNode):
         self._sent = 0
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
-        self._begun = 0
-        self._first = 0
+        self._playhead = Playhead(settings.rate)
+        self._first = self._bag.start or 0
+        self._length = (self._bag.end or 0) - self._first
+        self._until = 0  # of the recording, ns: what is shown of it while it is paused
+        self._ticking: Timer | None = None
         self._start = self.create_timer(START_S, self._begin)
+        self.add_post_set_parameters_callback(self._seek)
+
+    @property
+    def _settings(self) -> SessionPlayerSettings:
+        settings: SessionPlayerSettings = self._live.values["player"]
+        return settings
+
+    @property
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
 
     def _offer(self, topic: BagTopic) -> str:
         """Publish a topic, or say why it cannot be published."""
@@ -72,6 +93,8 @@ class SessionPlayer(GuardedNode):
         except BagError as error:
             return f"{topic.name} ({error})"
         latched = _is_latched(topic)
+        if latched:
+            self._latched.add(topic.name)
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
@@ -87,26 +110,34 @@ class SessionPlayer(GuardedNode):
 
     def _begin(self) -> None:
         self._start.cancel()
-        self._begin_messages()
-        self._first = self._waiting.log_time if self._waiting else 0
+        self._go_to(round(1e9 * self._settings.time))
         self.health.state = "playing"
-        self.create_timer(0.002, self._tick)
+        self._ticking = self.create_timer(0.002, self._tick)
+        self._use()
 
     def _tick(self) -> None:
         """Send what is due."""
-        elapsed = (self.get_clock().now().nanoseconds - self._begun) * self._rate
+        if self.health.state == "finished":
+            if self._settings.loop:
+                self._go_to(0)
+                self.health.state = "playing"
+            return
+        elapsed = max(self._playhead.position(self._now), self._until)
         while self._waiting is not None and self._waiting.log_time - self._first <= elapsed:
             self._topics[self._waiting.topic].publish(self._waiting.data)
             self.health.published(self._waiting.topic)
             self._sent += 1
             self._waiting = self._next()
+        self._say_progress()
         if self._waiting is not None or self.finished.done():
             return
-        if self._loop:
-            self._begin_messages()
+        if self._settings.loop:
+            self._go_to(0)
             return
         self.health.state = "finished"
-        if self._damage or self._sent < self._count:
+        if self._settings.stay:
+            self.health.report()
+        elif self._damage or self._sent < self._count:
             self.finished.set_exception(
                 BagError(
                     f"{self._sent} of {self._count} messages of {self._bag.path} were played"
@@ -116,12 +147,52 @@ class SessionPlayer(GuardedNode):
         else:
             self.finished.set_result(None)
 
-    def _begin_messages(self) -> None:
+    def _say_progress(self) -> None:
+        """Tell diagnostics how far it is."""
+        position = min(max(self._playhead.position(self._now), 0), self._length)
+        self.health.values = {
+            "position": f"{1e-9 * position:.3f}",
+            "duration": f"{1e-9 * self._length:.3f}",
+        }
+
+    def _use(self, _: object = None) -> None:
+        """Go on at the rate that was set, or publish nothing."""
+        settings = self._settings
+        if self._ticking is None:
+            return
+        self._playhead.run_at(settings.rate, self._now)
+        self._playhead.hold(settings.paused, self._now)
+        if self.health.state != "finished" or settings.loop:
+            self.health.state = "paused" if settings.paused else "playing"
+        self._say_progress()
+        self.health.report()
+
+    def _seek(self, parameters: list[Parameter]) -> None:
+        """Play on at a time, each time that it is set, also to what it was."""
+        times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
+        if self._ticking is None or not times:
+            return
+        self._go_to(times[-1])
+        self.health.state = "paused" if self._settings.paused else "playing"
+        self._say_progress()
+        self.health.report()
+
+    def _go_to(self, position: int) -> None:
+        """Have the messages from there on wait, and show a moment of them even if it is paused.
+
+        What is kept for those who come later is sent again from the start.
+        """
         self._damage.clear()
         self._sent = 0
         self._messages = iter(self._bag.messages(list(self._topics), self._damage))
         self._waiting = self._next()
-        self._begun = self.get_clock().now().nanoseconds
+        while self._waiting is not None and self._waiting.log_time - self._first < position:
+            if self._waiting.topic in self._latched:
+                self._topics[self._waiting.topic].publish(self._waiting.data)
+            self._sent += 1
+            self._waiting = self._next()
+        self._until = position + _SHOWN if position else 0
+        self._playhead.go_to(position, self._now)
 
     def _next(self) -> BagMessage | None:
         """The next message; what is damaged is said, and passed over where that can be."""

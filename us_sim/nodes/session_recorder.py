@@ -23,7 +23,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.recorder_services import RecorderEvents, offer_services
 from us_sim.nodes.session_attachments import session_attachments
-from us_sim.nodes.settings import SessionRecorderSettings
+from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.nodes.topics import ON_DEMAND
 from us_sim.recording.losses import Loss, news
 from us_sim.recording.pre_roll import PreRoll
@@ -43,7 +43,7 @@ class SessionRecorder(GuardedNode):
 
     Its parameters are those of `SessionRecorderSettings`; its services and events are those of
     rosbag2's recorder. Topics that are made on demand, such as ``ultrasound/image_annotated``, are
-    recorded only where ``topics`` names them: they are large, and follow from the others.
+    recorded only where ``topics`` or ``also`` names them: they are large, and follow from others.
 
     A text on ``session/marker`` marks a moment of the recording.
     """
@@ -52,10 +52,11 @@ class SessionRecorder(GuardedNode):
         super().__init__("session_recorder", **kwargs)
         self._settings = declared(self, SessionRecorderSettings())
         settings = self._settings
-        self._chosen = set(settings.topics)
+        named = {*settings.topics, *settings.also}
+        self._chosen = named if settings.topics else set()
         self._excluded = {*settings.exclude, *NOT_THE_SESSION}
         self._excluded.add(self.resolve_topic_name(RecorderEvents.LOST))  # it is in the metadata
-        self._excluded |= {self.resolve_topic_name(name) for name in ON_DEMAND} - self._chosen
+        self._excluded |= {self.resolve_topic_name(name) for name in ON_DEMAND} - named
         self._marker_topic = self.resolve_topic_name(MARKERS)
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import json
 import os
 import signal
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -21,8 +16,9 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.run.deferred_signals import deferred_signals
-from us_sim.run.parameter_texts import require_texts
+from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
 
 __all__ = [
@@ -36,48 +32,19 @@ __all__ = [
     "scene_settings",
     "simulation_nodes",
     "video_settings",
+    "viewer_process",
 ]
 
 Parameters = dict[str, dict[str, str]]
 """Parameters given by a person: YAML texts by node and name."""
 
-_PR_SET_PDEATHSIG = 1
-_THIS_PROGRAM = ctypes.CDLL(None)
-_COMPLAINT = "us_sim: "
-# Of `us_sim.nodes.process` and `us_sim.nodes.standby`, which need rclpy.
+# Of `us_sim.nodes.process`, which needs rclpy.
 INTERRUPTED = 130
-STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
-RECORDER = "session_recorder"
-STOP_S = 0.8
-"""How long nodes may take to end before the recorder is told to."""
+RECORDER, VIEWER = "session_recorder", "viewer"
 RECORDER_STOP_S = 10.0
 """How long the recorder may take to write what it still holds."""
 HUNG_STOP_S = 2.0
 """How long a node that hangs may take to end by itself, before it is killed."""
-
-
-@dataclass(frozen=True)
-class NodeProcess:
-    """One node and its parameters."""
-
-    node: str
-    parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
-    given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
-
-    def __post_init__(self) -> None:
-        require_texts(self.all_parameters)
-
-    def command(self) -> list[str]:
-        """The command line that runs it, in ROS 2 and without."""
-        command = [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
-        for name, value in self.all_parameters.items():
-            command += ["-p", f"{name}:={json.dumps(value)}"]
-        return command
-
-    @property
-    def all_parameters(self) -> dict[str, object]:
-        """Those that a person gave go before the others."""
-        return self.parameters | self.given
 
 
 def simulation_nodes(
@@ -110,6 +77,11 @@ def simulation_nodes(
             f"{', '.join(process.node for process in nodes)}"
         )
     return nodes
+
+
+def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
+    """The process that shows the simulation in browsers, at an address that it says itself."""
+    return NodeProcess(VIEWER, {"host": view.host, "port": view.port}, given or {})
 
 
 def scene_settings(scene: Scene) -> dict[str, object]:
@@ -164,21 +136,26 @@ class ProcessGroup:
     """
 
     def __init__(self, log: Path | None = None) -> None:
-        self._running: dict[str, _Running] = {}
-        self._standbys: dict[str, _Running] = {}
+        self._running: dict[str, RunningNode] = {}
+        self._standbys: dict[str, RunningNode] = {}
+        self._leaving: list[tuple[str, RunningNode, float]] = []  # and until when they may take
         self._log_path = log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
 
     def start(self, processes: Iterable[NodeProcess]) -> None:
         """Start each from this very package; they end with this process, whatever happens to it.
 
-        A node of the same name that has ended is replaced, by one that stands by if there is one.
+        A node of the same name that has ended is replaced, by one that stands by if there is one;
+        one that runs as it shall goes on.
         """
         for process in processes:
+            if self.is_running(process.node) and self._running[process.node].node == process:
+                continue
             with deferred_signals():
                 standby = self._standbys.pop(process.node, None)
-                if standby is None or not standby.go_on(process, self._show):
-                    standby = _Running(process, self._show)
+                show = self._tell if process.node == VIEWER else self._show
+                if standby is None or not standby.go_on(process, show):
+                    standby = RunningNode(process, show)
                 self._running[process.node] = standby
 
     def stand_by(self, process: NodeProcess) -> bool:
@@ -186,8 +163,14 @@ class ProcessGroup:
         standby = self._standbys.get(process.node)
         if standby is None or standby.process.poll() is not None:
             with deferred_signals():
-                standby = self._standbys[process.node] = _Running(process, None)
+                standby = self._standbys[process.node] = RunningNode(process, None)
         return standby.said == STANDING_BY
+
+    def _tell(self, line: str) -> None:
+        """Show a line to the person, too, whom it tells where the page is."""
+        self._show(line)
+        if self._log is not None and not line.startswith(COMPLAINT):
+            tqdm.write(line.rstrip(), file=sys.stderr)
 
     def _show(self, line: str) -> None:
         """Put a node's line where it belongs."""
@@ -195,7 +178,7 @@ class ProcessGroup:
             with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
                 self._log.write(line)
                 self._log.flush()
-        elif not line.startswith(_COMPLAINT):  # which is said when the node has ended
+        elif not line.startswith(COMPLAINT):  # which is said when the node has ended
             tqdm.write(line.rstrip(), file=sys.stderr)
 
     @property
@@ -242,6 +225,32 @@ class ProcessGroup:
         running.kill()
         running.told = True
 
+    def dismiss(self, node: str) -> None:
+        """Tell one to end, without waiting for that: `leaving` says when it has."""
+        standby = self._standbys.pop(node, None)
+        if standby is not None:
+            standby.kill()
+        running = self._running.pop(node, None)
+        if running is not None:
+            patience = RECORDER_STOP_S if node == RECORDER else STOP_S
+            running.tell_to_end()
+            self._leaving.append((node, running, time.monotonic() + patience))
+
+    def leaving(self) -> dict[str, bool]:
+        """Nodes that were dismissed and are not gone, or were killed since this was asked last.
+
+        The value says the latter: such a node has taken longer than it may.
+        """
+        now, there, still = time.monotonic(), {}, []
+        for node, running, until in self._leaving:
+            if running.process.poll() is not None:
+                continue
+            there[node] = now > until and running.kill()
+            if not there[node]:
+                still.append((node, running, until))
+        self._leaving = still
+        return there
+
     def stop(self) -> list[str]:
         """End every process; the names of those that had to be killed.
 
@@ -256,100 +265,18 @@ class ProcessGroup:
             running.wait(deadline - time.monotonic())
         if RECORDER in self._running:
             self._running[RECORDER].wait_after_sigterm(RECORDER_STOP_S)
-        killed = [node for node, running in self._running.items() if running.kill()]
+        for _, running, until in self._leaving:
+            running.wait(until - time.monotonic())
+        every = [*self._running.items(), *((node, running) for node, running, _ in self._leaving)]
+        killed = [node for node, running in every if running.kill()]
         for running in self._standbys.values():
             running.kill()
-        for running in (*self._running.values(), *self._standbys.values()):
+        for running in (*(running for _, running in every), *self._standbys.values()):
             running.reader.join(STOP_S)
         if self._log is not None:
             with contextlib.suppress(OSError):
                 self._log.close()
         return killed
-
-
-class _Running:
-    """A node's process, and the thread that reads what it says.
-
-    Args:
-        node: what it runs.
-        show: what is done with its lines; None for one that stands by.
-    """
-
-    def __init__(self, node: NodeProcess, show: Callable[[str], None] | None) -> None:
-        package = str(Path(__file__).resolve().parents[2])
-        search = [package, os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
-        self._node = node
-        self.process = subprocess.Popen(
-            node.command(),
-            stdin=subprocess.DEVNULL if show else subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            env=environment if show else environment | {STANDBY: "1"},
-            start_new_session=True,
-            preexec_fn=_end_with_parent if sys.platform == "linux" else None,
-        )
-        self.complaint = ""  # why it cannot work
-        self.said = ""
-        self.told = False  # that it has ended
-        self._show = show
-        self.reader = threading.Thread(target=self._read, daemon=True)
-        try:
-            self.reader.start()
-        except RuntimeError as error:
-            self.process.kill()
-            self.process.wait()
-            raise UsSimError(f"{node.node} cannot be followed: {error}") from None
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            if line.strip():
-                self.said = line.strip().removeprefix(_COMPLAINT).rpartition("]: ")[2]
-            if line.startswith(_COMPLAINT):
-                self.complaint = self.said
-            if self._show is not None:
-                self._show(line)
-
-    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
-        """Run the node in earnest after standing by; whether it can."""
-        assert self.process.stdin is not None
-        if self.said != STANDING_BY or node != self._node:
-            self.kill()
-            return False
-        self._show = show
-        try:
-            self.process.stdin.write("\n")
-            self.process.stdin.close()
-        except OSError:
-            return False
-        return True
-
-    def tell_to_end(self) -> None:
-        """SIGTERM, which one that was stopped gets, too."""
-        if self.process.poll() is None:
-            self.process.terminate()
-            self.process.send_signal(signal.SIGCONT)
-
-    def wait(self, seconds: float) -> None:
-        """Wait for its end, at most so long."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(max(seconds, 0.0))
-
-    def wait_after_sigterm(self, seconds: float) -> None:
-        """Tell it to end, and wait at most so long."""
-        self.tell_to_end()
-        self.wait(seconds)
-
-    def kill(self) -> bool:
-        """End it for certain; whether it had not ended by itself."""
-        if self.process.poll() is not None:
-            return False
-        self.process.kill()
-        self.wait(STOP_S)  # one that waits for a disk ends when that answers
-        return True
 
 
 def ending(status: int) -> str:
@@ -362,7 +289,3 @@ def ending(status: int) -> str:
         return f"was ended by {signal.Signals(-status).name}"
     except ValueError:
         return f"was ended by signal {-status}"
-
-
-def _end_with_parent() -> None:
-    _THIS_PROGRAM.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -11,29 +11,43 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
+from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.progress import Progress, late_progress
-from us_sim.run.graph import NodeProcess, Parameters, ProcessGroup, keep_on_this_host
+from us_sim.run.following import follow
+from us_sim.run.graph import (
+    NodeProcess,
+    Parameters,
+    ProcessGroup,
+    keep_on_this_host,
+    viewer_process,
+)
 from us_sim.run.losses import Outcome
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import plan_of
-from us_sim.run.supervision import follow
+from us_sim.run.plan import Plan, plan_of
+from us_sim.run.request import Request
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
-from us_sim.scene.case_tissue import keep_tissue
-from us_sim.scene.image_in_volume import check_path_in_volume
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
 
-__all__ = ["demo", "dry_run", "play", "prepare_volume", "run"]
+__all__ = ["demo", "dry_run", "play", "prepare_volume", "run", "view_running"]
 
 
-def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: Path | None) -> str:
+def dry_run(
+    scene: Scene,
+    parameters: Parameters,
+    *,
+    record: Path | None,
+    path: Path | None,
+    view: ViewerSettings | None = None,
+) -> str:
     """What :func:`run` would start and what it would leave out, and why, one line each."""
-    plan_of(scene, parameters, record=record, path=path)
+    plan_of(Request(scene, parameters, record, path, view=view))
     rows = [
         ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
     ]
@@ -50,6 +64,11 @@ def dry_run(scene: Scene, parameters: Parameters, *, record: Path | None, path: 
         ("runs", "session_recorder", f"records to {record}")
         if record
         else ("left out", "session_recorder", "no --record")
+    )
+    rows.append(
+        ("runs", "viewer", f"serves a page at {view.host}, port {view.port or 'any'}")
+        if view
+        else ("left out", "viewer", "no --view")
     )
     lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
@@ -69,17 +88,33 @@ def run(
     duration: float | None,
     network: bool,
     supervision: SupervisionSettings,
+    view: ViewerSettings | None = None,
+    by_hand: bool = False,
 ) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
+
+    Args:
+        scene: what is run.
+        parameters: given by a person, by node.
+        record: MCAP file to record to.
+        path: bag to play to the tracker.
+        duration: s, after which all ends.
+        network: talk beyond this host.
+        supervision: when a node hangs, and how often it is started again.
+        view: address of the page that shows the simulation; None is no page.
+        by_hand: poses come on ``tracker/pose``, whatever the scene's tracker is.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
             recorded.
     """
     keep_on_this_host(network=network)
-    plan = plan_of(scene, parameters, record=record, path=path, duration=duration)
+    request = Request(
+        scene, parameters, record, path, duration=duration, view=view, by_hand=by_hand
+    )
+    plan = plan_of(request)
     prepare_volume(scene, path)
-    outcome = follow(plan, None, supervision)
+    outcome = follow(plan, None, supervision, request)
     for file in outcome.files:
         print(f"recorded to {file}")
     _require_nothing_lost(outcome)
@@ -96,6 +131,7 @@ def demo(
     supervision: SupervisionSettings,
     source: str | None = None,
     path: Path | None = None,
+    view: ViewerSettings | None = None,
 ) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
@@ -109,6 +145,7 @@ def demo(
         source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
             None is the one that the scene's tracker asks for.
         path: bag or recording that is played in place of the scene's own path.
+        view: address of the page that shows the simulation; None is no page.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
@@ -131,10 +168,11 @@ def demo(
     with _made_unless_refused(out):
         video = _prepared_video(scene, file) if source == "camera" else None
         played = file if video is None else None
-        plan = plan_of(scene, parameters, record=recording, path=played, video=video)
+        request = Request(scene, parameters, recording, played, video=video, view=view)
+        plan = plan_of(request)
         prepare_volume(scene, played)
     started = time.monotonic()
-    outcome = follow(plan, out / "nodes.log", supervision)
+    outcome = follow(plan, out / "nodes.log", supervision, request)
     try:
         _report(scene, out, outcome, time.monotonic() - started, video)
     except UsSimError as error:
@@ -165,6 +203,26 @@ def _made_unless_refused(out: Path) -> Iterator[None]:
             for folder in made:
                 folder.rmdir()
         raise
+
+
+def view_running(
+    view: ViewerSettings, given: Parameters, *, network: bool, supervision: SupervisionSettings
+) -> int:
+    """Show whatever runs on this ROS domain, here or on other machines, until Ctrl-C.
+
+    Raises:
+        UsSimError: the viewer cannot start, or one is there already.
+    """
+    keep_on_this_host(network=network)
+    viewer = viewer_process(view, checked_parameters("viewer", None, given.get("viewer", {})))
+    others = sorted(set(given) - {viewer.node})
+    if others:
+        raise UsSimError(
+            f"--param {others[0]}: --attach starts the viewer alone; set parameters of what runs "
+            f"already with `ros2 param set`, or in the page"
+        )
+    _require_nothing_lost(follow(Plan([viewer]), None, supervision))
+    return 0
 
 
 def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:
@@ -211,11 +269,14 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
 def prepare_volume(scene: Scene, path: Path | None = None) -> None:
     """Make a phantom that is not in the cache yet, in view of the person who waits.
 
-    The tissue of a case is made too, and kept in the case.
+    The tissue of a case is made too, and kept in the case. Of a phantom that is there nothing is
+    read, unless a path is played: its nodes do that, and notice damage.
 
     Raises:
         SceneError: no image along the path that will be played shows any of the volume.
     """
+    if path is None and _is_kept(scene):
+        return
     bar: list[Progress] = []
 
     def show(fraction: float, text: str) -> None:
@@ -227,11 +288,26 @@ def prepare_volume(scene: Scene, path: Path | None = None) -> None:
     try:
         volume = volume_of(scene, show)
         if path is not None:
+            from us_sim.scene.image_in_volume import check_path_in_volume
+
             check_path_in_volume(scene, path, volume)
-        keep_tissue(scene, volume, late_progress("making the tissue"))
+        if scene.volume.case is not None:
+            from us_sim.scene.case_tissue import keep_tissue
+
+            keep_tissue(scene, volume, late_progress("making the tissue"))
     finally:
         for shown in bar:
             shown.__exit__(None, None, None)
+
+
+def _is_kept(scene: Scene) -> bool:
+    """Whether a phantom is in the cache already."""
+    from us_sim.volume.phantom.phantom import is_phantom_kept
+
+    volume = scene.volume
+    return volume.phantom is not None and is_phantom_kept(
+        volume.phantom, volume.seed, volume.voxel_size
+    )
 
 
 def _prepared_video(scene: Scene, file: Path) -> PathVideo:

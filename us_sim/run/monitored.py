@@ -13,6 +13,7 @@ from us_sim.run.domain_lock import domain
 from us_sim.run.graph import NodeProcess
 
 if TYPE_CHECKING:
+    from us_sim.nodes.session_control import SessionControl
     from us_sim.nodes.session_monitor import SessionMonitor
 
 __all__ = ["Monitored", "refuse_unknown"]
@@ -58,17 +59,33 @@ class Monitored:
         )
         self._executor: Any = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._namespace = namespace
+        self._control: SessionControl | None = None
+
+    def control(self) -> SessionControl:
+        """The node by which the simulation is controlled, in this process, too."""
+        from us_sim.nodes.session_control import SessionControl
+
+        if self._control is None:
+            self._control = SessionControl(context=self._context, namespace=self._namespace)
+            self._executor.add_node(self._control)
+        return self._control
+
+    def follow(self, nodes: Sequence[str]) -> None:
+        """Follow these nodes from now on."""
+        self.names = list(nodes)
+        self.node.follow(nodes)
 
     def spin(self, seconds: float = 0.1) -> None:
         """Take what has come next, or wait for it, at most so long."""
         self._executor.spin_once(timeout_sec=seconds)
 
-    def refuse_company(self) -> None:
+    def refuse_company(self, names: Collection[str]) -> None:
         """Raise UsSimError when a node of one of these names is on the domain already."""
         until = time.monotonic() + LOOK_AROUND_S
         while time.monotonic() < until:
             self.spin()
-        taken = sorted(set(self.names) & set(self.node.get_node_names()))
+        taken = sorted(set(names) & set(self.node.get_node_names()))
         if taken:
             raise UsSimError(
                 f"{taken[0]} runs already on ROS domain {domain()}: "
@@ -107,6 +124,8 @@ class Monitored:
     def close(self) -> None:
         """Leave the domain."""
         self._executor.shutdown()
+        if self._control is not None:
+            self._control.destroy_node()
         self.node.destroy_node()
         self._context.try_shutdown()
 

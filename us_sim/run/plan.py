@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from us_sim.nodes.settings import checked_parameters
 from us_sim.run.graph import (
     RECORDER,
+    VIEWER,
     NodeProcess,
-    Parameters,
     parameters_file,
     player_settings,
     scene_settings,
     simulation_nodes,
     video_settings,
+    viewer_process,
 )
+from us_sim.run.request import Request
 from us_sim.scene.building import path_of
-from us_sim.scene.scene import Scene
 
-if TYPE_CHECKING:
-    from us_sim.demo.camera_video import PathVideo
+__all__ = ["PLAYERS", "Plan", "goes_on", "plan_of"]
 
-__all__ = ["Plan", "plan_of"]
+PLAYERS = ("path_player", "session_player")
+_WHAT_COUNTS = {
+    RECORDER: ("file",),
+    "path_player": ("path", "topic"),
+    "session_player": ("path",),
+}
+"""Parameters of which a change takes another process; of other nodes it is every parameter."""
+_NOT_PLAYED = ("/diagnostics", "/session/scenes", "/session/thumbnails", "/session/bags")
+"""Topics of a recording on which those publish that are there while it is played."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """What a live run starts."""
 
-    scene: Scene
     processes: list[NodeProcess]
-    poses: int | None  # or images, in the path or video that is played
-    duration: float | None  # s
+    poses: int | None = None  # or images, in the path or video that is played to its end
+    duration: float | None = None  # s
     player: str = "path_player"  # node that plays them
     loops: bool = False  # it begins again at its end
 
@@ -42,51 +47,62 @@ class Plan:
         return [process.node for process in self.processes]
 
 
-def plan_of(
-    scene: Scene,
-    parameters: Parameters,
-    *,
-    record: Path | None,
-    path: Path | None,
-    duration: float | None = None,
-    video: PathVideo | None = None,
-) -> Plan:
+def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
+    """Whether a process that runs can stay when another plan wants its node."""
+    if wanted is None or running.node not in _WHAT_COUNTS:
+        return running == wanted
+    before, after = running.all_parameters, wanted.all_parameters
+    return all(before.get(name) == after.get(name) for name in _WHAT_COUNTS[running.node])
+
+
+def plan_of(request: Request) -> Plan:
     """What is started to run a scene.
 
-    Args:
-        scene: what is run.
-        parameters: given by a person, by node.
-        record: MCAP file to record to.
-        path: bag to play to the tracker.
-        duration: s, after which all ends.
-        video: to show the scene's camera in place of a path.
+    Raises:
+        UsSimError: a parameter will not do, or what is to be played cannot be.
     """
-    parameters = dict(parameters)
+    scene, parameters = request.scene, dict(request.parameters)
 
     def taken(node: str) -> dict[str, object]:
         return checked_parameters(node, scene, parameters.pop(node, {}))
 
     processes = []
-    if record is not None:
-        settings: dict[str, object] = {"file": str(record.expanduser().resolve())}
+    if request.view is not None:  # it goes first: a page can load while tissue is built
+        processes.append(viewer_process(request.view, taken(VIEWER)))
+    recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
+    player = taken("path_player") if request.path is not None or request.is_changed else {}
+    if request.path is not None and request.everything:
+        settings: dict[str, object] = {"path": _absolute(request), "exclude": list(_NOT_PLAYED)}
+        processes.append(NodeProcess("session_player", settings | dict(request.playing)))
+        return Plan(processes, duration=request.duration, player="session_player")
+    if request.record is not None:
+        settings = {"file": str(request.record.expanduser().resolve())}
         settings |= scene_settings(scene)
-        if video is not None:
+        if request.video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
-        processes.append(NodeProcess(RECORDER, settings, taken(RECORDER)))
-    player = taken("path_player") if path is not None else {}
-    driver = taken("camera_driver") if video is not None else {}
-    processes += simulation_nodes(scene, parameters, played=path is not None)
-    for recorder in processes[: record is not None]:
-        recorder.parameters["parameters"] = parameters_file(processes)
-    if video is not None:
-        settings = video_settings(scene, video.file, video.camera_info, recorded=record is not None)
+        processes.append(NodeProcess(RECORDER, settings, recorder))
+    driver = taken("camera_driver") if request.video is not None else {}
+    played = request.by_hand or request.path is not None
+    processes += simulation_nodes(scene, parameters, played=played)
+    for process in processes:
+        if process.node == RECORDER:
+            process.parameters["parameters"] = parameters_file(processes)
+    recorded = request.record is not None
+    if request.video is not None:
+        video = request.video
+        settings = video_settings(scene, video.file, video.camera_info, recorded=recorded)
         processes.append(NodeProcess("camera_driver", settings, driver))
-        count = len(video.poses)
         loops = bool(driver.get("loop"))
-        return Plan(scene, processes, count, duration, "camera_driver", loops)
-    poses = None
-    if path is not None:
-        poses = len(path_of(scene, path, str(player.get("topic") or "") or None))
-        settings = player_settings(scene, path, recorded=record is not None)
-        processes.append(NodeProcess("path_player", settings, player))
-    return Plan(scene, processes, poses, duration, loops=bool(player.get("loop")))
+        return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
+    if request.path is None:
+        return Plan(processes, duration=request.duration)
+    count = len(path_of(scene, request.path, str(player.get("topic") or "") or None))
+    settings = player_settings(scene, request.path, recorded=recorded) | dict(request.playing)
+    processes.append(NodeProcess("path_player", settings, player))
+    ends = not settings.get("stay")
+    loops = bool(processes[-1].all_parameters.get("loop"))
+    return Plan(processes, count if ends else None, request.duration, loops=loops)
+
+
+def _absolute(request: Request) -> str:
+    return str(request.path.expanduser().resolve()) if request.path is not None else ""

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from us_sim.run.graph import RECORDER, NodeProcess
+from us_sim.run.graph import RECORDER, VIEWER, NodeProcess
 from us_sim.run.supervision_settings import SupervisionSettings
 
 __all__ = ["Restarts", "going_on"]
@@ -52,8 +52,9 @@ def _times(count: int) -> str:
 def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
     """The process that goes on in place of one that has ended.
 
-    A recorder goes on in a further file. What plays a path or a video goes on where that would be
-    by now, as a tracker's motion would: what it did not send meanwhile is missing.
+    A recorder goes on in a further file, and a viewer at the port where pages look for it. What
+    plays a path or a video goes on where that would be by now, as a tracker's motion would: what it
+    did not send meanwhile is missing.
 
     Args:
         process: as it was started at first.
@@ -61,6 +62,9 @@ def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
     """
     if process.node == RECORDER:
         more: dict[str, object] = {"if_exists": "further"}
+    elif process.node == VIEWER:
+        port = report.get("port", "")
+        more = {"port": int(port)} if port.isdecimal() and len(port) < 6 else {}
     else:
         try:
             more = {"begun": float(report["begun"])}

@@ -1,32 +1,25 @@
-"""A plan of node processes, kept running, followed by what they report, and ended together."""
+"""A plan of node processes, kept running while another may take its place, and ended together."""
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import time
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 from tqdm import tqdm
 
-from us_sim.errors import UsSimError
-from us_sim.progress import Progress
-from us_sim.run.domain_lock import alone_on_domain
-from us_sim.run.graph import INTERRUPTED, RECORDER, ProcessGroup, ending
-from us_sim.run.losses import Loss, Outcome, files_of, images_in
+from us_sim.run.graph import INTERRUPTED, RECORDER, NodeProcess, ProcessGroup, ending
+from us_sim.run.losses import Loss, Outcome, images_in
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import Plan
+from us_sim.run.plan import Plan, goes_on
+from us_sim.run.recordings import Recordings
 from us_sim.run.restarts import Restarts, going_on
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import START_LIMIT_S, Watch
 
-__all__ = ["Supervisor", "follow"]
+__all__ = ["IMAGER", "IMAGES", "Supervisor", "say"]
 
-SETTLE_S = 1.2
-"""After the path's end: the last images, and each node's last report, which comes every second."""
-RIVALRY_S = 5.0
-"""After all nodes are ready: to see a simulation elsewhere that began at the same moment."""
 SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
 """Nodes that take long to start, and hold no device that a second process could not have."""
 IMAGER, IMAGES = "slice_interpolator", "ultrasound/image"
@@ -35,8 +28,8 @@ IMAGER, IMAGES = "slice_interpolator", "ultrasound/image"
 class Supervisor:
     """Keeps the nodes of a plan running: one that ends or hangs is started again.
 
-    What is noticed is said, kept in `losses`, and published on ``diagnostics``, so that it is in
-    the recording.
+    Another plan may take its place while it runs. What is noticed is said, kept in `losses`, and
+    published on ``diagnostics``, so that it is in the recording.
 
     Args:
         plan: what runs.
@@ -50,22 +43,71 @@ class Supervisor:
     ) -> None:
         self.losses: list[Loss] = []
         self.finished = False  # whether what is played is at its end, or given up
-        self._plan, self._group, self._monitor = plan, group, monitor
+        self._group, self._monitor, self._settings = group, monitor, settings
         self._watch = Watch(settings.silence)
-        self._restarts = Restarts(settings)
         self._away: dict[str, tuple[Loss, float]] = {}  # started again, and when they were lost
         self._were_ready: set[str] = set()
-        self._processes = {process.node: process for process in plan.processes}
+        self._processes: dict[str, NodeProcess] = {}  # that were started, by node
+        self._due: list[NodeProcess] = []  # that are started when others have ended
+        self._recordings = Recordings()
         self._is_disk_full = False
-        self._standby = settings.standby
-        self._older = self._recorded()
         self._began = time.monotonic()
-        group.start(plan.processes)
+        self._changes = 0
+        self.change(plan)
+
+    def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
+        """Run this plan; processes that the plan before had, too, go on.
+
+        Others are told to end, and new ones are started by `look` once they have.
+
+        Args:
+            plan: what runs from now on.
+            anew: nodes that do not go on even so.
+        """
+        wanted = {process.node: process for process in plan.processes}
+        for node, process in list(self._processes.items()):
+            if node in anew or not goes_on(process, wanted.get(node)):
+                self._group.dismiss(node)
+                del self._processes[node]
+                self._away.pop(node, None)
+                self._were_ready.discard(node)
+        self._plan, self.finished = plan, False
+        self._due = [each for each in plan.processes if each.node not in self._processes]
+        self._restarts = Restarts(self._settings)
+        self._changed = time.monotonic()
+        self._changes += 1
+        self._monitor.follow(plan.nodes)
+        self._start_due()
+
+    @property
+    def plan(self) -> Plan:
+        """What runs, or is about to."""
+        return self._plan
+
+    @property
+    def started(self) -> set[str]:
+        """Nodes of it that were started."""
+        return set(self._processes)
 
     @property
     def waiting(self) -> list[str]:
         """Nodes that have not reported yet, or not yet again."""
-        return self._monitor.waiting(self._group.pids)
+        due = [process.node for process in self._due]
+        return due + self._monitor.waiting(self._group.pids)
+
+    def failed(self) -> str:
+        """Why the plan cannot run, where a node of it is given up before all were ready."""
+        late = self.waiting
+        if late and time.monotonic() - self._changed > START_LIMIT_S:
+            return f"{', '.join(late)} did not start in {START_LIMIT_S:g} s"
+        given_up = (loss for loss in self.losses if loss.given_up and loss.node in late)
+        return str(next(given_up, ""))
+
+    def keep(self, node: str, values: Mapping[str, object]) -> None:
+        """Parameters that a node was given while it runs: started again, it has them, too."""
+        if node in self._processes:
+            process = self._processes[node]
+            self._processes[node] = replace(process, given=process.given | dict(values))
 
     def look(self) -> None:
         """Take what has come, and see to nodes that have ended or hang.
@@ -74,6 +116,7 @@ class Supervisor:
             UsSimError: a node that was never ready cannot work, in its own words.
         """
         self._monitor.spin()
+        self._start_due()
         for node, status in self._group.take_ended().items():
             self._ended(node, status)
         hung = self._watch.look(self._running(), self._monitor.node.heard)
@@ -83,22 +126,48 @@ class Supervisor:
             self._lose(node, how, said)
         self._welcome()
         self._look_at_the_disk()
-        if self._standby:
+        if self._settings.standby:
             self._prepare()
+
+    def _start_due(self) -> None:
+        """Start what is due, unless something that was dismissed may still publish beside it.
+
+        The recorder may take long to write, and disturbs nobody but another recorder.
+        """
+        leaving = self._group.leaving()
+        if leaving.get(RECORDER):
+            self._note_killed_recorder()
+        others = leaving.keys() - {RECORDER}
+        ready = [
+            process
+            for process in self._due
+            if not (others if process.node != RECORDER else RECORDER in leaving)
+        ]
+        for process in ready:
+            self._due.remove(process)
+            self._processes[process.node] = process
+            if process.node == RECORDER:
+                self._recordings.begin(process)
+        self._group.start(ready)
 
     def end(self) -> None:
         """End all nodes; a recorder that had to be killed is lost."""
         if RECORDER in self._group.stop():
-            loss = self._loss(RECORDER, "did not end when it was told to and was killed", "")
-            loss.given_up = "its last messages may be missing"
-            self._note(loss, loss.given_up)
+            self._note_killed_recorder()
+
+    def _note_killed_recorder(self) -> None:
+        loss = self._loss(RECORDER, "did not end when it was told to and was killed", "")
+        loss.given_up = "its last messages may be missing"
+        self._note(loss, loss.given_up)
 
     def outcome(self, startup: float) -> Outcome:
         """How it went, once all has ended."""
-        made = self._monitor.node.count(IMAGER, IMAGES)
-        files = [file for file in self._recorded() if file not in self._older]
+        files = self._recordings.files()
+        recorded = images_in(files)
+        # How many images there were while something was recorded is only known of a whole run.
+        made = self._monitor.node.count(IMAGER, IMAGES) if self._changes == 1 else recorded
         poses = None if self._plan.loops else self._plan.poses
-        return Outcome(startup, self.losses, files, made, images_in(files), poses)
+        return Outcome(startup, self.losses, files, made, recorded, poses)
 
     def _running(self) -> Mapping[str, int]:
         group = self._group
@@ -137,7 +206,7 @@ class Supervisor:
             loss, since = self._away.pop(node)
             loss.back_after = time.monotonic() - since
             self._publish()
-            _say(f"{node} is back after {loss.back_after:.1f} s")
+            say(f"{node} is back after {loss.back_after:.1f} s")
 
     def _prepare(self) -> None:
         """Have the next node stand by, one at a time, while all others run."""
@@ -154,7 +223,7 @@ class Supervisor:
     def _note(self, loss: Loss, then: str = "") -> None:
         self.losses.append(loss)
         last = f", and last said: {loss.said}" if loss.said else ""
-        _say(f"{loss.node} {loss.what} after {loss.at:.1f} s{last}; {then}".removesuffix("; "))
+        say(f"{loss.node} {loss.what} after {loss.at:.1f} s{last}; {then}".removesuffix("; "))
 
     def _publish(self) -> None:
         """Tell diagnostics, which a recorder records."""
@@ -170,108 +239,7 @@ class Supervisor:
             self._publish()
         self._is_disk_full = is_full
 
-    def _recorded(self) -> list[Path]:
-        """The files of the recording, with any that were there before."""
-        if RECORDER not in self._processes:
-            return []
-        return files_of(Path(str(self._processes[RECORDER].all_parameters["file"])))
 
-
-def follow(plan: Plan, log: Path | None, settings: SupervisionSettings) -> Outcome:
-    """Start the plan's processes and stay with them until they are done; how it went.
-
-    Args:
-        plan: what runs.
-        log: where what they say goes; None is the terminal.
-        settings: when a node hangs, and how often it is started again.
-
-    Raises:
-        UsSimError: a node cannot start, or another simulation runs on this domain.
-    """
-    with alone_on_domain():
-        group = ProcessGroup(log)
-        supervisor = None
-        startup = 0.0
-        try:
-            # The monitor goes first: it would wait for what a killed node never acknowledges.
-            with contextlib.closing(Monitored(plan.nodes, supervised=True)) as monitor:
-                monitor.refuse_company()
-                began = time.monotonic()
-                supervisor = Supervisor(plan, group, monitor, settings)
-                _await_all(supervisor, monitor, began)
-                monitor.refuse_unknown(plan.processes)
-                startup = time.monotonic() - began
-                _stay(plan, supervisor, monitor)
-        except KeyboardInterrupt:
-            if supervisor is not None:
-                supervisor.end()
-                lost = supervisor.outcome(startup).sentence()
-                if lost:
-                    _say(lost)
-            raise
-        finally:
-            (group.stop if supervisor is None else supervisor.end)()
-        return supervisor.outcome(startup)
-
-
-def _await_all(supervisor: Supervisor, monitor: Monitored, began: float) -> None:
-    """Until every node has reported."""
-    with Progress("starting (the first run compiles)", len(monitor.names), "nodes") as bar:
-        while waiting := supervisor.waiting:
-            supervisor.look()
-            monitor.refuse_earlier_run()
-            more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
-            bar.update(len(monitor.names) - len(waiting), ", ".join(waiting[:2]) + more)
-            given_up = next((loss for loss in supervisor.losses if loss.given_up), None)
-            if given_up is not None:
-                raise UsSimError(str(given_up))
-            if time.monotonic() - began > START_LIMIT_S:
-                raise UsSimError(f"{', '.join(waiting)} did not start in {START_LIMIT_S:g} s")
-
-
-def _stay(plan: Plan, supervisor: Supervisor, monitor: Monitored) -> None:
-    """Until the path is at its end, or the time is up."""
-    began = time.monotonic()
-    ended: float | None = None
-    plays = plan.poses is not None
-    total = plan.duration if not plays else None if plan.loops else plan.poses
-    unit = "s" if not plays else "poses" if plan.player == "path_player" else "images"
-    with Progress("running", total, unit) as bar:
-        while True:
-            supervisor.look()
-            now = time.monotonic()
-            if now - began < RIVALRY_S:
-                monitor.refuse_earlier_run()
-            done = _played(plan, monitor) if plays else now - began
-            bar.update(min(done, total or done), _status(plan, monitor))
-            if supervisor.finished and ended is None:
-                ended = now
-            if plan.duration is not None and now - began > plan.duration:
-                return
-            if ended is not None and now - ended > SETTLE_S:
-                return
-
-
-def _played(plan: Plan, monitor: Monitored) -> float:
-    """How far what is played has come, in poses or images."""
-    text = monitor.node.reports.get(plan.player, {}).get("played", "")
-    return float(text) if text.isdecimal() and len(text) < 12 else 0.0
-
-
-def _status(plan: Plan, monitor: Monitored) -> str:
-    """The images so far, their rate and their age, in words."""
-    again = f"begins again every {plan.poses}; " if plan.loops else ""
-    slicer = monitor.node.reports.get(IMAGER, {})
-    count = monitor.node.count(IMAGER, IMAGES)
-    if not count:
-        heard = slicer.get("received", "0") != "0"
-        return again + ("nobody subscribes to ultrasound/image" if heard else "waiting for poses")
-    return (
-        f"{again}{count} images, {slicer.get('rate_hz', '?')}/s, "
-        f"p99 {slicer.get('latency_p99_ms', '?')} ms"
-    )
-
-
-def _say(sentence: str) -> None:
+def say(sentence: str) -> None:
     """To the person, above the bar."""
     tqdm.write(f"us-sim: {sentence}", file=sys.stderr)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
     from us_sim.recording.path import ProbePath
     from us_sim.skin.membrane import SkinMembrane
+    from us_sim.skin.settings import MembraneSettings
     from us_sim.skin.surface import TriangleSurface
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe.probe import Probe
@@ -259,12 +260,12 @@ def skin_surface_of(scene: Scene) -> TriangleSurface:
     )
 
 
-def membrane_of(scene: Scene) -> SkinMembrane:
-    """The scene's skin, pressed by the scene's probe."""
+def membrane_of(scene: Scene, settings: MembraneSettings | None = None) -> SkinMembrane:
+    """The scene's skin, pressed by the scene's probe; with other settings where they are given."""
     from us_sim.skin.membrane import SkinMembrane
 
     sheet = skin_surface_of(scene)
-    return SkinMembrane(sheet, collider_of(scene), scene.skin)
+    return SkinMembrane(sheet, collider_of(scene), settings or scene.skin)
 
 
 def _mesh(

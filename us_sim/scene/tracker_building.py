@@ -17,6 +17,7 @@ from us_sim.settings.registry import TRACKERS
 
 if TYPE_CHECKING:
     from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.filter.pose_filter import PoseFilter
     from us_sim.tracking.haptic.rendering import HapticRendering
     from us_sim.tracking.probe_tracking import ProbeTracking
 
@@ -29,8 +30,12 @@ __all__ = [
 ]
 
 
-def tracking_of(scene: Scene) -> ProbeTracking:
+def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
     """What turns the measurements of the scene's tracker into the probe's poses.
+
+    Args:
+        scene: with the tracker.
+        filter: in place of the scene's.
 
     Raises:
         CalibrationError: a file of a registration or calibration cannot be used.
@@ -47,7 +52,7 @@ def tracking_of(scene: Scene) -> ProbeTracking:
         gate = OutlierGate(tracker.gate)
     return ProbeTracking(
         *tracker_poses_of(scene),
-        create_filter(tracker.filter.name, tracker.filter.given),
+        filter or create_filter(tracker.filter.name, tracker.filter.given),
         gate,
         time_offset=tracker.time_offset,
         coast_for=tracker.coast_for,

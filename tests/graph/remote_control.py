@@ -1,0 +1,100 @@
+"""What a person elsewhere on the ROS domain has: parameters to set, and reports to read."""
+
+import subprocess
+import sys
+import time
+
+import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
+
+
+class RemoteControl:
+    """Sets parameters of ``session_control`` and hears what nodes report."""
+
+    def __init__(self):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        from rclpy.parameter_client import AsyncParameterClient
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from sensor_msgs.msg import CompressedImage, Image
+
+        self._context = Context()
+        rclpy.init(args=[], context=self._context)
+        self.node = Node("remote_control", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._client = AsyncParameterClient(self.node, "session_control")
+        self.reports = {}
+        self.states = []
+        self.images = 0
+        self.size = None
+        self.scenes = {}
+        self.thumbnails = {}
+        self.node.create_subscription(DiagnosticArray, "diagnostics", self._take, 100)
+        self.node.create_subscription(Image, "ultrasound/image", self._imaged, 10)
+        kept = QoSProfile(depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(DiagnosticArray, "session/scenes", self._listed, kept)
+        self.node.create_subscription(CompressedImage, "session/thumbnails", self._pictured, kept)
+
+    def set(self, **values):
+        """Set them together; the reason where that is refused."""
+        from rclpy.parameter import Parameter
+
+        self.until(self._client.services_are_ready)
+        asked = self._client.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()]
+        )
+        self.until(asked.done)
+        return asked.result().result.reason
+
+    def value(self, name):
+        """A parameter's value now."""
+        asked = self._client.get_parameters([name])
+        self.until(asked.done)
+        return asked.result().values[0].string_value
+
+    def until(self, condition, seconds=100):
+        """Listen until that is so."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, (self.states[-5:], self.reports)
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def report(self, node="session_control"):
+        """What a node said last, by key."""
+        return self.reports.get(node, {})
+
+    @property
+    def state(self):
+        return self.report().get("state", "")
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def _take(self, message):
+        for status in message.status:
+            name = status.name.rsplit("/", 1)[-1]
+            self.reports[name] = {item.key: item.value for item in status.values}
+            self.reports[name]["message"] = status.message
+            if name == "session_control":
+                self.states.append(status.message)
+
+    def _imaged(self, message):
+        self.images += 1
+        self.size = message.width, message.height
+
+    def _listed(self, message):
+        self.scenes = {status.name: status for status in message.status}
+
+    def _pictured(self, message):
+        self.thumbnails[message.header.frame_id] = bytes(message.data)
+
+
+def started(*words, cwd):
+    """`us-sim WORDS` in a process of its own."""
+    command = [sys.executable, "-m", "us_sim", *map(str, words)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=cwd)

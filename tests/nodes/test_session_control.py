@@ -1,0 +1,124 @@
+"""The simulation's switches: what is handed on, what is refused, and what pages hear of it."""
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+
+from us_sim.errors import SceneError
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.session_control import SessionControl
+from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.nodes.viewer_session import ViewerSession
+from us_sim.scene.listing import ListedScene
+from us_sim.viewer.session import NOT_THERE
+
+
+class Simulation:
+    """Notes what it is told."""
+
+    def __init__(self):
+        self.taken = []
+
+    def check(self, wanted, named):
+        assert named
+        if wanted.scene == "nowhere":
+            raise SceneError("there is no scene file nowhere")
+
+    def take(self, wanted, named):
+        self.taken.append((set(named), wanted))
+
+
+def controlled(bench):
+    control = bench.make(SessionControl)
+    simulation = Simulation()
+    control.obey(simulation, SessionControlSettings(scene="arm", volume="arm.nrrd"))
+    return control, simulation
+
+
+def put(control, **values):
+    parameters = [Parameter(name, value=value) for name, value in values.items()]
+    return control.set_parameters_atomically(parameters)
+
+
+def test_what_cannot_be_is_refused_and_stays_as_it_was(bench):
+    control, simulation = controlled(bench)
+    assert put(control, scene="nowhere").reason == "there is no scene file nowhere"
+    assert "out of range" in put(control, replay_rate=0.0).reason
+    assert not simulation.taken
+    assert control.get_parameter("scene").value == "arm"
+
+
+def test_before_there_is_a_simulation_nothing_can_be_asked(bench):
+    control = bench.make(SessionControl)
+    assert put(control, record="a.mcap").reason == "the simulation has not begun yet"
+
+
+def test_a_volume_goes_with_the_scene_that_it_was_set_for(bench):
+    control, simulation = controlled(bench)
+    assert control.values.volume == "arm.nrrd"
+    assert put(control, scene="leg").successful
+    assert (control.values.scene, control.values.volume) == ("leg", None)
+    assert control.get_parameter("volume").value == ""
+    assert put(control, scene="arm", volume="other.nrrd").successful
+    assert simulation.taken[-1][1].volume == "other.nrrd"
+
+
+def test_the_same_value_again_is_told_too(bench):
+    control, simulation = controlled(bench)
+    for _ in range(2):
+        assert put(control, replay_time=1.5).successful
+    assert [named for named, _ in simulation.taken] == [{"replay_time"}] * 2
+
+
+def test_what_is_so_is_shown_without_being_asked_for(bench):
+    control, simulation = controlled(bench)
+    control.show(SessionControlSettings(scene="leg", record="a.mcap"))
+    assert control.get_parameter("record").value == "a.mcap"
+    assert control.values.record == "a.mcap"
+    assert not simulation.taken
+
+
+def test_pages_follow_and_ask_and_hear_why_not(bench):
+    control, simulation = controlled(bench)
+    page = bench.add(GuardedNode("page", context=bench.context))
+    session = ViewerSession(page, Posted(page))
+    board = session.board
+    assert board.ask(record="a.mcap").result() == NOT_THERE
+    board.watch()
+    bench.spin_until(lambda: control.count_subscribers("session/scenes"))
+    arm = ListedScene("arm", "/arm.yaml", description="An arm.", structures=("vein", "artery"))
+    control.tell_scenes([arm, ListedScene("leg", "/leg.yaml", problem="volume: is missing")])
+    control.tell_thumbnail("/arm.yaml", b"jpeg")
+    control.tell_bags({"a.mcap": "/a.mcap"})
+    values = {"scene": "arm", "replay_rate": "0.5", "replay_loop": "true", "fraction": "0.40"}
+    control.tell("starting: 2 of 5 nodes", values, "nothing came")
+    bench.spin_until(
+        lambda: board.state.scene == "arm" and board.bags and board.thumbnail("/arm.yaml")
+    )
+    bench.spin_until(lambda: board.scenes)
+    assert [(each.description, each.problem) for each in board.scenes] == [
+        ("An arm.", ""),
+        ("", "volume: is missing"),
+    ]
+    assert (board.state.rate, board.state.loop, board.state.is_busy) == (0.5, True, True)
+    assert board.state.problem == "nothing came"
+    bench.spin_until(lambda: session._client.services_are_ready())
+    taken, refused = board.ask(record="b.mcap"), board.ask(scene="nowhere")
+    bench.spin_until(lambda: taken.done() and refused.done())
+    assert (taken.result(), refused.result()) == ("", "there is no scene file nowhere")
+    assert simulation.taken[-1][1].record == "b.mcap"
+    board.unwatch()
+    bench.spin_until(lambda: not control.count_subscribers("session/scenes"))
+
+
+def test_a_change_is_reported_at_once_but_the_time_in_a_replay_is_not(bench):
+    control, _ = controlled(bench)
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    control.tell("running", {"record": "", "position": "1.0"})
+    sent = []
+    control.health.report = lambda: sent.append(dict(control.health.values))
+    control.tell("running", {"record": "", "position": "2.0"})
+    assert not sent
+    control.tell("running", {"record": "a.mcap", "position": "2.0"})
+    assert sent[-1]["record"] == "a.mcap"
+    bench.spin_until(lambda: reports)

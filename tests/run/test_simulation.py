@@ -1,0 +1,144 @@
+"""What a running simulation does as its control is set, without any process."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.run.plan import plan_of
+from us_sim.run.request import Request
+from us_sim.run.simulation import Simulation
+from us_sim.scene.reading import load_scene
+from us_sim.share import shared_path
+
+PATH = str(shared_path("bags/press_and_slide.mcap"))
+
+
+class Supervisor:
+    """Runs plans on paper: all nodes are ready at once, unless the test says why they fail."""
+
+    def __init__(self, plan):
+        self.plan, self.why, self.waiting, self.kept = plan, "", [], {}
+        self.started = set(plan.nodes)
+        self.plans = [plan]
+
+    def change(self, plan, anew=()):
+        assert set(anew) <= set(self.plan.nodes)
+        self.plan = plan
+        self.started = set(plan.nodes)
+        self.plans.append(plan)
+
+    def look(self):
+        why, self.why = self.why, ""
+        if why:
+            raise UsSimError(why)
+
+    def failed(self):
+        return ""
+
+    def keep(self, node, values):
+        self.kept[node] = values
+
+
+class Control:
+    """Shows what it is told."""
+
+    def __init__(self):
+        self.values = SessionControlSettings()
+        self.told, self.to_player = [], []
+
+    def obey(self, _, settings):
+        self.values = settings
+
+    def show(self, settings):
+        self.values = settings
+
+    def tell(self, state, values, warning=""):
+        self.told.append((state, values, warning))
+
+    def tell_player(self, node, values):
+        self.to_player.append((node, values))
+
+
+@pytest.fixture
+def running(small_scene):
+    """A simulation of the small scene that is ready, its supervisor and its control."""
+    request = Request(load_scene(small_scene), by_hand=True)
+    supervisor, control = Supervisor(plan_of(request)), Control()
+    monitor = SimpleNamespace(control=lambda: control, node=SimpleNamespace(reports={}))
+    simulation = Simulation(request, supervisor, monitor)
+    simulation.look()
+    yield simulation, supervisor, control
+    simulation.close()
+
+
+def ask(simulation, control, **values):
+    control.values = replace(control.values, **values)
+    simulation.check(control.values, set(values))
+    simulation.take(control.values, set(values))
+
+
+def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path):
+    simulation, supervisor, control = running
+    nodes = set(supervisor.plan.nodes)
+    ask(simulation, control, record=str(tmp_path / "a.mcap"))
+    assert set(supervisor.plan.nodes) == nodes | {"session_recorder"}
+    ask(simulation, control, replay=PATH, replay_rate=0.5)
+    assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}
+    player = supervisor.plan.processes[-1].all_parameters
+    assert (player["rate"], player["stay"]) == (0.5, True)
+    ask(simulation, control, replay_time=3.0)
+    assert control.to_player[-1] == ("path_player", {"time": 3.0})
+    ask(simulation, control, replay_paused=True)
+    assert control.to_player[-1] == ("path_player", {"paused": True})
+    assert supervisor.kept["path_player"] == {"paused": True}
+    simulation.look()
+    assert control.told[-1][1]["replay"] == PATH
+    ask(simulation, control, record=None, replay=None)
+    assert set(supervisor.plan.nodes) == nodes
+
+
+def test_a_whole_recording_takes_the_place_of_the_nodes_until_it_ends(running, tmp_path):
+    simulation, supervisor, control = running
+    before = supervisor.plan.processes
+    ask(simulation, control, replay=PATH, replay_as="recording")
+    assert supervisor.plan.nodes == ["session_player"]
+    with pytest.raises(SettingsError, match="end the replay first"):
+        ask(simulation, control, record=str(tmp_path / "a.mcap"))
+    control.values = replace(control.values, record=None)
+    ask(simulation, control, replay=None)
+    assert supervisor.plan.processes == before
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"record": "a.bag"}, "must be a file that ends in .mcap"),
+        ({"record": "nowhere/a.mcap"}, "there is no such folder"),
+        ({"record": PATH}, "exists already"),
+        ({"replay": "nowhere.mcap"}, "there is no bag at nowhere.mcap"),
+        ({"scene": "nowhere"}, "there is no scene file nowhere"),
+    ],
+)
+def test_what_cannot_be_is_refused(running, values, why):
+    simulation, supervisor, control = running
+    with pytest.raises(UsSimError, match=why):
+        ask(simulation, control, **values)
+    assert len(supervisor.plans) == 1
+
+
+def test_what_turns_out_not_to_work_is_taken_back(running):
+    simulation, supervisor, control = running
+    before = supervisor.plan
+    supervisor.waiting = ["path_player"]
+    ask(simulation, control, replay=PATH)
+    supervisor.why = "path_player cannot work"
+    simulation.look()
+    assert supervisor.plan.processes == before.processes
+    assert control.told[-1][2] == "path_player cannot work; small runs as before"
+    assert control.values.replay is None
+    supervisor.why = "tissue_deformer cannot work"
+    with pytest.raises(UsSimError, match="tissue_deformer"):
+        simulation.look()  # there is nothing more to go back to

@@ -1,0 +1,184 @@
+"""Stands for a running simulation: by its parameters scenes are loaded, recorded and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Protocol
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from sensor_msgs.msg import CompressedImage
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import changed, declared, parameters_with
+from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
+from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.scene.listing import ListedScene
+
+__all__ = ["Controlled", "SessionControl"]
+
+
+_FLOWING = ("position", "fraction")
+"""What changes all the time, and is told once a second."""
+
+
+class Controlled(Protocol):
+    """What does as the parameters say."""
+
+    def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+        """Raise UsSimError when this cannot be; ``named`` are the parameters that were set."""
+
+    def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+        """Begin to do this; what the parameters say that were not set goes on."""
+
+
+class SessionControl(GuardedNode):
+    """A simulation's switches, for any machine on its ROS domain.
+
+    Its parameters are those of `SessionControlSettings`. What becomes of a change is in its
+    report on ``diagnostics``: `state`, and `fraction` while something is loaded.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("session_control", **kwargs)
+        self._controlled: Controlled | None = None
+        self._values = declared(self, SessionControlSettings())
+        self._is_showing = False
+        self._told: tuple[object, ...] = ()
+        self._player_clients: dict[str, AsyncParameterClient] = {}
+        self._untold: tuple[str, Mapping[str, Any]] = ("", {})  # node, and parameters for it
+        self.health = Health(self, "")
+        self._scenes = self.create_publisher(
+            DiagnosticArray, "session/scenes", LATCHED, qos_overriding_options=overridable()
+        )
+        self._thumbnails = self.create_publisher(
+            CompressedImage, "session/thumbnails", CATALOGUE, qos_overriding_options=overridable()
+        )
+        self._bags = self.create_publisher(
+            DiagnosticArray, "session/bags", LATCHED, qos_overriding_options=overridable()
+        )
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._take)
+
+    def obey(self, controlled: Controlled, settings: SessionControlSettings) -> None:
+        """Hand changes on from now on.
+
+        Args:
+            controlled: does as the parameters say.
+            settings: what it does now.
+        """
+        self._controlled = controlled
+        self.show(settings)
+
+    def show(self, settings: SessionControlSettings) -> None:
+        """Set the parameters to what is so by now."""
+        self._is_showing = True
+        try:
+            self.set_parameters_atomically(parameters_with(settings))
+        finally:
+            self._is_showing = False
+
+    @property
+    def values(self) -> SessionControlSettings:
+        """What the parameters say."""
+        return self._values
+
+    def tell(self, state: str, values: Mapping[str, str], warning: str = "") -> None:
+        """Report how things are; at once where more than the time in a replay has changed."""
+        news = state, warning, {key: values[key] for key in values if key not in _FLOWING}
+        is_news, self._told = news != self._told, news
+        self.health.state, self.health.warning = state, warning
+        self.health.values = dict(values)
+        self._hand_on()
+        if is_news:
+            self.health.report()
+
+    def tell_player(self, node: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of the node that plays, as soon as it is there."""
+        if node not in self._player_clients:
+            self._player_clients[node] = AsyncParameterClient(self, node)
+        self._untold = (
+            node,
+            dict(self._untold[1]) | dict(values) if self._untold[0] == node else values,
+        )
+        self._hand_on()
+
+    def _hand_on(self) -> None:
+        node, values = self._untold
+        if values and self._player_clients[node].services_are_ready():
+            self._untold = node, {}
+            self._player_clients[node].set_parameters(
+                [Parameter(name, value=each) for name, each in values.items()]
+            )
+
+    def tell_scenes(self, scenes: Sequence[ListedScene]) -> None:
+        """Publish which scenes and cases can be loaded."""
+        message = self._array()
+        for scene in scenes:
+            status = DiagnosticStatus(name=scene.name, hardware_id=scene.origin)
+            status.level = DiagnosticStatus.ERROR if scene.problem else DiagnosticStatus.OK
+            status.message = scene.problem or scene.description
+            about = {
+                "kind": scene.kind,
+                "region": scene.region,
+                "structures": ", ".join(scene.structures),
+                "probe": scene.probe,
+                "tracker": scene.tracker,
+            }
+            status.values = [KeyValue(key=key, value=value) for key, value in about.items()]
+            message.status.append(status)
+        self._scenes.publish(message)
+
+    def tell_thumbnail(self, origin: str, jpeg: bytes) -> None:
+        """Publish what the probe sees in a scene."""
+        message = CompressedImage(format="jpeg", data=jpeg)
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = origin
+        self._thumbnails.publish(message)
+
+    def tell_bags(self, bags: Mapping[str, str]) -> None:
+        """Publish which bags can be played: files by name."""
+        message = self._array()
+        message.status = [
+            DiagnosticStatus(name=name, hardware_id=file, message="bag")
+            for name, file in bags.items()
+        ]
+        self._bags.publish(message)
+
+    def _array(self) -> DiagnosticArray:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        return message
+
+    def _wanted(self, parameters: list[Parameter]) -> SessionControlSettings:
+        """A volume belongs to the scene that it was set with."""
+        wanted = changed(self._values, parameters)
+        names = {each.name for each in parameters}
+        if "scene" in names and "volume" not in names:
+            wanted = changed(wanted, [Parameter("volume", value="")])
+        return wanted
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        if self._is_showing:
+            return SetParametersResult(successful=True)
+        try:
+            wanted = self._wanted(parameters)
+            if self._controlled is None:
+                raise SettingsError("the simulation has not begun yet")
+            self._controlled.check(wanted, {each.name for each in parameters})
+        except UsSimError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Parameter]) -> None:
+        if self._is_showing:
+            self._values = changed(self._values, parameters)
+            return
+        self._values = self._wanted(parameters)
+        self.show(self._values)
+        if self._controlled is not None:
+            self._controlled.take(self._values, {each.name for each in parameters})

@@ -1,0 +1,176 @@
+"""What can be set of the nodes that record and play sessions: their parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+__all__ = [
+    "BEGUN",
+    "AwaitedSettings",
+    "PathPlayerSettings",
+    "SessionControlSettings",
+    "SessionPlayerSettings",
+    "SessionRecorderSettings",
+]
+
+BEGUN = Quantity("time", 0.0, 1e10)
+"""When something began, since 1970."""
+_SPEED = Quantity("number", 0.01, 100.0)
+_SPAN = Quantity("time", 0.0, 1e6)
+_BYTES = Quantity("number", 0, 2**53)
+
+
+@dataclass(frozen=True)
+class AwaitedSettings(Settings):
+    """Of nodes that play: when they begin."""
+
+    await_topics: tuple[str, ...] = setting(
+        description="begin when each of these has a publisher", default=()
+    )
+    await_subscriber: str | None = setting(
+        description="and this node subscribes to each", default=None
+    )
+
+
+@dataclass(frozen=True)
+class PathPlayerSettings(Settings):
+    """Of ``path_player``."""
+
+    path: str | None = setting(
+        description="bag or tracker recording to play", default=None, file=True
+    )
+    topic: str | None = setting(
+        description="in the bag; not given: the only one of PoseStamped", default=None
+    )
+    rate: float = setting(_SPEED, "speed factor", default=1.0, live=True)
+    loop: bool = setting(description="start again at the end", default=False, live=True)
+    paused: bool = setting(
+        description="hold the probe where it is; not in lockstep", default=False, live=True
+    )
+    time: float = setting(
+        _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
+    )
+    stay: bool = setting(
+        description="wait at the end until `time` is set, else end there", default=False
+    )
+    restamp: bool = setting(
+        description="stamp poses when they are sent, else as recorded", default=True
+    )
+    lockstep: bool = setting(
+        description="send the next pose when the image of the last has come", default=False
+    )
+    begun: float = setting(
+        BEGUN,
+        "since 1970, when the first pose was sent: play on where the path would be by now; 0: from "
+        "the start",
+        default=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class SessionPlayerSettings(Settings):
+    """Of ``session_player``."""
+
+    path: str | None = setting(description="bag to play", default=None, file=True)
+    rate: float = setting(_SPEED, "speed factor", default=1.0, live=True)
+    loop: bool = setting(description="start again at the end", default=False, live=True)
+    paused: bool = setting(description="publish nothing", default=False, live=True)
+    time: float = setting(
+        _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
+    )
+    stay: bool = setting(
+        description="wait at the end until `time` is set, else end there", default=False
+    )
+    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+
+
+@dataclass(frozen=True)
+class SessionRecorderSettings(Settings):
+    """Of ``session_recorder``."""
+
+    file: str = setting(
+        description="MCAP file to write, or a new folder for a bag", default="session.mcap"
+    )
+    if_exists: str = setting(
+        description="a recording of that name that is there already: refuse to start, or go on in "
+        "a further file beside it",
+        choices=("refuse", "further"),
+        default="refuse",
+    )
+    compression: str = setting(
+        description="of the file's chunks", choices=("none", "zstd"), default="none"
+    )
+    topics: tuple[str, ...] = setting(description="full names; none: all", default=())
+    also: tuple[str, ...] = setting(
+        description="full names of topics made on demand, such as /tissue/structures, that are "
+        "recorded beside the others",
+        default=(),
+    )
+    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+    max_cache_size: int = setting(
+        _BYTES,
+        "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
+        default=100 * 1024 * 1024,
+    )
+    max_bagfile_size: int = setting(
+        _BYTES, "bytes after which a further file is begun; 0: never", default=0
+    )
+    max_bagfile_duration: float = setting(
+        _SPAN, "after which a further file is begun; 0: never", default=0.0
+    )
+    start_paused: bool = setting(description="wait for the service ~/resume", default=False)
+    snapshot_mode: bool = setting(
+        description="keep messages in memory, max_cache_size at most, until ~/snapshot writes them",
+        default=False,
+    )
+    snapshot_duration: float = setting(_SPAN, "how old they may be; 0: any", default=0.0)
+    scene: str | None = setting(
+        description="scene that is recorded, to be attached with the files that it names",
+        default=None,
+    )
+    volume: str | None = setting(
+        description="volume file in place of the scene's", default=None, file=True
+    )
+    parameters: str = setting(
+        description="those of all nodes, as YAML: attached as parameters.yaml", default=""
+    )
+    attach: tuple[str, ...] = setting(description="more files to attach", default=())
+
+
+@dataclass(frozen=True)
+class SessionControlSettings(Settings):
+    """Of ``session_control``."""
+
+    live = True
+
+    scene: str = setting(
+        description="scene file, name of an installed one, or `case:NAME`; setting it, also to "
+        "what it is, loads it",
+        default="upper_arm",
+    )
+    volume: str | None = setting(
+        description="volume file in place of the scene's; of no other scene than it is set with",
+        default=None,
+    )
+    record: str | None = setting(
+        description="new MCAP file to record to; none ends the recording", default=None
+    )
+    replay: str | None = setting(
+        description="bag to play; setting it to what it is plays it from its start; none ends it",
+        default=None,
+    )
+    replay_as: str = setting(
+        description="path: the probe moves as recorded; recording: all recorded topics are "
+        "published in place of the simulation, which goes on afterwards",
+        choices=("path", "recording"),
+        default="path",
+    )
+    replay_rate: float = setting(_SPEED, "speed factor", default=1.0)
+    replay_loop: bool = setting(description="start again at the end", default=False)
+    replay_paused: bool = setting(description="hold it where it is", default=False)
+    replay_time: float = setting(
+        _SPAN, "from the start, where to play on each time this is set", default=0.0
+    )

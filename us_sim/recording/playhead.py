@@ -1,0 +1,67 @@
+"""Where in a recording a player is, whose pace may change while it plays. Times in ns.
+
+>>> from us_sim.recording.playhead import Playhead
+>>> head = Playhead(rate=2.0)
+>>> head.go_to(100, now=1000)
+>>> head.position(now=1050)
+200
+>>> head.run_at(1.0, now=1050)
+>>> head.pause(now=1060)
+>>> head.position(now=9999)
+210
+>>> head.resume(now=9999)
+>>> head.position(now=10009)
+220
+"""
+
+from __future__ import annotations
+
+__all__ = ["Playhead"]
+
+
+class Playhead:
+    """Goes on with a clock that is told to it.
+
+    Args:
+        rate: recorded time over the clock's.
+    """
+
+    def __init__(self, rate: float = 1.0) -> None:
+        self.rate = rate
+        self.is_paused = False
+        self._at = 0  # in the recording,
+        self._since = 0  # at this time of the clock
+
+    def position(self, now: int) -> int:
+        """How far after the recording's start it is."""
+        return self._at if self.is_paused else self._at + round((now - self._since) * self.rate)
+
+    def begun(self, now: int) -> int:
+        """When it would have been at the start, had it always gone at this rate."""
+        return now - round(self.position(now) / self.rate)
+
+    def go_to(self, position: int, now: int) -> None:
+        """Be there at that time."""
+        self._at, self._since = position, now
+
+    def run_at(self, rate: float, now: int) -> None:
+        """Change the pace."""
+        self.go_to(self.position(now), now)
+        self.rate = rate
+
+    def pause(self, now: int) -> None:
+        """Stay there."""
+        self.go_to(self.position(now), now)
+        self.is_paused = True
+
+    def resume(self, now: int) -> None:
+        """Go on from there."""
+        self.is_paused = False
+        self.go_to(self._at, now)
+
+    def hold(self, is_held: bool, now: int) -> None:
+        """Stay there, or go on; nothing happens where that is so already."""
+        if is_held and not self.is_paused:
+            self.pause(now)
+        elif not is_held and self.is_paused:
+            self.resume(now)

@@ -1,0 +1,136 @@
+"""A node as a process of its own: how it is started, what it says, how it is ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from us_sim.errors import UsSimError
+from us_sim.run.end_with_parent import end_with_parent
+from us_sim.run.parameter_texts import require_texts
+
+__all__ = ["COMPLAINT", "STANDING_BY", "STOP_S", "NodeProcess", "RunningNode"]
+
+COMPLAINT = "us_sim: "
+"""With which a node begins to say why it cannot work."""
+STOP_S = 0.8
+"""How long nodes may take to end before the recorder is told to."""
+# Of `us_sim.nodes.standby`, which needs rclpy.
+STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """One node and its parameters."""
+
+    node: str
+    parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
+    given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
+
+    def __post_init__(self) -> None:
+        require_texts(self.all_parameters)
+
+    def command(self) -> list[str]:
+        """The command line that runs it, in ROS 2 and without."""
+        command = [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
+        for name, value in self.all_parameters.items():
+            command += ["-p", f"{name}:={json.dumps(value)}"]
+        return command
+
+    @property
+    def all_parameters(self) -> dict[str, object]:
+        """Those that a person gave go before the others."""
+        return self.parameters | self.given
+
+
+class RunningNode:
+    """A node's process, and the thread that reads what it says.
+
+    Args:
+        node: what it runs.
+        show: what is done with its lines; None for one that stands by.
+    """
+
+    def __init__(self, node: NodeProcess, show: Callable[[str], None] | None) -> None:
+        package = str(Path(__file__).resolve().parents[2])
+        search = [package, os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
+        self.node = node
+        self.process = subprocess.Popen(
+            node.command(),
+            stdin=subprocess.DEVNULL if show else subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment if show else environment | {STANDBY: "1"},
+            start_new_session=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        )
+        self.complaint = ""  # why it cannot work
+        self.said = ""
+        self.told = False  # that it has ended
+        self._show = show
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        try:
+            self.reader.start()
+        except RuntimeError as error:
+            self.process.kill()
+            self.process.wait()
+            raise UsSimError(f"{node.node} cannot be followed: {error}") from None
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.strip():
+                self.said = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
+            if line.startswith(COMPLAINT):
+                self.complaint = self.said
+            if self._show is not None:
+                self._show(line)
+
+    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
+        """Run the node in earnest after standing by; whether it can."""
+        assert self.process.stdin is not None
+        if self.said != STANDING_BY or node != self.node:
+            self.kill()
+            return False
+        self._show = show
+        try:
+            self.process.stdin.write("\n")
+            self.process.stdin.close()
+        except OSError:
+            return False
+        return True
+
+    def tell_to_end(self) -> None:
+        """SIGTERM, which one that was stopped gets, too."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            self.process.send_signal(signal.SIGCONT)
+
+    def wait(self, seconds: float) -> None:
+        """Wait for its end, at most so long."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(max(seconds, 0.0))
+
+    def wait_after_sigterm(self, seconds: float) -> None:
+        """Tell it to end, and wait at most so long."""
+        self.tell_to_end()
+        self.wait(seconds)
+
+    def kill(self) -> bool:
+        """End it for certain; whether it had not ended by itself."""
+        if self.process.poll() is not None:
+            return False
+        self.process.kill()
+        self.wait(STOP_S)  # one that waits for a disk ends when that answers
+        return True

@@ -1,0 +1,305 @@
+"""A simulation whose scene, recording and replay may be changed while it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
+from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.recording.reader import read_bag
+from us_sim.run.background import Background
+from us_sim.run.bags import bags_in_reach
+from us_sim.run.graph import RECORDER, VIEWER
+from us_sim.run.monitored import Monitored
+from us_sim.run.plan import PLAYERS, plan_of
+from us_sim.run.request import Request
+from us_sim.run.supervision import Supervisor, say
+from us_sim.scene.building import path_of
+from us_sim.scene.listing import ListedScene
+from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
+from us_sim.share import find_bag
+
+__all__ = ["Simulation"]
+
+CATALOGUE_AFTER_S = 3.0
+"""From all nodes ready until scenes are listed: the first picture goes before."""
+_BAGS_EVERY_S = 2.0
+_OF_SCENE = {"scene", "volume"}
+_OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
+"""Parameters that go on to the node that plays."""
+
+
+class Simulation:
+    """Does as `session_control` says: it gives the supervisor other plans.
+
+    Where a plan turns out not to work, the one before runs again.
+
+    Args:
+        request: that the supervisor's plan was made for.
+        supervisor: of the nodes.
+        monitor: on whose executor the control node is.
+    """
+
+    def __init__(self, request: Request, supervisor: Supervisor, monitor: Monitored) -> None:
+        self._request = request
+        self._settled: Request | None = None  # the last with which all nodes were ready
+        self._supervisor, self._monitor = supervisor, monitor
+        self._making: Background | None = None
+        self._made = (0.0, "")  # fraction, and of what
+        self._asked: tuple[str, str | None] = ("", None)  # scene and volume that are being made
+        self._catalogue: Background | None = None
+        self._ready_since: float | None = None
+        self._bags_at = 0.0
+        self._bags: dict[str, str] = {}
+        self._problem = ""
+        self._control = monitor.control()
+        self._control.obey(self, self._shown())
+
+    def look(self) -> None:
+        """As `Supervisor.look`; and go on with what was asked for.
+
+        Raises:
+            UsSimError: a node cannot work, and there is nothing to go back to.
+        """
+        try:
+            self._supervisor.look()
+            failed = self._supervisor.failed()
+            if failed and self._request is not self._settled and self._settled is not None:
+                raise UsSimError(failed)
+        except UsSimError as error:
+            if self._settled is None or self._request is self._settled:
+                raise
+            self._go_back(str(error))
+        if not self._supervisor.waiting:
+            self._settled = self._request
+            self._ready_since = self._ready_since or time.monotonic()
+        self._look_at_making()
+        self._look_at_catalogue()
+        self._report()
+
+    def close(self) -> None:
+        """End what works in the background."""
+        for process in (self._making, self._catalogue):
+            if process is not None:
+                process.end()
+
+    def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+        """Raise UsSimError when what the parameters say cannot be."""
+        if _OF_SCENE & set(named):
+            load_scene(wanted.scene, volume=wanted.volume)
+            return
+        if "record" in named and wanted.record:
+            self._check_recording(Path(wanted.record).expanduser(), wanted)
+        if {"replay", "replay_as"} & set(named) and wanted.replay:
+            file = find_bag(wanted.replay)
+            if wanted.replay_as == "path":
+                path_of(self._request.scene, file)
+            elif not read_bag(file).message_count:
+                raise BagError(f"{file}: holds no message, so there is nothing to play")
+            elif self._request.record is not None:
+                raise SettingsError(
+                    f"replay: {file}: as a recording it takes the place of the simulation, which "
+                    f"is being recorded to {self._request.record}: end that first"
+                )
+
+    def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+        """Begin to do what the parameters say."""
+        self._problem = ""
+        if _OF_SCENE & set(named):
+            self._make(wanted.scene, wanted.volume)
+            return
+        request = replace(
+            self._request,
+            record=Path(wanted.record).expanduser() if wanted.record else None,
+            is_changed=True,
+        )
+        if not wanted.replay:
+            request = request.without_replay()
+        elif {"replay", "replay_as", *_OF_PLAYER} & set(named):
+            playing = {name: getattr(wanted, key) for key, name in _OF_PLAYER.items()}
+            request = replace(
+                request,
+                path=find_bag(wanted.replay),
+                everything=wanted.replay_as == "recording",
+                playing=playing | {"stay": True},
+            )
+        self._change(request)
+        self._steer(wanted, named)
+
+    def _check_recording(self, file: Path, wanted: SessionControlSettings) -> None:
+        if file.suffix != ".mcap":
+            raise SettingsError(f"record: {file}: must be a file that ends in .mcap")
+        if file.exists():
+            raise SettingsError(f"record: {file}: exists already; choose another name")
+        if not file.absolute().parent.is_dir():
+            raise SettingsError(f"record: {file}: there is no such folder; make it first")
+        if self._request.everything or (wanted.replay and wanted.replay_as == "recording"):
+            raise SettingsError(
+                f"record: {file}: a recording is played in place of the simulation; end the "
+                f"replay first"
+            )
+
+    def _steer(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
+        """Hand on to the node that plays what it can do by itself."""
+        values: dict[str, object] = {
+            name: getattr(wanted, key) for key, name in _OF_PLAYER.items() if key in named
+        }
+        for player in PLAYERS:
+            self._supervisor.keep(player, values)
+        if "replay_time" in named:
+            values["time"] = wanted.replay_time
+        elif "replay" in named:
+            values["time"] = 0.0
+        if values and wanted.replay:
+            self._control.tell_player(self._supervisor.plan.player, values)
+
+    def _make(self, name: str, volume: str | None) -> None:
+        """Have what a scene needs made, while the one before goes on."""
+        if self._making is not None:
+            self._making.end()
+        self._asked, self._made = (name, volume), (0.0, "reading the scene")
+        self._making = Background("us_sim.run.scene_making", name, *filter(None, [volume]), nice=2)
+
+    def _look_at_making(self) -> None:
+        making = self._making
+        if making is None:
+            return
+        has_ended = making.has_ended  # before what it has said, so that nothing is missed
+        for said in making.said():
+            if "refused" in said or "ready" in said:
+                self._making = None
+                making.end()
+                self._begin(str(said.get("refused", "")))
+                return
+            self._made = float(said["fraction"]), str(said["text"])
+        if has_ended:
+            self._making = None
+            self._begin(f"{self._asked[0]}: what makes it ended without a word")
+
+    def _begin(self, refused: str) -> None:
+        """Load the scene that was made, unless it cannot be."""
+        name, volume = self._asked
+        if not refused:
+            try:
+                scene = load_scene(name, volume=volume)
+                request = self._request.with_scene(scene)
+                self._change(request, anew=set(self._supervisor.plan.nodes) - {VIEWER})
+                say(f"loading {scene.name}")
+            except UsSimError as error:
+                refused = str(error)
+        if refused:
+            self._problem = f"{refused}; {self._request.scene.name} goes on"
+            say(self._problem)
+        self._control.show(self._shown())
+
+    def _change(self, request: Request, anew: Collection[str] = ()) -> None:
+        plan = plan_of(request)
+        self._request = request
+        if anew or plan.processes != self._supervisor.plan.processes:
+            self._supervisor.change(plan, anew)
+
+    def _go_back(self, why: str) -> None:
+        """Run what ran before; a recording and a replay that had ended for it do not come back."""
+        assert self._settled is not None
+        before = self._settled
+        if RECORDER not in self._supervisor.started:
+            before = replace(before, record=None, is_changed=True)
+        if not set(PLAYERS) & self._supervisor.started:
+            before = before.without_replay()
+        self._problem = f"{why}; {before.scene.name} runs as before"
+        say(self._problem)
+        self._settled = self._request = before
+        self._supervisor.change(plan_of(before))
+        self._control.show(self._shown())
+
+    def _look_at_catalogue(self) -> None:
+        """Say what there is to load and to play, once there is time for it."""
+        now = time.monotonic()
+        if self._ready_since is None or now - self._ready_since < CATALOGUE_AFTER_S:
+            return
+        if now - self._bags_at > _BAGS_EVERY_S:
+            self._bags_at, bags = now, bags_in_reach()
+            if bags != self._bags:
+                self._bags = bags
+                self._control.tell_bags(bags)
+        if self._catalogue is None:
+            origin = self._request.scene.origin
+            self._catalogue = Background("us_sim.run.catalogue", origin, nice=19)
+        for said in self._catalogue.said():
+            if "scenes" in said:
+                self._control.tell_scenes([*map(ListedScene.from_json, said["scenes"])])
+            else:
+                with contextlib.suppress(OSError):  # the cache was emptied meanwhile
+                    self._control.tell_thumbnail(said["thumbnail"], Path(said["file"]).read_bytes())
+
+    def _report(self) -> None:
+        """Tell diagnostics how it goes."""
+        request, waiting = self._request, self._supervisor.waiting
+        count = len(self._supervisor.plan.nodes)
+        state, fraction = "running", 1.0
+        if self._making is not None:
+            fraction, what = self._made
+            state = f"loading {_short(self._asked[0])}: {what}, {100 * fraction:.0f} %"
+        elif waiting:
+            fraction = (count - len(waiting)) / max(count, 1)
+            state = f"starting: {count - len(waiting)} of {count} nodes"
+        player = self._monitor.node.reports.get(self._supervisor.plan.player, {})
+        playing: dict[str, str] = {
+            key: player[key] for key in ("position", "duration") if request.path and key in player
+        }
+        values = {
+            "scene": request.scene.name,
+            "origin": request.scene.origin,
+            "volume": request.scene.volume.name,
+            "loading": self._asked[0] if self._making is not None else "",
+            "fraction": f"{fraction:.2f}",
+            "record": str(request.record or ""),
+            "replay": str(request.path or ""),
+            "replay_as": "recording" if request.everything else "path",
+            "replay_state": player.get("state", "starting") if request.path else "",
+            "replay_rate": f"{self._control.values.replay_rate:g}",
+            "replay_loop": str(self._control.values.replay_loop).lower(),
+            "replay_paused": str(self._control.values.replay_paused).lower(),
+            **playing,
+        }
+        self._control.tell(state, values, self._problem)
+
+    def _shown(self) -> SessionControlSettings:
+        """The control's parameters as things are."""
+        request, scene = self._request, self._request.scene
+        changes: dict[str, Any] = {
+            key: request.playing[name]
+            for key, name in _OF_PLAYER.items()
+            if name in request.playing
+        }
+        return replace(
+            SessionControlSettings(),
+            scene=scene.origin,
+            volume=_volume_of(scene),
+            record=str(request.record) if request.record else None,
+            replay=str(request.path) if request.path else None,
+            replay_as="recording" if request.everything else "path",
+            **changes,
+        )
+
+
+def _volume_of(scene: Scene) -> str | None:
+    """A volume file that takes the place of the scene's own."""
+    if scene.volume.file is None:
+        return None
+    try:
+        own = load_scene(scene.origin).volume.file
+    except SceneError:  # it has none of its own
+        own = None
+    return scene.volume.file if scene.volume.file != own else None
+
+
+def _short(name: str) -> str:
+    """A scene's name from what loads it."""
+    return Path(name.rpartition(":")[2]).stem

@@ -1,0 +1,100 @@
+"""What there is to load: installed scenes, and cases, with what a person chooses them by."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import UsSimError
+from us_sim.scene.reading import find_scene, load_scene
+from us_sim.scene.scene import CASE_PREFIX
+from us_sim.share import shared_roots
+
+__all__ = ["ListedScene", "listed_scene", "listed_scenes"]
+
+
+@dataclass(frozen=True)
+class ListedScene:
+    """A scene or a case in a list."""
+
+    name: str
+    origin: str  # what loads it: a scene's file, or `case:` and the case's folder
+    kind: str = "scene"  # or case
+    description: str = ""
+    region: str = ""  # of the body
+    structures: tuple[str, ...] = ()
+    probe: str = ""
+    tracker: str = ""  # where poses come from
+    problem: str = ""  # why it cannot be loaded as it is
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> ListedScene:
+        """From what `dataclasses.asdict` and JSON have made of one."""
+        return cls(**{**said, "structures": tuple(said["structures"])})
+
+
+def listed_scenes() -> Iterator[ListedScene]:
+    """Installed scenes, then the cases of `case_roots`; each name once."""
+    from us_sim.volume.cases.roots import case_roots, cases_in
+
+    files: dict[str, Path] = {}
+    for root in shared_roots():
+        for file in sorted((root / "config" / "scenes").glob("*.yaml")):
+            files.setdefault(file.stem, file)
+    for file in files.values():
+        yield listed_scene(str(file))
+    folders: dict[str, Path] = {}
+    for root in case_roots():
+        if os.path.isdir(root):
+            for folder in cases_in(root):
+                folders.setdefault(folder.name, folder)
+    for folder in folders.values():
+        yield listed_scene(f"{CASE_PREFIX}{folder.resolve()}")
+
+
+def listed_scene(name: str) -> ListedScene:
+    """What there is to say of a scene, or of ``case:`` and a case."""
+    if name.startswith(CASE_PREFIX):
+        return _listed_case(Path(name.removeprefix(CASE_PREFIX)))
+    try:
+        scene = load_scene(name)
+    except UsSimError as error:
+        origin = _origin(name)
+        return ListedScene(Path(name).stem, origin, problem=str(error).removeprefix(f"{origin}: "))
+    return ListedScene(
+        scene.name,
+        scene.origin,
+        description=scene.description,
+        structures=tuple(scene.structures),
+        probe=scene.probe.geometry,
+        tracker=scene.tracker.source.name,
+    )
+
+
+def _origin(name: str) -> str:
+    try:
+        return str(find_scene(name))
+    except UsSimError:
+        return name
+
+
+def _listed_case(folder: Path) -> ListedScene:
+    from us_sim.volume.cases.case import read_case
+    from us_sim.volume.cases.listing import listed
+
+    origin, case = f"{CASE_PREFIX}{folder}", listed(folder)
+    if case.problem:
+        return ListedScene(case.name, origin, "case", problem=case.problem)
+    settings = read_case(folder).settings
+    return ListedScene(
+        case.name,
+        origin,
+        "case",
+        settings.description,
+        case.region,
+        tuple(settings.structures),
+        case.probe,
+    )
