@@ -18,6 +18,7 @@ NODES = [
     "slice_interpolator",
     "space_mouse_driver",
     "tissue_deformer",
+    "viewer",
     "volume_reconstructor",
 ]
 FOLDER = Path(__file__).resolve().parent
@@ -54,6 +55,7 @@ setup(
     license="Apache-2.0",
     author="us_sim developers",
     packages=find_packages(include=["us_sim", "us_sim.*"]),
+    package_data={"us_sim.viewer": ["assets/**/*", "panels/*.js"]},
     python_requires=">=3.11",
     install_requires=[
         "cyclonedds>=11.0,<12",
@@ -79,14 +81,18 @@ setup(
         "dicom": ["pydicom>=3.0", "pillow>=10", "python-gdcm>=3.0.20"],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
+        "rerun": ["rerun-sdk>=0.41"],
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
+        "viewer": ["nicegui>=3.6,<4"],
         "test": [
             "fast-simplification>=0.1.7",
             "hypothesis>=6.100",
             "meshio>=5.3",
             "mypy>=1.10",
+            "nicegui>=3.6,<4",
             "pillow>=10",
+            "playwright>=1.45",
             "pydicom>=3.0",
             "pyigtl>=0.3.1",
             "pytest>=7.4",

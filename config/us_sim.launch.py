@@ -18,6 +18,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.run.domain_lock import alone_on_domain
 from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, RECORDER, ending
 from us_sim.run.monitored import Monitored
@@ -37,6 +38,11 @@ ARGUMENTS = {
     "path": ("", "bag with a probe path to play; empty: poses come from outside"),
     "record": ("", "MCAP file to record to; empty: nothing is recorded"),
     "volume": ("", "volume file that replaces the scene's"),
+    "view": (
+        "false",
+        "true: a page in a browser shows the simulation, and moves the probe where no path is "
+        "played",
+    ),
 }
 SUPERVISION = {
     name: (str(getattr(SupervisionSettings(), name)), rule.description)
@@ -56,7 +62,11 @@ def session(context):
     if record is not None and record.exists():
         raise UsSimError(f"{record} exists already: choose another name or remove it")
     path = find_bag(given["path"]) if given["path"] else None
-    plan = plan_of(scene, {}, record=record, path=path)
+    if given["view"] not in ("true", "false"):
+        raise UsSimError(f"view:={given['view']}: must be true or false")
+    view = ViewerSettings() if given["view"] == "true" else None
+    by_hand = view is not None and path is None
+    plan = plan_of(scene, {}, record=record, path=path, view=view, by_hand=by_hand)
     supervised = Supervised(plan, settings, context.launch_configurations.get("ros_namespace", ""))
     left_out = [part for part in scene.parts() if not part.needed]
     return [
@@ -150,7 +160,7 @@ class Supervised:
 
 
 def generate_launch_description():
-    """Arguments: scene, path, record, volume, and what is done for nodes that end or hang."""
+    """Arguments: scene, path, record, volume, view, and what is done for nodes that end or hang."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(name, default_value=default, description=description)

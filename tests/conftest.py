@@ -1,10 +1,12 @@
 """How the whole suite runs, and fixtures shared by all tests."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from chromium import chromium
 
 import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 
@@ -112,3 +114,10 @@ def _own_corner() -> None:
     if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ["ROS_DOMAIN_ID"] = own  # the workers must not hear each other
     os.environ.setdefault("ROS_DOMAIN_ID", own)
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A real Chromium, without a window; a process may have one."""
+    with chromium() as started:
+        yield started

@@ -12,6 +12,7 @@ TOPICS = {
     "/tracker/pose": "geometry_msgs/msg/PoseStamped",
     "/probe/pose": "geometry_msgs/msg/PoseStamped",
     "/probe/status": "diagnostic_msgs/msg/DiagnosticStatus",
+    "/probe/marker": "visualization_msgs/msg/MarkerArray",
     "/tissue/nodes": "sensor_msgs/msg/PointCloud2",
     "/tissue/rest": "sensor_msgs/msg/PointCloud2",
     "/tissue/tetrahedra": "std_msgs/msg/Int32MultiArray",

@@ -10,9 +10,11 @@ from us_sim.command.scene_options import (
     add_network_option,
     add_scene_options,
     add_supervision_options,
+    add_view_option,
     node_parameters,
     scene_name,
     supervision,
+    viewed,
 )
 from us_sim.share import find_bag
 
@@ -21,7 +23,14 @@ __all__ = ["add_demo"]
 
 def add_demo(commands: Any) -> None:
     """Add the command to `us-sim`'s."""
-    demo = commands.add_parser("demo", help="press on the virtual arm; images, summary, recording")
+    commands.add_parser(
+        "demo",
+        help="press on the virtual arm; images, summary, recording",
+        add_options=_add_options,
+    )
+
+
+def _add_options(demo: argparse.ArgumentParser) -> None:
     demo.add_argument(
         "scene",
         nargs="?",
@@ -47,6 +56,7 @@ def add_demo(commands: Any) -> None:
     )
     add_scene_options(demo)
     add_supervision_options(demo)
+    add_view_option(demo)
     add_network_option(demo)
     demo.set_defaults(command=_demo)
 
@@ -63,4 +73,5 @@ def _demo(args: argparse.Namespace) -> int:
         supervision=supervision(args),
         source=args.source,
         path=args.path,
+        view=viewed(args),
     )

@@ -73,13 +73,14 @@ def _parser() -> ChosenParser:
     from us_sim.command.render import add_render
     from us_sim.command.run import add_run
     from us_sim.command.segment import add_segment
+    from us_sim.command.view import add_view
 
     parser = ChosenParser(
         prog="us-sim", description="Interactive simulation of compression ultrasonography."
     )
     parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (add_demo, add_run, add_render, add_play, add_bag, add_cases):
+    for add in (add_view, add_demo, add_run, add_render, add_play, add_bag, add_cases):
         add(commands)
     for add in (
         add_import,

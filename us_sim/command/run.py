@@ -11,20 +11,22 @@ from us_sim.command.scene_options import (
     add_network_option,
     add_scene_options,
     add_supervision_options,
+    add_view_option,
     node_parameters,
     scene_name,
     supervision,
+    viewed,
 )
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
-__all__ = ["add_run"]
+__all__ = ["RunSettings", "add_run"]
 
 
 @dataclass(frozen=True)
-class _Run(Settings):
+class RunSettings(Settings):
     """What becomes of a run."""
 
     record: Path | None = setting(description="record the session to this MCAP", default=None)
@@ -40,13 +42,19 @@ class _Run(Settings):
 
 def add_run(commands: Any) -> None:
     """Add the command to `us-sim`'s."""
-    run = commands.add_parser("run", help="run the nodes of a scene until Ctrl-C")
+    commands.add_parser(
+        "run", help="run the nodes of a scene until Ctrl-C", add_options=_add_options
+    )
+
+
+def _add_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
-    add_setting_options(run, _Run)
+    add_setting_options(run, RunSettings)
     add_supervision_options(run)
     run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
     add_scene_options(run)
+    add_view_option(run)
     add_network_option(run)
     run.set_defaults(command=_run)
 
@@ -55,7 +63,7 @@ def _run(args: argparse.Namespace) -> int:
     from us_sim.run.live import dry_run, run
     from us_sim.scene.reading import load_scene
 
-    asked = read_settings(args, _Run)
+    asked = read_settings(args, RunSettings)
     scene = load_scene(scene_name(args), volume=args.volume)
     parameters = node_parameters(args.param)
     if args.dry_run:
@@ -68,7 +76,7 @@ def _run(args: argparse.Namespace) -> int:
             from us_sim.scene.image_in_volume import check_path_in_volume
 
             check_path_in_volume(scene, path, volume_of(scene))
-        print(dry_run(scene, parameters, record=asked.record, path=args.path))
+        print(dry_run(scene, parameters, record=asked.record, path=args.path, view=viewed(args)))
         if checked:
             print(f"readable  {', '.join(checked)}")
         return 0
@@ -80,4 +88,5 @@ def _run(args: argparse.Namespace) -> int:
         duration=asked.duration,
         network=args.network,
         supervision=supervision(args),
+        view=viewed(args),
     )

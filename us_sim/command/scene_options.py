@@ -5,19 +5,29 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.errors import UsSimError
 from us_sim.run.supervision_settings import SupervisionSettings
 
+if TYPE_CHECKING:
+    from us_sim.nodes.viewer_settings import ViewerSettings
+
 __all__ = [
     "add_network_option",
     "add_scene_options",
     "add_supervision_options",
+    "add_view_option",
+    "add_viewer_options",
     "node_parameters",
     "scene_name",
     "supervision",
+    "viewed",
+    "viewer",
 ]
+
+_OF_THE_VIEWER = ("host", "port")
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -75,6 +85,43 @@ def supervision(args: argparse.Namespace) -> SupervisionSettings:
         UsSimError: a value will not do.
     """
     return read_settings(args, SupervisionSettings)
+
+
+def add_viewer_options(parser: argparse.ArgumentParser) -> None:
+    """Where the page is served."""
+    from us_sim.nodes.viewer_settings import ViewerSettings
+
+    add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
+
+
+def add_view_option(parser: argparse.ArgumentParser) -> None:
+    """Whether the simulation is shown in browsers, too."""
+    parser.add_argument("--view", action="store_true", help="show it in a browser, too")
+    add_viewer_options(parser)
+
+
+def viewer(args: argparse.Namespace) -> ViewerSettings:
+    """What these options say.
+
+    Raises:
+        UsSimError: a value will not do.
+    """
+    from us_sim.nodes.viewer_settings import ViewerSettings
+
+    return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
+
+
+def viewed(args: argparse.Namespace) -> ViewerSettings | None:
+    """Likewise, where the simulation is to be shown.
+
+    Raises:
+        UsSimError: a value will not do, or it is not to be shown at all.
+    """
+    if args.view:
+        return viewer(args)
+    if any(name in args for name in _OF_THE_VIEWER):
+        raise UsSimError("--host and --port are where the viewer listens: add --view")
+    return None
 
 
 def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -1,0 +1,315 @@
+"""`us-sim view` used by a person in a real browser: the arm is pressed, and everything is tried.
+
+Each step leaves a picture of the page in the folder that US_SIM_SCREENSHOTS names, or in the test's
+own: `docs/viewer_press.png` is one of them.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from awaiting import until
+from chromium import watched
+
+from us_sim.recording.reader import read_bag
+
+START_S = 240.0
+STEP = 4
+"""Of the image's pixels each so many-th of each so many-th row is looked at."""
+PIXELS = """step => {
+    const canvas = document.querySelector(".us-image");
+    const { width, height } = canvas;
+    const data = canvas.getContext("2d").getImageData(0, 0, width, height).data;
+    const values = [];
+    for (let y = 0; y < height; y += step)
+        for (let x = 0; x < width; x += step) values.push(data[4 * (y * width + x)]);
+    return [Math.ceil(width / step), Math.ceil(height / step), values];
+}"""
+DARK = 25
+"""Grey value below which blood is in the middle of a vessel."""
+
+
+class Person:
+    """Somebody at the page."""
+
+    def __init__(self, page: Any, pictures: Path) -> None:
+        self.page, self._pictures = page, pictures
+
+    def picture(self, name: str) -> None:
+        self.page.screenshot(path=self._pictures / f"viewer_{name}.png")
+
+    def image(self) -> Any:
+        """(rows, columns) grey values of the ultrasound image, thinned out."""
+        columns, rows, values = self.page.evaluate(PIXELS, STEP)
+        return np.reshape(values, (rows, columns)).astype(float)
+
+    def vein(self) -> int:
+        """Dark pixels where the vein is, and below the skin, beside the bone."""
+        image = self.image()
+        rows, columns = image.shape
+        part = image[rows // 10 : int(0.42 * rows), int(0.44 * columns) : int(0.66 * columns)]
+        return int((part < DARK).sum())
+
+    def go_home(self) -> None:
+        """Let go, and have the probe where it began."""
+        self.page.get_by_role("button", name="Upright").click()
+        self.press(1.0)
+
+    def press(self, millimetres: float) -> None:
+        """Type how far the probe is pressed in, and wait until the tissue has followed."""
+        field = self.page.get_by_role("spinbutton", name="Press")
+        field.fill(f"{millimetres}")
+        field.press("Enter")
+        field.blur()
+        self.settle()
+
+    def settle(self) -> None:
+        """Until the image does not change any more."""
+        last = self.image()
+
+        def is_still() -> bool:
+            nonlocal last
+            time.sleep(0.4)
+            now, before = self.image(), last
+            last = now
+            return now.shape == before.shape and bool(np.abs(now - before).mean() < 1.0)
+
+        until(is_still, "the image comes to rest")
+
+    def drag_down(self, pixels: float) -> None:
+        """Drag the probe down with the mouse, over the image."""
+        box = self.page.locator(".us-image").bounding_box()
+        x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.25 * box["height"]
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        for i in range(30):
+            self.page.mouse.move(x, y + pixels * (i + 1) / 30)
+            self.page.wait_for_timeout(20)
+        self.page.mouse.up()
+        self.settle()
+
+    def tab(self, name: str) -> None:
+        """Open a panel."""
+        if not self.page.get_by_role("tab", name=name).is_visible():
+            self.page.get_by_role("button", name="Panels").click()
+        self.page.get_by_role("tab", name=name).click()
+
+    def control(self, parameter: str) -> Any:
+        """The control of a parameter."""
+        return self.page.locator(f"[data-parameter='{parameter}']")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("view")
+
+
+@pytest.fixture(scope="module")
+def address(folder: Path) -> Iterator[str]:
+    """Where `us-sim view` of the arm serves its page."""
+    pytest.importorskip("nicegui", reason="nicegui is not installed")
+    log = folder / "view.log"
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "us_sim", "view", "upper_arm", "--port", "0"],
+            cwd=folder,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        found = until(
+            lambda: process.poll() is not None or re.search(r"http://\S+", log.read_text()),
+            "the address is printed",
+            START_S,
+        )
+        assert process.poll() is None, log.read_text()
+        yield found[0]
+    finally:
+        process.send_signal(signal.SIGINT)
+        killer = threading.Timer(30.0, process.kill)
+        killer.start()
+        process.wait()
+        killer.cancel()
+    assert "Traceback" not in log.read_text()
+
+
+@pytest.fixture(scope="module")
+def person(browser: Any, address: str, folder: Path) -> Iterator[Person]:
+    """At a page of 1280 × 720, of which nothing may go wrong until the last test."""
+    pictures = Path(os.environ.get("US_SIM_SCREENSHOTS") or folder)
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    wrong: list[str] = []
+    watched(page, address, wrong)
+    page.goto(address)
+    page.wait_for_function("window.usSim?.images?.() > 3", timeout=1e3 * START_S)
+    page.get_by_text("starting").wait_for(state="hidden", timeout=1e3 * START_S)
+    yield Person(page, pictures)
+    page.close()
+    assert not wrong
+
+
+def test_the_page_shows_the_arm_and_its_vein(person: Person) -> None:
+    person.settle()
+    image = person.image()
+    assert image.shape == (512 // STEP, 512 // STEP)
+    assert image.std() > 20
+    assert person.vein() > 1000 / STEP**2
+    assert person.page.evaluate("usSim.scene()") == "upper arm"
+    person.picture("start")
+
+
+def test_dragging_the_probe_down_closes_the_vein_and_letting_go_opens_it(person: Person) -> None:
+    before = person.vein()
+    person.page.get_by_role("button", name="Look under the skin").click()
+    person.drag_down(150)
+    assert person.vein() < 0.35 * before
+    person.picture("press")
+    person.go_home()
+    assert person.vein() > 0.8 * before
+    person.page.get_by_role("button", name="Look under the skin").click()
+
+
+def test_keys_alone_move_the_probe_and_reach_everything(person: Person) -> None:
+    page, before = person.page, person.image()
+    page.locator("body").press("ArrowLeft")
+    for _ in range(12):
+        page.keyboard.press("ArrowLeft")
+    person.settle()
+    assert np.abs(person.image() - before).mean() > 5
+    page.keyboard.press("h")
+    person.settle()
+    reached = set()
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        reached.add(
+            page.evaluate(
+                "(document.activeElement.getAttribute('aria-label') ??"
+                " document.activeElement.textContent).trim()"
+            )
+        )
+    for name in ("Panels", "B-mode", "Strain", "Freeze", "Save"):
+        assert any(name in each for each in reached), reached
+
+
+def test_another_method_is_chosen_and_a_material_changed(person: Person) -> None:
+    page = person.page
+    person.press(6.0)
+    soft = person.image()
+    person.tab("Tissue")
+    person.control("tissue_deformer.solver").locator("select, .q-select").first.click()
+    option = page.get_by_role("option", name="fem", exact=True)
+    if option.count():
+        option.click()
+    else:
+        person.control("tissue_deformer.solver").locator("select").select_option("fem")
+    person.settle()
+    until(lambda: np.abs(person.image() - soft).mean() > 1, "linear tissue looks otherwise")
+    person.picture("tissue")
+    field = person.control("tissue_deformer.materials.vein.young_modulus").locator("input").last
+    linear = person.image()
+    field.fill("200")
+    field.press("Enter")
+    until(lambda: np.abs(person.image() - linear).mean() > 1, "a stiff vein stays open")
+    person.settle()
+
+
+def test_a_value_that_is_refused_goes_back_and_says_why(person: Person) -> None:
+    person.tab("Image")
+    control = person.control("slice_interpolator.depth")
+    field = control.locator("input").last
+    before = field.input_value()
+    field.fill("9000")
+    field.press("Enter")
+    until(lambda: re.search("400 mm|range|at most", control.inner_text()), "the reason is shown")
+    assert field.input_value() in (before, "9000")
+    person.picture("refused")
+    field.fill(before)
+    field.press("Enter")
+
+
+def test_skin_is_hidden_and_shown(person: Person) -> None:
+    def scene() -> bytes:
+        return bytes(person.page.locator("#scene").screenshot())
+
+    person.page.get_by_role("button", name="Panels").click()
+    person.go_home()
+    shown = scene()
+    person.page.get_by_role("button", name="Layers").click()
+    box = person.page.get_by_role("checkbox", name="Skin")
+    box.uncheck()
+    time.sleep(0.5)
+    person.picture("without_skin")
+    assert scene() != shown
+    box.check()
+    person.page.get_by_role("button", name="Layers").click()
+
+
+def test_what_is_recorded_is_replayed(person: Person, folder: Path) -> None:
+    page = person.page
+    person.tab("Session")
+    page.get_by_label("file").fill("press.mcap")
+    page.get_by_role("button", name="Record", exact=True).click()
+    until(lambda: (folder / "press.mcap").exists(), "the recording has begun")
+    for depth in (6.0, 1.0):
+        person.press(depth)
+    page.get_by_role("button", name="Stop", exact=True).click()
+    until(
+        lambda: (folder / "metadata.yaml").exists(), "the recording is complete, with its metadata"
+    )
+    recorded = read_bag(folder / "press.mcap").topic("/tracker/pose").message_count
+    assert recorded > 5
+    page.get_by_label("recording or path").click()
+    page.get_by_label("recording or path").fill("press")
+    page.get_by_role("option", name="press.mcap").click()
+    still = person.image()
+    page.get_by_role("button", name="Play or pause").click()
+    until(lambda: np.abs(person.image() - still).mean() > 5, "the replay presses")
+    person.picture("replay")
+    page.get_by_role("button", name="End replay").click()
+    until(
+        lambda: "You hold" in page.locator("#hand").inner_text(), "the probe is the person's again"
+    )
+
+
+def test_another_scene_is_loaded_while_the_page_stays(person: Person, folder: Path) -> None:
+    page = person.page
+    person.tab("Cases")
+    load = page.get_by_role("button", name="Load upper_arm_path", exact=True)
+    if not load.is_visible():
+        page.get_by_text("With other trackers").click()
+    person.picture("cases")
+    load.click()
+    until(
+        lambda: page.evaluate("usSim.scene()") == "upper arm path", "the scene is loaded", START_S
+    )
+    drawn = page.evaluate("usSim.images()")
+    until(lambda: page.evaluate("usSim.images()") > drawn + 3, "images of the new scene", START_S)
+    person.picture("loaded")
+    assert folder.exists()
+
+
+def test_it_fits_a_tablet_in_both_directions(person: Person) -> None:
+    page = person.page
+    for width, height in ((1024, 768), (768, 1024)):
+        page.set_viewport_size({"width": width, "height": height})
+        for name in (".us-image", "#scene canvas", "#hand", "#image-tools"):
+
+            def fits(name: str = name, width: int = width, height: int = height) -> bool:
+                box = page.locator(name).first.bounding_box()
+                right, bottom = box["x"] + box["width"], box["y"] + box["height"]
+                return bool(
+                    box["x"] >= -1 and box["y"] >= 0 and right <= width + 1 and bottom <= height + 1
+                )
+
+            until(fits, f"{name} is within {width} x {height}")
+        person.picture(f"tablet_{width}")
+    page.set_viewport_size({"width": 1280, "height": 720})

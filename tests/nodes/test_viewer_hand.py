@@ -1,0 +1,233 @@
+"""The hand in the viewer: what it publishes, from when on, until when, and what it refuses."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from shape_msgs.msg import Mesh
+
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.conversions import mesh_message, nanoseconds_of, pose_message
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.viewer_hand import ViewerHand
+from us_sim.skin.surface import bent_surface
+from us_sim.viewer.simulator import Simulator
+
+
+class Holder(GuardedNode):
+    """A node with the hand of a viewer, and no web server."""
+
+    def __init__(self, **kwargs):
+        super().__init__("viewer", **kwargs)
+        self.health = Health(self, "test")
+        self.post = Posted(self)
+        self.simulator = Simulator()
+        self.hand = ViewerHand(self, self.post, self.simulator)
+
+
+class Page:
+    """What a page does with the hand."""
+
+    def __init__(self, bench, holder):
+        self._bench, self._holder = bench, holder
+        self.feed, self._sequence = holder.hand.feed, 0
+
+    def __call__(self, **wish):
+        self._sequence += 1
+        asked = {"source": "page", "sequence": self._sequence, **wish}
+        return self._holder.simulator.commands["hand"](asked, 1)
+
+    def open(self):
+        self.feed.watch(self.nothing)
+
+    def close(self):
+        self.feed.unwatch(self.nothing)
+
+    def nothing(self) -> None:
+        """It is told nothing."""
+
+    @property
+    def state(self):
+        packet = self.feed.newest()
+        return packet.header if packet else {"leader": "unknown", "obstacle": "unknown"}
+
+    def await_leader(self, name):
+        self._bench.spin_until(lambda: self.state["leader"] == name)
+
+
+@pytest.fixture
+def page(bench):
+    return Page(bench, bench.make(Holder))
+
+
+@pytest.fixture
+def tracked(bench):
+    """Poses that the probe's tracker publishes."""
+    tracker = bench.make(ProbeTracker)
+    poses = bench.collect(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: tracker.count_subscribers("probe/pose") > 0)
+    return poses
+
+
+def depth(pose):
+    return pose.pose.position.z
+
+
+def test_without_a_page_nothing_is_published(bench, page, tracked):
+    topic = "tracker/pose"
+    bench.spin_for(10)
+    assert bench.peer.count_publishers(topic) == 0
+    page.open()
+    bench.spin_until(lambda: len(tracked) > 2)
+    page.close()
+    bench.spin_until(lambda: bench.peer.count_publishers(topic) == 0)
+    count = len(tracked)
+    bench.spin_for(30)
+    assert len(tracked) == count
+
+
+def test_it_begins_on_the_skin_and_repeats_the_pose_at_rest(bench, page, tracked):
+    page.open()
+    bench.spin_until(lambda: len(tracked) >= 4)
+    assert depth(tracked[0]) == pytest.approx(0.001)
+    gaps = np.diff([nanoseconds_of(pose.header.stamp) for pose in tracked]) * 1e-9
+    assert 0.15 < np.median(gaps) < 0.45  # images are stale after 0.5 s
+    assert {pose.header.frame_id for pose in tracked} == {"patient"}
+
+
+def test_a_press_sets_out_at_once_and_ends_where_it_was_wanted(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    rest, asked = depth(tracked[-1]), time.monotonic()
+    assert page(to={"press": 0.009}) is None
+    bench.spin_until(lambda: depth(tracked[-1]) > rest + 1e-4)
+    assert time.monotonic() - asked < 0.15  # on a busy machine; it takes some 5 ms
+    bench.spin_until(lambda: depth(tracked[-1]) == pytest.approx(0.009, abs=1e-5))
+    depths = np.array([depth(pose) for pose in tracked])
+    stamps = np.array([nanoseconds_of(pose.header.stamp) for pose in tracked]) * 1e-9
+    assert (np.diff(depths) >= -1e-9).all()  # never back
+    assert depths.max() <= 0.009 + 1e-9  # never beyond
+    assert (np.diff(depths) <= 0.15 * np.maximum(np.diff(stamps), 1 / 60) * 1.2).all()
+
+
+def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracked):
+    hand = page._holder.hand
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    first = nanoseconds_of(tracked[-1].header.stamp)
+    assert hand.asked_by(first) is None
+    page(by={"slide": [0.002, 0.0]})
+    page(by={"slide": [0.003, 0.0]})
+    bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.005, abs=1e-5))
+    answers = [hand.asked_by(nanoseconds_of(pose.header.stamp)) for pose in tracked]
+    assert answers[-1] == ("page", 2)
+    moved = [a for a, pose in zip(answers, tracked, strict=True) if pose.pose.position.x > 1e-6]
+    assert moved[0] is not None
+
+
+def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):
+    radius = 0.045
+    arm = bent_surface((0.1, 0.06), 0.002, flat_width=0.0, radius=radius)
+    publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
+    publisher.publish(mesh_message(arm.vertices, arm.triangles))
+    page.open()
+    page.await_leader("hand")
+    side = [radius * math.sin(0.7), 0.01, radius * (1 - math.cos(0.7))]
+    above = [1.2 * side[0], side[1], 1.2 * side[2] - 0.2 * radius]
+    assert page(to={"point": above, "press": 0.0}) is None
+    bench.spin_until(lambda: page.state["stance"]["x"] == pytest.approx(side[0], abs=2e-3))
+    bench.spin_until(lambda: page.state["stance"]["press"] == pytest.approx(0.0, abs=1e-5))
+    bench.spin_until(lambda: page.state["stance"] == pytest.approx(page.state["goal"], abs=1e-4))
+    bench.spin_for(5)
+    last = tracked[-1].pose
+    orientation = [getattr(last.orientation, axis) for axis in "xyzw"]
+    inwards = Pose([last.position.x, last.position.y, last.position.z], orientation).rotation[:, 2]
+    angle = np.arctan2(last.position.x, radius - last.position.z)
+    np.testing.assert_allclose(inwards, [-np.sin(angle), 0, np.cos(angle)], atol=0.01)
+    assert np.hypot(last.position.x, radius - last.position.z) == pytest.approx(radius, abs=5e-5)
+    assert page.state["range"]["y"] == pytest.approx([-0.03, 0.03])
+
+
+def test_somebody_else_leads_as_long_as_he_publishes(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("bench")
+    assert "bench moves the probe" in page(by={"press": 0.001})
+    assert bench.peer.count_publishers("tracker/pose") == 1
+    now = bench.peer.get_clock().now
+
+    def has_followed():
+        driver.publish(pose_message(Pose([0.013, 0.0, 0.004]), now().to_msg(), "patient"))
+        return page.state["stance"]["x"] == pytest.approx(0.013)
+
+    bench.spin_until(has_followed)
+    assert page.state["stance"]["press"] == pytest.approx(0.004)
+    bench.peer.destroy_publisher(driver)
+    page.await_leader("hand")
+    bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.013, abs=1e-6))
+    assert depth(tracked[-1]) == pytest.approx(0.004, abs=1e-6)
+
+
+def test_no_tracker_that_listens_is_said(bench, page):
+    page.open()
+    page.await_leader("nobody")
+    assert page(go="home") == "no simulator with a probe runs yet"
+    bench.peer.create_publisher(PoseStamped, "probe/pose", 10)
+    page.await_leader("tracker")
+    assert "follows the scene's own tracker" in page(go="home")
+
+
+def test_a_page_that_comes_back_finds_the_probe_where_it_was(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    page(to={"press": 0.006, "fan": 0.2})
+    bench.spin_until(lambda: tracked and depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5))
+    page.close()
+    bench.spin_until(lambda: bench.peer.count_publishers("tracker/pose") == 0)
+    page.open()
+    page.await_leader("hand")
+    count = len(tracked)
+    bench.spin_until(lambda: len(tracked) > count)
+    assert depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5)
+
+
+def test_a_scene_that_calibrates_such_poses_is_said(bench, page, tmp_path):
+    scene = tmp_path / "moved.yaml"
+    calibration = "tracker: {calibration: {position: [0, 0, 5 mm]}}"
+    scene.write_text(f"based_on: upper_arm\nname: moved\n{calibration}\n")
+    bench.make(ProbeTracker, scene=str(scene))
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: "5 mm from where it is held" in page.state["warning"])
+
+
+@pytest.mark.parametrize(
+    ("wish", "said"),
+    [
+        ([1], "is an object, not [1]"),
+        ({"sequence": 1}, "source is a text"),
+        ({"source": "a", "sequence": -1}, "sequence is a count"),
+        ({"source": "a", "sequence": True}, "sequence is a count"),
+        ({"source": "a", "sequence": 1, "go": "away"}, "home, lift, upright"),
+        ({"source": "a", "sequence": 1, "fly": 1}, "has no 'fly'"),
+        ({"source": "a", "sequence": 1, "to": {"press": float("nan")}}, "1 finite number, not nan"),
+        ({"source": "a", "sequence": 1, "to": {"press": 1e4}}, "more than 10 m"),
+        ({"source": "a", "sequence": 1, "to": {"fan": 90}}, "more than 6.28 rad"),
+        ({"source": "a", "sequence": 1, "to": {"point": [1, 2]}}, "3 finite numbers"),
+        ({"source": "a", "sequence": 1, "by": {"slide": "left"}}, "2 finite numbers"),
+        ({"source": "a", "sequence": 1, "by": {"point": [0, 0, 0]}}, "cannot move 'point'"),
+        ({"source": "a", "sequence": 1, "by": 3}, "by is an object"),
+    ],
+)
+def test_what_is_no_wish_is_refused_in_one_sentence(bench, wish, said):
+    holder = bench.make(Holder)
+    assert said in holder.simulator.commands["hand"](wish, 1)

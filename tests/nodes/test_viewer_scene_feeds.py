@@ -1,0 +1,220 @@
+"""What the 3D scene of a page gets of a graph: rest once, then what moves; and what is refused."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from bench import Bench, pose_at
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import Mesh
+from std_msgs.msg import Int32MultiArray
+from visualization_msgs.msg import MarkerArray
+
+from us_sim.geometry.collider import RoundedBox
+from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.nodes.conversions import (
+    cloud_message,
+    mesh_message,
+    structure_markers,
+    tetrahedra_message,
+    transducer_markers,
+    wrench_message,
+)
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
+from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
+from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
+from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.packet import Packet
+
+PLANES = uniform_planes(-0.02, 0.02, 4)
+MESH = box_mesh(PLANES, PLANES, PLANES)
+SQUARE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SMALL = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]])
+CLOSED = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+def cloud(points: np.ndarray, second: int = 0) -> PointCloud2:
+    columns = dict(zip("xyz", points.T, strict=True))
+    return cloud_message(columns, Time(sec=second), "patient")
+
+
+def unused() -> None:
+    """What a page does when it is told of something new: it takes it when it is ready."""
+
+
+@pytest.fixture
+def graph(bench: Bench) -> SimpleNamespace:
+    """A node with all feeds of the scene, by kind, and publishers to it."""
+    node = bench.add(GuardedNode("viewer", context=bench.context))
+    node.health = Health(node, "test")
+    post = Posted(node)
+    feeds: dict[str, Feed] = {}
+    for made in (SkinFeeds, TissueFeeds, ProbeFeeds):
+        feeds |= {feed.kind: feed for feed in made(node, post, 30.0).feeds}
+    feeds["structures"] = StructuresFeed(node, post).feed
+
+    def newest(kind: str, when: Callable[[Packet], bool] = lambda _: True) -> Packet:
+        found: list[Packet] = []
+
+        def look() -> bool:
+            packet = feeds[kind].newest()
+            found[:] = [packet] if packet is not None and when(packet) else []
+            return bool(found)
+
+        bench.spin_until(look)
+        return found[0]
+
+    def latch(kind: type, topic: str, message: object) -> None:
+        publisher = bench.peer.create_publisher(kind, topic, LATCHED)
+        publisher.publish(message)
+        kept.append(publisher)
+
+    kept: list[object] = []
+    return SimpleNamespace(bench=bench, node=node, feeds=feeds, newest=newest, latch=latch)
+
+
+def test_nothing_is_subscribed_to_while_no_page_watches(graph):
+    topics = ["skin/nodes", "tissue/nodes", "tissue/structures", "probe/pose", "probe/marker"]
+    graph.bench.spin_for(5)
+    assert not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
+    for feed in graph.feeds.values():
+        feed.watch(unused)
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("skin/nodes") == 1)
+    for feed in graph.feeds.values():
+        feed.unwatch(unused)
+    graph.bench.spin_until(
+        lambda: not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
+    )
+
+
+def test_the_skin_is_told_once_and_moved_by_steps(graph):
+    graph.latch(Mesh, "skin/mesh", mesh_message(SQUARE, TRIANGLES))
+    for kind in ("skin_mesh", "skin"):
+        graph.feeds[kind].watch(unused)
+    told = graph.newest("skin_mesh")
+    nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
+    nodes.publish(cloud(SQUARE + np.array([0, 0, 0.003]), second=7))
+    moved = graph.newest("skin")
+    steps = np.frombuffer(moved.payload, np.int16).reshape(-1, 3)
+    np.testing.assert_allclose(steps * moved.header["resolution"], [[0, 0, 0.003]] * 4, atol=5e-7)
+    assert moved.header["mesh"] == told.header["mesh"]
+    assert moved.header["stamp"] == str(7 * 10**9)
+
+
+def test_skin_that_cannot_be_used_is_said_and_what_was_there_stays(graph):
+    graph.latch(Mesh, "skin/mesh", mesh_message(SQUARE, TRIANGLES))
+    for kind in ("skin_mesh", "skin"):
+        graph.feeds[kind].watch(unused)
+    graph.newest("skin_mesh")
+    nodes = graph.bench.publisher(PointCloud2, "skin/nodes")
+    for wrong in (SQUARE[:3], SQUARE * np.nan):
+        before = graph.node.health.problems("mesh")
+        sequence = graph.feeds["skin"].sequence
+        nodes.publish(cloud(wrong))
+        graph.bench.spin_until(lambda s=sequence: graph.feeds["skin"].sequence > s)
+        assert graph.feeds["skin"].newest() is None
+        assert graph.node.health.problems("mesh") == before + 1
+    nodes.publish(cloud(SQUARE))
+    assert graph.newest("skin").header["points"] == 4
+
+
+def test_tissue_comes_with_its_outer_faces_and_strain_when_asked_for(graph):
+    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
+    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
+    for kind in ("tissue_mesh", "tissue", "strain"):
+        graph.feeds[kind].watch(unused)
+    told = graph.newest("tissue_mesh")
+    assert told.header["points"] == len(MESH.nodes) == 64
+    assert told.header["triangles"] == 6 * 9 * 2
+    assert told.header["edges"] == 3 * 54  # of a closed surface 3/2 of the triangles
+    nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/nodes") == 2)
+    across = 1.02**-0.5
+    nodes.publish(cloud(MESH.nodes * [across, across, 1.02], second=1))
+    moved = graph.newest("tissue")
+    steps = np.frombuffer(moved.payload, np.int16).reshape(-1, 3) * moved.header["resolution"]
+    np.testing.assert_allclose(steps[:, 2], 0.02 * MESH.nodes[:, 2], atol=1e-6)
+    strain = np.frombuffer(graph.newest("strain").payload, np.float32)
+    assert strain == pytest.approx(0.02, rel=0.02)
+
+
+def test_tetrahedra_of_nodes_that_there_are_not_are_refused(graph):
+    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
+    huge = MESH.tetrahedra.copy()
+    huge[3, 2] = 2**30
+    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(huge))
+    graph.feeds["tissue_mesh"].watch(unused)
+    graph.bench.spin_until(lambda: graph.node.health.problems("mesh") > 0)
+    assert graph.feeds["tissue_mesh"].newest() is None
+
+
+def test_structures_are_heard_once_and_carried_from_then_on(graph):
+    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
+    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
+    graph.feeds["structures"].watch(unused)
+    markers = graph.bench.publisher(MarkerArray, "tissue/structures")
+    nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
+    deformed = MESH.nodes + np.array([0, 0, 0.002])
+    vein = ("vein", (0.2, 0.4, 0.8, 1.0), SMALL + np.array([0, 0, 0.002]), CLOSED)
+    nodes.publish(cloud(deformed, second=4))
+    nodes.publish(cloud(deformed, second=5))
+    markers.publish(structure_markers([vein], Time(sec=5), "patient"))
+    packet = graph.newest("structures")
+    count = packet.header["vertices"]
+    nodes_of = np.frombuffer(packet.payload, np.uint32, 4 * count).reshape(-1, 4)
+    weights = np.frombuffer(packet.payload, np.float32, 4 * count, 16 * count).reshape(-1, 4)
+    at_rest = np.einsum("va,vax->vx", weights, MESH.nodes[nodes_of])
+    np.testing.assert_allclose(np.sort(at_rest, axis=0), np.sort(SMALL, axis=0), atol=1e-7)
+    assert packet.header["parts"][0]["name"] == "vein"
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
+    assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
+
+
+def test_structures_of_another_tissue_are_refused_and_not_tried_again(graph):
+    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
+    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
+    graph.feeds["structures"].watch(unused)
+    markers = graph.bench.publisher(MarkerArray, "tissue/structures")
+    nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
+    far = ("bone", (0.9, 0.9, 0.8, 1.0), SMALL + np.array([0, 0, 0.5]), CLOSED)
+    nodes.publish(cloud(MESH.nodes, second=5))
+    markers.publish(structure_markers([far], Time(sec=5), "patient"))
+    graph.bench.spin_until(lambda: graph.node.health.problems("mesh") == 1)
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
+    assert graph.feeds["structures"].newest() is None
+
+
+def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
+    parts = transducer_mesh(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
+    surfaces = [(part.name, (*part.colour, 1.0), part.vertices, part.triangles) for part in parts]
+    outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
+    graph.latch(MarkerArray, "probe/marker", transducer_markers(surfaces, outline, Time(), "probe"))
+    for kind in ("probe_mesh", "probe"):
+        graph.feeds[kind].watch(unused)
+    told = graph.newest("probe_mesh")
+    by_name = {part["name"]: part for part in told.header["parts"]}
+    assert [by_name[p.name]["triangles"] for p in parts] == [len(p.triangles) for p in parts]
+    assert [by_name[p.name]["vertices"] for p in parts] == [len(p.vertices) for p in parts]
+    assert told.header["outline"] == 4
+    last = np.frombuffer(told.payload, np.float32)[-12:].reshape(4, 3)
+    np.testing.assert_allclose(last, outline, atol=1e-9)
+    poses = graph.bench.publisher(PoseStamped, "probe/pose")
+    wrenches = graph.bench.publisher(WrenchStamped, "probe/wrench")
+    poses.publish(pose_at(0.012, second=9))
+    assert graph.newest("probe").header["position"] == [0.0, 0.0, 0.012]
+    force = np.array([0.0, 0.5, -3.0])
+    wrenches.publish(wrench_message(force, np.zeros(3), Time(sec=9), "probe"))
+    packet = graph.newest("probe", lambda packet: "force" in packet.header)
+    assert packet.header["force"] == [0.0, 0.5, -3.0]
+    assert packet.header["stamp"] == str(9 * 10**9)

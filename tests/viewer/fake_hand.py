@@ -1,0 +1,54 @@
+"""A simulator for pages whose hand only remembers what it was asked."""
+
+import time
+from typing import Any
+
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.simulator import Simulator
+
+PIXEL = 8e-5  # m
+MATRIX = [PIXEL, 0, 0, -0.0128, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
+RANGES = {"x": [-0.07, 0.07], "y": [-0.08, 0.08], "press": [-0.05, 0.025], "tilt": [-1.05, 1.05]}
+STANCE = {"x": 0.012, "y": 0.0, "z": 0.0, "press": 0.0042, "rotation": 0.0, "fan": -0.2, "rock": 0}
+
+
+class FakeHand:
+    """Feeds ``image``, ``image_geometry`` and ``hand``, and the command ``hand``."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.asked: list[dict[str, Any]] = []
+        self.image, self.geometry = Feed("image", rate=None), Feed("image_geometry", rate=None)
+        self.state = Feed("hand", rate=None)
+        simulator.add(self.image, self.geometry, self.state)
+        simulator.commands["hand"] = self._take
+        matrix = {"matrix": MATRIX}
+        self.geometry.offer(lambda n: Packet("image_geometry", n, matrix, b""))
+        self.say()
+        self.show()
+
+    def _take(self, value: Any, _: int) -> str | None:
+        self.asked.append(value)
+        return "the hand cannot" if value.get("go") == "lift" else None
+
+    def say(self, **changes: Any) -> None:
+        header = {"leader": "hand", "obstacle": "", "warning": "", "range": RANGES}
+        header |= {"stance": STANCE, "goal": STANCE, **changes}
+        self.state.offer(lambda n: Packet("hand", n, header, b""))
+
+    def show(self, **told: Any) -> None:
+        header = {"stamp": "1", "rows": 320, "columns": 320, "encoding": "mono8", **told}
+        self.image.offer(lambda n: Packet("image", n, header, bytes(320 * 320)))
+
+    def total(self, name: str) -> Any:
+        """The sum of all changes of a quantity."""
+        changes = [wish["by"][name] for wish in self.asked if name in wish.get("by", {})]
+        if name == "slide":
+            return [sum(change[axis] for change in changes) for axis in (0, 1)]
+        return sum(changes)
+
+    def until(self, done: Any) -> None:
+        deadline = time.monotonic() + 10.0
+        while not done():
+            assert time.monotonic() < deadline, f"asked so far: {self.asked}"
+            time.sleep(0.02)

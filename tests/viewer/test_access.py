@@ -1,0 +1,104 @@
+"""Who may open the page."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from us_sim.viewer.access import Access, is_loopback
+
+
+def asked(
+    token: str = "",
+    *,
+    kind: str = "http",
+    host: str = "127.0.0.1:8080",
+    origin: str = "",
+    query: str = "",
+    cookie: str = "",
+) -> Any:
+    """What is answered: "passed", or the messages of the refusal."""
+    headers = [(b"host", host.encode())]
+    if origin:
+        headers.append((b"origin", origin.encode()))
+    if cookie:
+        headers.append((b"cookie", cookie.encode()))
+    scope = {
+        "type": kind,
+        "path": "/",
+        "headers": headers,
+        "query_string": query.encode(),
+        "server": ("127.0.0.1", 8080),
+    }
+    sent: list[Any] = []
+
+    async def app(_: Any, __: Any, send: Any) -> None:
+        await send("passed")
+
+    async def receive() -> Any:
+        return {"type": "websocket.connect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    asyncio.run(Access(app, token)(scope, receive, send))
+    return sent[0] if sent == ["passed"] else sent
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:9000", "[::1]:8080", "127.1.2.3"])
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_this_computer_may(host: str, kind: str) -> None:
+    assert asked(host=host, kind=kind) == "passed"
+    assert asked(host=host, kind=kind, origin=f"http://{host}") == "passed"
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "https://127.0.0.1.evil.example",
+        "http://127.0.0.1:8081",
+        "http://localhost:8080",  # not the name that was asked for
+        "null",
+        "file://",
+    ],
+)
+def test_pages_of_another_origin_may_not(origin: str) -> None:
+    closed = asked(kind="websocket", origin=origin)
+    assert [m["type"] for m in closed] == ["websocket.close"]
+    refused = asked(origin=origin)
+    assert refused[0]["status"] == 403
+    assert b"may not use the viewer" in refused[1]["body"]
+
+
+@pytest.mark.parametrize("host", ["evil.example:8080", "", "127.0.0.1.evil.example", "[::1"])
+def test_names_that_are_not_this_computers_may_not(host: str) -> None:
+    refused = asked(host=host)
+    assert refused[0]["status"] == 403
+    assert b"open the address as it was printed" in refused[1]["body"]
+
+
+def test_beyond_this_computer_a_token_is_needed() -> None:
+    host = "lab.example:8080"
+    assert asked("secret", host=host)[0]["status"] == 403
+    assert asked("secret", host=host, query="token=other")[0]["status"] == 403
+    welcome = asked("secret", host=host, query="token=secret&a=1")
+    headers = dict(welcome[0]["headers"])
+    assert welcome[0]["status"] == 303
+    assert headers[b"location"] == b"/?a=1"
+    cookie = headers[b"set-cookie"].decode()
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    pair = cookie.split(";")[0]
+    assert asked("secret", host=host, cookie=pair) == "passed"
+    assert asked("secret", host=host, cookie=pair, kind="websocket") == "passed"
+    assert asked("secret", host=host, cookie="a=b")[0]["status"] == 403
+    foreign = asked(
+        "secret", host=host, cookie=pair, kind="websocket", origin="http://evil.example"
+    )
+    assert foreign[0]["type"] == "websocket.close"
+
+
+def test_loopback_is_told_from_other_addresses() -> None:
+    assert all(map(is_loopback, ("localhost", "127.0.0.1", "::1", "127.8.8.8", "[::1]")))
+    assert not any(map(is_loopback, ("0.0.0.0", "", "192.168.0.2", "::", "localhost.evil")))

@@ -1,0 +1,191 @@
+"""What keys, drags, wheel, fingers and sliders of a real browser ask of the hand."""
+
+import math
+from typing import Any
+
+import pytest
+from fake_hand import PIXEL, FakeHand
+
+from us_sim.viewer.simulator import Simulator
+
+
+@pytest.fixture
+def viewer(page: Any, simulator: Simulator) -> FakeHand:
+    viewer = FakeHand(simulator)
+    page.goto(page.address)
+    page.wait_for_function("document.querySelector('.us-image')?.width === 320")
+    page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")
+    return viewer
+
+
+def box_of_image(page: Any) -> Any:
+    return page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")
+
+
+@pytest.mark.parametrize(
+    ("key", "quantity", "sign"),
+    [
+        ("s", "press", 1),
+        ("w", "press", -1),
+        ("PageDown", "press", 1),
+        ("e", "rotation", 1),
+        ("q", "rotation", -1),
+        ("Shift+ArrowUp", "fan", 1),
+        ("Shift+ArrowLeft", "rock", -1),
+    ],
+)
+def test_a_key_makes_a_small_step(
+    page: Any, viewer: FakeHand, key: str, quantity: str, sign: int
+) -> None:
+    page.keyboard.press(key)
+    viewer.until(lambda: viewer.asked)
+    step = viewer.total(quantity)
+    assert step * sign == pytest.approx(3e-4 if quantity == "press" else math.radians(1))
+
+
+def test_arrows_slide_and_go_on_while_they_are_held(page: Any, viewer: FakeHand) -> None:
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowUp")
+    viewer.until(lambda: viewer.total("slide") == pytest.approx([7.5e-4, -7.5e-4]))
+    viewer.asked.clear()
+    page.keyboard.down("ArrowLeft")
+    viewer.until(lambda: viewer.asked and viewer.total("slide")[0] < -5e-3)
+    page.keyboard.up("ArrowLeft")
+    page.wait_for_timeout(100)
+    count = len(viewer.asked)
+    page.wait_for_timeout(150)
+    assert len(viewer.asked) == count
+
+
+def test_keys_are_not_taken_from_who_types(page: Any, viewer: FakeHand) -> None:
+    number = page.locator(".us-quantity input[type=number]").first
+    number.click()
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("s")
+    page.wait_for_timeout(100)
+    assert not any("by" in wish and wish["by"] for wish in viewer.asked)
+    number.fill("7.5")
+    page.keyboard.press("Enter")
+    viewer.until(lambda: viewer.asked[-1:] and viewer.asked[-1]["to"] == {"press": 0.0075})
+
+
+def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: FakeHand) -> None:
+    box = box_of_image(page)
+    metres = 320 * PIXEL / box["height"]
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.2 * box["height"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 3, y + 100, steps=20)
+    page.mouse.up()
+    viewer.until(lambda: viewer.total("press") == pytest.approx(100 * metres, rel=0.06))
+    assert not any("slide" in wish["by"] for wish in viewer.asked)
+    assert [wish["sequence"] for wish in viewer.asked] == sorted(
+        {wish["sequence"] for wish in viewer.asked}
+    )
+
+
+def test_dragging_sideways_slides_and_the_wheel_presses(page: Any, viewer: FakeHand) -> None:
+    box = box_of_image(page)
+    metres = 320 * PIXEL / box["height"]
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 60, y, steps=10)
+    page.mouse.up()
+    viewer.until(lambda: viewer.total("slide")[0] == pytest.approx(-60 * metres, rel=0.1))
+    viewer.asked.clear()
+    page.mouse.wheel(0, 300)
+    viewer.until(lambda: viewer.total("press") == pytest.approx(1.5e-3))
+
+
+def test_a_burst_of_movements_is_one_wish_a_picture(page: Any, viewer: FakeHand) -> None:
+    took = page.evaluate(
+        """() => {
+            const began = performance.now();
+            const place = document.querySelector("#ultrasound");
+            const tell = (type, y) => place.dispatchEvent(new PointerEvent(type,
+                {pointerId: 7, clientX: 900, clientY: y, button: 0, bubbles: true}));
+            place.setPointerCapture = () => {};
+            place.hasPointerCapture = () => true;
+            tell("pointerdown", 200);
+            for (let i = 1; i <= 200; i++) tell("pointermove", 200 + i / 2);
+            tell("pointerup", 300);
+            return performance.now() - began; // ms
+        }"""
+    )
+    metres = 320 * PIXEL / box_of_image(page)["height"]
+    viewer.until(lambda: viewer.total("press") == pytest.approx(100 * metres, rel=0.07))
+    assert len(viewer.asked) <= 2 + took / 14
+
+
+def test_two_fingers_press_and_rotate(page: Any, viewer: FakeHand) -> None:
+    page.evaluate(
+        """() => {
+            const place = document.querySelector("#ultrasound");
+            const tell = (type, pointerId, x, y) => place.dispatchEvent(new PointerEvent(type,
+                {pointerId, clientX: x, clientY: y, button: 0, bubbles: true,
+                 pointerType: "touch"}));
+            place.setPointerCapture = () => {};
+            place.hasPointerCapture = () => true;
+            tell("pointerdown", 1, 800, 300);
+            tell("pointerdown", 2, 900, 300);
+            for (let i = 1; i <= 50; i++) {
+                tell("pointermove", 1, 800, 300 + i / 2);
+                tell("pointermove", 2, 900, 300 + i);
+            }
+            tell("pointerup", 1, 800, 325);
+            tell("pointerup", 2, 900, 350);
+        }"""
+    )
+    metres = 320 * PIXEL / box_of_image(page)["height"]
+    viewer.until(lambda: viewer.total("rotation") == pytest.approx(math.atan2(25, 100), abs=1e-6))
+    assert viewer.total("press") == pytest.approx(37.5 * metres, rel=1e-6)
+
+
+def test_sliders_show_how_the_probe_is_held_and_move_it(page: Any, viewer: FakeHand) -> None:
+    values = page.locator(".us-quantity input[type=number]").evaluate_all(
+        "entries => entries.map(entry => entry.value)"
+    )
+    assert values == ["4.2", "-11", "0", "0", "12.0", "0.0"]
+    fan = page.locator(".us-quantity input[type=range]").nth(1)
+    fan.evaluate("s => { s.value = 20; s.dispatchEvent(new Event('input')); }")
+    viewer.until(lambda: viewer.asked)
+    assert viewer.asked[-1]["to"]["fan"] == pytest.approx(math.radians(20))
+    page.get_by_role("button", name="Centre", exact=True).click()
+    viewer.until(lambda: viewer.asked[-1].get("go") == "home")
+
+
+def test_who_else_leads_is_said_and_what_is_refused(page: Any, viewer: FakeHand) -> None:
+    said = page.locator(".us-said")
+    page.keyboard.press("l")
+    page.wait_for_function("document.querySelector('.us-said').textContent === 'the hand cannot'")
+    viewer.say(leader="path_player", obstacle="path_player moves the probe")
+    page.wait_for_function("document.querySelector('.us-quantity input').disabled")
+    page.wait_for_function(
+        "document.querySelector('.us-said').textContent.startsWith('path_player')", timeout=8000
+    )
+    assert "us-wrong" not in (said.get_attribute("class") or "")
+
+
+def test_the_delay_counts_from_the_key_to_the_painted_image(page: Any, viewer: FakeHand) -> None:
+    assert page.evaluate("usSim.latency()") == {"count": 0}
+    page.keyboard.press("s")
+    viewer.until(lambda: viewer.asked)
+    wish = viewer.asked[-1]
+    viewer.show(command=["another", 99])
+    page.wait_for_timeout(200)
+    assert page.evaluate("usSim.latency()") == {"count": 0}
+    viewer.show(command=[wish["source"], wish["sequence"]])
+    page.wait_for_function("usSim.latency().count === 1")
+    assert 200 < page.evaluate("usSim.latency().median") < 2000
+    page.evaluate("usSim.resetLatency()")
+    assert page.evaluate("usSim.latency()") == {"count": 0}
+
+
+def test_help_shows_the_keys_and_goes(page: Any, viewer: FakeHand) -> None:
+    page.keyboard.press("?")
+    page.wait_for_selector(".us-help[open]")
+    page.keyboard.press("s")
+    page.keyboard.press("Escape")
+    page.wait_for_selector(".us-help", state="hidden")
+    assert not viewer.asked

@@ -1,0 +1,226 @@
+"""Measuring, freezing and keeping the image in a real browser, against a geometry that is known."""
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.simulator import Simulator
+
+COLUMNS, ROWS = 400, 300
+ACROSS, DOWN = 1e-4, 1.4e-4  # m a pixel: not square
+MATRIX = [ACROSS, 0, 0, -0.02, 0, 0, 0, 0, 0, DOWN, 0, DOWN / 2, 0, 0, 0, 1]
+TOOLS = "/us_sim/assets/image_tools"
+
+
+class Images:
+    """Images whose grey value is their number."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.feed, geometry = Feed("image", rate=None), Feed("image_geometry", rate=None)
+        simulator.add(self.feed, geometry)
+        geometry.offer(lambda n: Packet("image_geometry", n, {"matrix": MATRIX}, b""))
+
+    def show(self, grey: int) -> None:
+        header = {"stamp": str(grey), "rows": ROWS, "columns": COLUMNS, "encoding": "mono8"}
+        self.feed.offer(lambda n: Packet("image", n, header, bytes([grey]) * (ROWS * COLUMNS)))
+
+
+pytestmark = pytest.mark.usefixtures("images")
+
+
+@pytest.fixture
+def images(page: Any, simulator: Simulator) -> Images:
+    images = Images(simulator)
+    images.show(40)
+    page.goto(page.address)
+    page.wait_for_selector(".us-image-bar")
+    await_grey(page, 40)
+    return images
+
+
+def await_grey(page: Any, grey: int) -> None:
+    page.wait_for_function(
+        f"""() => {{
+            const canvas = document.querySelector(".us-image");
+            return canvas.width === {COLUMNS} &&
+                canvas.getContext("2d").getImageData(9, 9, 1, 1).data[0] === {grey};
+        }}"""
+    )
+
+
+def at(page: Any, lateral: float, depth: float) -> tuple[float, float]:
+    """Where a place of the image plane, mm, is on the page."""
+    box = page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")
+    column, row = (lateral + 20) * 1e-3 / ACROSS, depth * 1e-3 / DOWN - 0.5
+    x = box["x"] + (column + 0.5) / COLUMNS * box["width"]
+    return x, box["y"] + (row + 0.5) / ROWS * box["height"]
+
+
+def drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=6)
+    page.mouse.up()
+
+
+def values(page: Any) -> list[str]:
+    return page.locator(".us-values li").evaluate_all(
+        "items => items.map(item => item.firstChild.textContent)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("start", "end"), [((-8, 5), (4, 5)), ((0, 6), (0, 33)), ((-12, 10), (9, 31))]
+)
+def test_distances_are_right_to_a_tenth_of_a_millimetre(
+    page: Any, start: tuple[float, float], end: tuple[float, float]
+) -> None:
+    page.keyboard.press("d")
+    drag(page, at(page, *start), at(page, *end))
+    (value,) = values(page)
+    assert value.endswith(" mm")
+    assert float(value.split()[0]) == pytest.approx(math.dist(start, end), abs=0.1)
+
+
+def test_several_distances_and_their_ends_can_be_dragged(page: Any) -> None:
+    for depth, length in ((8, 10), (20, 6)):
+        page.get_by_role("button", name="Distance", exact=True).click()
+        drag(page, at(page, 0, depth), at(page, length, depth))
+    drag(page, at(page, 6, 20), at(page, 8, 20))
+    first, second = (float(value.split()[0]) for value in values(page))
+    assert (first, second) == pytest.approx((10, 8), abs=0.1)
+    page.set_viewport_size({"width": 1024, "height": 700})
+    assert [float(value.split()[0]) for value in values(page)] == [first, second]
+    page.locator(".us-handle").first.focus()
+    page.keyboard.press("Delete")
+    assert [float(value.split()[0]) for value in values(page)] == [second]
+
+
+def test_the_area_of_an_ellipse_and_its_circumference(page: Any) -> None:
+    page.keyboard.press("o")
+    drag(page, at(page, -9, 20), at(page, 9, 20))
+    drag(page, at(page, 0, 29), at(page, 0, 24))  # from a circle of 9 mm to a half axis of 4 mm
+    area, circumference = (float(part) for part in values(page)[0].split() if part[0].isdigit())
+    assert area == pytest.approx(math.pi * 9 * 4, abs=0.1 * math.pi * (9 + 4) / 2)
+    assert circumference == pytest.approx(42.3656, abs=0.5)  # SciPy: 4 a E(1 - b²/a²)
+    page.keyboard.press("x")
+    assert values(page) == []
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "known"),  # 4 a E(m) with E of Abramowitz and Stegun, table 17.1
+    [(1, 1, 2 * math.pi), (2, 1, 9.688448220547675), (5, 4, 28.361667888974484), (1, 0, 4)],
+)
+def test_circumferences_are_those_of_the_elliptic_integral(
+    page: Any, a: float, b: float, known: float
+) -> None:
+    found = page.evaluate(
+        f"import('{TOOLS}/measures.js').then(m => [m.circumference({a}, {b}), "
+        f"m.circumference({b}, {a})])"
+    )
+    assert found == pytest.approx([known, known], rel=1e-12)
+
+
+def test_a_text_stays_where_it_was_written(page: Any) -> None:
+    page.keyboard.press("t")
+    page.mouse.click(*at(page, 5, 12))
+    page.keyboard.type("vein, s")
+    page.keyboard.press("Enter")
+    assert values(page) == ["vein, s"]
+    handle = page.locator(".us-handle").bounding_box()
+    middle = (handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2)
+    assert middle == pytest.approx(at(page, 5, 12), abs=1.0)
+
+
+def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
+    page: Any, images: Images
+) -> None:
+    for grey in range(41, 51):
+        images.show(grey)
+        await_grey(page, grey)
+    page.keyboard.press(" ")
+    _until(lambda: not images.feed.is_watched)
+    images.show(99)
+    for _ in range(3):
+        page.keyboard.press(",")
+    await_grey(page, 47)
+    scrubber = page.locator(".us-scrubber")
+    scrubber.evaluate("s => { s.value = 0; s.dispatchEvent(new Event('input')); }")
+    await_grey(page, 40)
+    assert page.locator(".us-moment").inner_text().startswith("-")
+    page.keyboard.press("c")
+    await_grey(page, 50)  # it plays to the end, and again
+    page.keyboard.press(" ")
+    _until(lambda: images.feed.is_watched)
+    images.show(120)
+    await_grey(page, 120)
+
+
+def _until(done: Any) -> None:
+    deadline = time.monotonic() + 10.0
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> None:
+    kept = page.evaluate(
+        f"""() => import('{TOOLS}/cine.js').then(({{ Cine }}) => {{
+            const slow = new Cine(), large = new Cine();
+            for (let i = 0; i < 900; i++) slow.keep({{ i }}, new Uint8Array(100), i * 1000 / 30);
+            for (let i = 0; i < 200; i++) large.keep({{ i }}, {{ byteLength: 2 ** 20 }}, i);
+            const told = c => [c.frames.length, c.frames[0].header.i, c.bytes, c.duration];
+            return [told(slow), told(large), slow.at(5000), slow.at(-1), slow.at(1e9)];
+        }})"""
+    )
+    slow, large, *numbers = kept
+    assert slow == [301, 599, 30100, pytest.approx(10_000)]
+    assert large == [96, 104, 96 * 2**20, 95]
+    assert numbers == [150, 0, 300]
+
+
+def test_the_kept_picture_has_the_image_its_scale_and_the_values(page: Any, tmp_path: Path) -> None:
+    page.evaluate("usSim.scene = () => 'upper_arm'")
+    page.keyboard.press("d")
+    drag(page, at(page, -10, 20), at(page, 10, 20))
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    name = download.value.suggested_filename
+    assert name.startswith("us_sim-20")
+    assert name.endswith(".png")
+    file = tmp_path / name
+    download.value.save_as(file)
+    picture = cv2.imread(str(file))
+    grey = (picture == 40).all(axis=2)
+    rows, columns = np.flatnonzero(grey.any(axis=1)), np.flatnonzero(grey.any(axis=0))
+    shape = (columns[-1] - columns[0] + 1) / (rows[-1] - rows[0] + 1)
+    assert shape == pytest.approx(COLUMNS * ACROSS / (ROWS * DOWN), rel=0.01)
+    scale = (rows[-1] - rows[0] + 1) / (1e3 * ROWS * DOWN)  # pixels a mm
+    yellow = (picture == (0x66, 0xD1, 0xFF)).all(axis=2)
+    line = yellow[: rows[-1]]
+    ends = np.flatnonzero(line.any(axis=0))
+    assert (ends[-1] - ends[0]) / scale > 20  # the crosses, and the number, reach beyond
+    assert np.argmax(line.sum(axis=1)) == pytest.approx(rows[0] + 20 * scale, abs=2)
+    assert yellow[rows[-1] + 1 :].any()  # the value, below
+    assert (picture[: rows[0]].max(axis=2) > 150).any()  # scene and time, above
+
+
+def test_the_annotated_picture_is_not_measured(page: Any, simulator: Simulator) -> None:
+    encoded = cv2.imencode(".jpg", np.full((60, 80, 3), 90, np.uint8))[1].tobytes()
+    feed = Feed("annotated", rate=None)
+    header = {"stamp": "1", "rows": 60, "columns": 80, "encoding": "jpeg"}
+    feed.offer(lambda n: Packet("annotated", n, header, encoded))
+    simulator.add(feed)
+    page.evaluate("import('/us_sim/assets/image.js').then(m => m.setMode('annotated'))")
+    page.wait_for_function("document.querySelector('.us-image').width === 80")
+    assert page.get_by_role("button", name="Distance", exact=True).is_disabled()
+    page.keyboard.press("d")
+    drag(page, (900, 300), (1000, 300))
+    assert values(page) == []

@@ -1,0 +1,124 @@
+"""The bar above the image: what it sets, what it watches, and what it does when it is refused."""
+
+from concurrent.futures import Future
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from awaiting import until
+
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.parameter_board import ParameterBoard
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.simulator import Simulator
+
+NODE = "slice_interpolator"
+PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from("
+PIXEL += "c.getContext('2d').getImageData(5, 5, 1, 1).data).slice(0, 3) : null; }}"
+
+
+def known(value: str) -> NodeParameters:
+    overlay = Parameter(NODE, "overlay", Kind.TEXT, value, choices=("none", "strain", "velocity"))
+    return NodeParameters(NODE, State.THERE, {"overlay": overlay})
+
+
+@pytest.fixture
+def asked(simulator: Simulator) -> list[str]:
+    """What the node was asked to show; it refuses velocity."""
+    values: list[str] = []
+
+    def send(_: Parameter, raw: Any) -> "Future[str]":
+        values.append(raw)
+        told: Future[str] = Future()
+        refused = raw == "velocity"
+        told.set_result("overlay: this scene has nothing for 'velocity'" if refused else "")
+        if not refused:
+            simulator.nodes.tell(known(raw))
+        return told
+
+    simulator.nodes = ParameterBoard(send=send)
+    simulator.nodes.tell(known("none"))
+    return values
+
+
+def coloured(simulator: Simulator, kind: str, bgr: tuple[int, int, int]) -> Feed:
+    """A stream with one picture of that colour."""
+    feed = Feed(kind)
+    picture = np.full((32, 32, 3), bgr, np.uint8)
+    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+    header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "jpeg"}
+    feed.offer(lambda sequence: Packet(kind, sequence, header, jpeg))
+    simulator.add(feed)
+    return feed
+
+
+def test_a_mode_is_asked_for_shown_and_left(
+    page: Any, simulator: Simulator, asked: list[str]
+) -> None:
+    plain = Feed("image")
+    pixels = np.full((32, 32), 90, np.uint8).tobytes()
+    header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "mono8"}
+    plain.offer(lambda sequence: Packet("image", sequence, header, pixels))
+    simulator.add(plain)
+    annotated = coloured(simulator, "annotated", (0, 0, 200))
+    page.goto(page.address)
+    image = PIXEL.format(".us-image")
+    page.wait_for_function(f"({image})()?.[0] === 90")
+    assert not annotated.is_watched
+    page.get_by_role("button", name="Strain", exact=True).click()
+    page.wait_for_function(f"({image})()?.[1] === 0")
+    assert asked == ["strain"]
+    assert not plain.is_watched
+    pressed = page.get_by_role("button", pressed=True)
+    assert pressed.all_text_contents() == ["Strain"]
+    page.get_by_role("button", name="B-mode").click()
+    page.wait_for_function(f"({image})()?.[0] === 90")
+    assert asked == ["strain"]  # nothing is asked of the node for the plain image
+    assert not annotated.is_watched
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simulator) -> None:
+    annotated = coloured(simulator, "annotated", (0, 0, 200))
+    page.goto(page.address)
+    page.get_by_role("button", name="Colour").click()
+    page.get_by_text("this scene has nothing for 'velocity'").wait_for()
+    assert page.get_by_role("button", pressed=True).all_text_contents() == ["B-mode"]
+    assert not annotated.is_watched
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simulator) -> None:
+    page.goto(page.address)
+    page.get_by_role("button", name="Outlines").click()
+    page.get_by_role("button", name="Outlines", pressed=True).wait_for()
+    simulator.nodes.tell(known("strain"))
+    page.get_by_role("button", name="Strain", exact=True, pressed=True).wait_for()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])
+def test_a_strip_is_watched_while_it_is_shown(
+    page: Any, simulator: Simulator, name: str, kind: str
+) -> None:
+    feed = coloured(simulator, kind, (200, 0, 0))
+    page.goto(page.address)
+    button = page.get_by_role("button", name=name)
+    button.click()
+    page.wait_for_function(f"({PIXEL.format('.us-strip')})()?.[2] > 190")
+    assert feed.is_watched
+    button.click()
+    page.wait_for_function("!document.querySelector('.us-strip')")
+    until(lambda: not feed.is_watched, "nobody watches the strip any more")
+
+
+def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
+    browser: Any, served: Any, simulator: Simulator
+) -> None:
+    page = browser.new_page()
+    page.goto(served[0].address)
+    page.wait_for_function("document.querySelector('.us-modes')")
+    until(lambda: NODE in simulator.nodes.watched, "the page looks at the node")
+    page.close()
+    until(lambda: NODE not in simulator.nodes.watched, "nobody looks at it any more")

@@ -1,0 +1,145 @@
+"""The page in a real browser: the image is drawn as it was sent, to scale, and only on demand."""
+
+import json
+import socket
+import urllib.error
+import urllib.request
+from typing import Any
+
+import numpy as np
+import pytest
+from awaiting import until
+
+from us_sim.errors import UsSimError
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.session import SessionState
+from us_sim.viewer.simulator import Simulator
+
+PIXEL = 1e-4  # m
+MATRIX = [PIXEL, 0, 0, -0.0256, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
+READ = """() => {
+    const canvas = document.querySelector(".us-image");
+    const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+    return [canvas.width, canvas.height, Array.from(data.filter((_, i) => i % 4 === 0))];
+}"""
+
+
+def offer(feed: Feed, pixels: Any) -> None:
+    rows, columns = pixels.shape
+    header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "mono8"}
+    feed.offer(lambda sequence: Packet("image", sequence, header, pixels.tobytes()))
+
+
+def feeds_of(simulator: Simulator) -> tuple[Feed, list[bool]]:
+    told: list[bool] = []
+    image, geometry = Feed("image", told.append), Feed("image_geometry", rate=None)
+    geometry.offer(lambda sequence: Packet("image_geometry", sequence, {"matrix": MATRIX}, b""))
+    simulator.add(image, geometry)
+    return image, told
+
+
+def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> None:
+    image, _ = feeds_of(simulator)
+    pixels = np.random.default_rng(1).integers(0, 256, (300, 512), dtype=np.uint8)
+    offer(image, pixels)
+    page.goto(page.address)
+    page.wait_for_function("document.querySelector('.us-image')?.width === 512")
+    columns, rows, shown = page.evaluate(READ)
+    np.testing.assert_array_equal(np.reshape(shown, (rows, columns)), pixels)
+    box = page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")
+    assert box["width"] / box["height"] == pytest.approx(512 / 300, rel=1e-3)
+
+
+def test_the_stream_ends_when_the_page_closes(
+    browser: Any, served: Any, simulator: Simulator
+) -> None:
+    image, told = feeds_of(simulator)
+    page = browser.new_page()
+    page.goto(served[0].address)
+    until(lambda: told == [True], "the page watches the image")
+    page.close()
+    until(lambda: told == [True, False], "nobody watches any more")
+    assert not image.is_watched
+
+
+def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
+    image, _ = feeds_of(simulator)
+    page.goto(page.address)
+    until(lambda: image.is_watched, "the page watches the image")
+    page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
+    until(lambda: not image.is_watched, "the page has left", 5.0)
+    until(lambda: image.is_watched, "the page is back", 5.0)
+
+
+def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> None:
+    server, _ = served
+    page = browser.new_page()
+    page.goto("data:text/html,<p>evil</p>")
+    for path in ("us_sim/stream", "_nicegui_ws/socket.io/?EIO=4&transport=websocket"):
+        address = f"ws://127.0.0.1:{server.port}/{path}"
+        outcome = page.evaluate(
+            "address => new Promise(resolve => { const s = new WebSocket(address);"
+            " s.onopen = () => resolve('open'); s.onerror = () => resolve('refused'); })",
+            address,
+        )
+        assert outcome == "refused", path
+    page.close()
+
+
+def test_a_foreign_host_is_refused(served: Any) -> None:
+    server, _ = served
+    request = urllib.request.Request(server.address, headers={"Host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(request)
+    assert refused.value.code == 403
+    assert "open the address as it was printed" in refused.value.read().decode()
+
+
+def test_a_taken_port_is_said(served: Any) -> None:
+    from us_sim.viewer.server import _listening
+
+    server, _ = served
+    with pytest.raises(UsSimError, match=f"port {server.port} of 127.0.0.1 is taken"):
+        _listening("127.0.0.1", server.port)
+    with pytest.raises(UsSimError, match=r"--host no\.such\.host\.invalid"):
+        _listening("no.such.host.invalid", 0)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))  # bound, and not listened at
+        with pytest.raises(UsSimError, match="is taken"):
+            _listening("127.0.0.1", free.getsockname()[1])
+
+
+def test_what_the_page_says_wrongly_is_answered(page: Any, simulator: Simulator) -> None:
+    feeds_of(simulator)
+    page.goto(page.address)
+    answer = page.evaluate(
+        "() => new Promise(resolve => { const s = new WebSocket(`ws://${location.host}/us_sim/"
+        "stream`); s.onopen = () => s.send('{\"no\": 1}'); s.onmessage = e => resolve(e.data); })"
+    )
+    assert "does not know" in json.loads(answer)["problem"]
+
+
+def test_an_image_that_is_not_followed_by_another_is_marked(
+    page: Any, simulator: Simulator
+) -> None:
+    image, _ = feeds_of(simulator)
+    pixels = np.zeros((8, 8), np.uint8)
+    offer(image, pixels)
+    page.goto(page.address)
+    page.get_by_text("No new image for 1 s").wait_for()
+    offer(image, pixels)
+    page.get_by_text("No new image").wait_for(state="hidden")
+
+
+def test_the_header_says_what_runs_and_what_is_done_with_it(
+    page: Any, simulator: Simulator
+) -> None:
+    loading = SessionState(is_there=True, scene="upper_arm", state="loading liver", fraction=0.25)
+    simulator.session.tell_state(loading)
+    page.goto(page.address)
+    page.get_by_text("loading liver, 25 %").wait_for()
+    done = SessionState(is_there=True, scene="liver", state="running", record="press.mcap")
+    simulator.session.tell_state(done)
+    page.get_by_text("recording press.mcap").wait_for()
+    assert page.evaluate("usSim.scene()") == "liver"

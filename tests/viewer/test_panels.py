@@ -1,0 +1,334 @@
+"""The panels in a real browser: controls made of parameters, set, refused, moved by others."""
+
+import re
+import time
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+from awaiting import until
+
+from us_sim.viewer.parameter_board import ParameterBoard
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.status import Level, NodeStatus
+
+NODE = "slice_interpolator"
+
+
+def made(name: str, kind: Kind = Kind.NUMBER, raw: Any = 0.0, **fields: Any) -> Parameter:
+    return Parameter(NODE, name, kind, raw, description=f"the {name}", **fields)
+
+
+PARAMETERS = (
+    made("depth", raw=0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),
+    made("gain", unit="dB", limits=(-60.0, 60.0)),
+    made("focus", unit="mm", size=1e-3, limits=(0.0, 0.4), may_be_nothing=True),
+    made("time_gain", Kind.NUMBERS, (0.0,), unit="dB"),
+    made("overlay", Kind.TEXT, "none", choices=("none", "strain")),
+    made("contact", Kind.TRUTH, False),
+    made("colour.pulses", Kind.WHOLE, 10, limits=(3, 64)),
+    made("flow.direction", Kind.NUMBERS, (0.0, 1.0, 0.0)),
+    made("scene", Kind.TEXT, "arm", is_live=False),
+)
+
+
+class Node:
+    """In place of a node: takes what it is sent, or refuses it, and tells the page."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.sent: list[tuple[float, str, Any]] = []
+        self.refusal = ""
+        self.parameters = {parameter.name: parameter for parameter in PARAMETERS}
+        self.board = simulator.nodes = ParameterBoard(send=self._take)
+        self.tell()
+
+    def tell(self, *parameters: Parameter) -> None:
+        self.parameters |= {parameter.name: parameter for parameter in parameters}
+        self.board.tell(NodeParameters(NODE, State.THERE, dict(self.parameters)))
+
+    def values(self, name: str) -> list[Any]:
+        return [raw for _, which, raw in self.sent if which == name]
+
+    def _take(self, parameter: Parameter, raw: Any) -> "Future[str]":
+        self.sent.append((time.monotonic(), parameter.name, raw))
+        if not self.refusal:
+            self.tell(self.parameters[parameter.name].with_raw(raw))
+        future: Future[str] = Future()
+        future.set_result(self.refusal)
+        return future
+
+
+@pytest.fixture
+def node(simulator: Simulator) -> Node:
+    return Node(simulator)
+
+
+def opened(page: Any, tab: str) -> None:
+    page.goto(page.address)
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab", name=tab).click()
+
+
+def control(page: Any, name: str) -> Any:
+    return page.locator(f'[data-parameter="{NODE}.{name}"]')
+
+
+def field(page: Any, name: str) -> Any:
+    return control(page, name).locator("input")
+
+
+def shows(page: Any, name: str, text: str) -> None:
+    until(lambda: field(page, name).input_value() == text, f"{name} shows {text}")
+
+
+def test_a_number_is_set_in_its_unit(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    shows(page, "depth", "40")
+    assert "mm" in control(page, "depth").inner_text()
+    field(page, "depth").fill("55")
+    field(page, "depth").press("Enter")
+    until(lambda: node.values("depth") == [0.055], "the depth is sent in metres")
+    field(page, "focus").fill("20,5")
+    field(page, "focus").blur()
+    until(lambda: node.values("focus") == [0.0205], "the focus is sent")
+    field(page, "focus").fill("")
+    field(page, "focus").press("Enter")
+    until(lambda: node.values("focus") == [0.0205, 0.0], "0 stands for none")
+    assert field(page, "focus").get_attribute("placeholder") == "none"
+
+
+def test_what_cannot_be_is_said_beside_the_control(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    shows(page, "depth", "40")
+    field(page, "depth").fill("900")
+    field(page, "depth").press("Enter")
+    reason = control(page, "depth").get_by_role("alert")
+    reason.wait_for()
+    assert reason.inner_text() == "900 mm is outside 5 to 400 mm"
+    shows(page, "depth", "40")
+    field(page, "depth").fill("much")
+    field(page, "depth").press("Enter")
+    until(lambda: reason.inner_text() == "'much' is not a number", "the page refuses it")
+    node.refusal = "40 mm is deeper than the focus"
+    field(page, "depth").fill("60")
+    field(page, "depth").press("Enter")
+    until(lambda: reason.inner_text() == node.refusal, "the node's reason is shown")
+    shows(page, "depth", "40")
+    node.refusal = ""
+    field(page, "depth").fill("60")
+    field(page, "depth").press("Enter")
+    until(lambda: reason.count() == 0, "the reason goes")
+    shows(page, "depth", "60")
+    until(lambda: node.values("depth") == [0.06, 0.06], "it was sent twice")
+
+
+def test_a_slider_sends_ten_times_a_second_at_most_and_its_last_for_certain(
+    page: Any, node: Node
+) -> None:
+    opened(page, "Image")
+    shows(page, "gain", "0")
+    box = control(page, "gain").locator(".q-slider__track").bounding_box()
+    height = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + box["width"] / 2, height)
+    page.mouse.down()
+    begun = time.monotonic()
+    for i in range(1, 61):
+        page.mouse.move(box["x"] + box["width"] * (0.5 + i / 240), height)
+    node.tell(node.parameters["gain"].with_raw(-40.0))  # from elsewhere: the hand is stronger
+    page.mouse.move(box["x"] + box["width"] + 50, height)
+    page.mouse.up()
+    lasted = time.monotonic() - begun
+    until(lambda: node.values("gain")[-1:] == [60.0], "the end of the slider is sent")
+    shows(page, "gain", "60")
+    assert len(node.sent) <= lasted / 0.1 + 3
+    assert all(-60.0 <= raw <= 60.0 for raw in node.values("gain"))
+
+
+def test_a_change_made_elsewhere_moves_the_control(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    shows(page, "gain", "0")
+    node.tell(node.parameters["gain"].with_raw(12.0))
+    shows(page, "gain", "12")
+    slider = control(page, "gain").get_by_role("slider")
+    assert slider.get_attribute("aria-valuenow") == "12"
+    node.tell(node.parameters["overlay"].with_raw("strain"))
+    until(lambda: "strain" in control(page, "overlay").inner_text(), "the choice is shown")
+    assert node.sent == []
+
+
+def test_a_parameter_that_is_added_has_a_control(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    shows(page, "gain", "0")
+    page.get_by_role("button", name="More").wait_for(state="detached")
+    node.tell(made("sparkle", raw=2.0, unit="dB", limits=(0.0, 9.0)))
+    page.get_by_text("More", exact=True).click()
+    shows(page, "sparkle", "2")
+    field(page, "sparkle").fill("3")
+    field(page, "sparkle").press("Enter")
+    until(lambda: node.values("sparkle") == [3.0], "the new parameter is set")
+
+
+def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    shows(page, "gain", "0")
+    field(page, "gain").focus()
+    field(page, "gain").press("ArrowUp")
+    until(lambda: node.values("gain") == [0.2], "a step up")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Shift+Tab")
+    page.keyboard.press("Shift+Tab")  # the slider before the field
+    page.keyboard.press("ArrowRight")
+    until(lambda: node.values("gain")[-1] == pytest.approx(0.4), "a step of the slider")
+    contact = control(page, "contact").get_by_role("switch")
+    contact.focus()
+    page.keyboard.press("Space")
+    until(lambda: node.values("contact") == [True], "the switch is on")
+    field(page, "overlay").focus()
+    page.keyboard.press("Enter")
+    page.get_by_role("option", name="strain").wait_for()
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    until(lambda: node.values("overlay") != [], "a choice is sent")
+    page.get_by_role("button", name='Expand "Colour"').focus()
+    page.keyboard.press("Enter")
+    field(page, "colour.pulses").fill("12")
+    field(page, "colour.pulses").press("Enter")
+    until(lambda: node.values("colour.pulses") == [12], "a whole number")
+    page.get_by_text("Flow", exact=True).click()
+    field(page, "flow.direction").fill("1, 0,0")
+    field(page, "flow.direction").press("Enter")
+    until(lambda: node.values("flow.direction") == [(1.0, 0.0, 0.0)], "a list")
+    page.get_by_text("Given at the start", exact=True).click()
+    until(lambda: "arm" in control(page, "scene").inner_text(), "what cannot be set is shown")
+    assert control(page, "scene").locator("input").count() == 0
+
+
+def test_time_gain_has_a_slider_for_each_depth(page: Any, node: Node) -> None:
+    opened(page, "Image")
+    gains = control(page, "time_gain")
+    until(lambda: gains.get_by_role("slider").count() == 8, "eight sliders")
+    assert [t.strip() for t in gains.locator(".us-depth").all_inner_texts()][::7] == [
+        "0 mm",
+        "40 mm",
+    ]
+    gains.locator(".q-slider__track-container").nth(2).focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    until(
+        lambda: node.values("time_gain")[-1:] == [(0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0)],
+        "the third is 2 dB",
+    )
+    gains.get_by_role("button", name="level").click()
+    until(lambda: node.values("time_gain")[-1] == (0.0,) * 8, "all are level")
+
+
+def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
+    page.goto(page.address)
+    page.get_by_role("button", name="Panels").wait_for()
+    page.get_by_role("button", name="Panels").click()
+    tissue = {"tissue_deformer", "skin_deformer", "probe_tracker"}
+    page.get_by_role("tab", name="Tissue").click()
+    until(lambda: node.board.watched >= tissue, "the tissue panel is seen")
+    until(
+        lambda: "tissue_deformer is not running" in page.locator(".us-panels").inner_text(),
+        "absent nodes are said",
+    )
+    page.get_by_role("button", name="Panels").click()
+    until(lambda: not node.board.watched & tissue, "the drawer is closed")
+    page.get_by_role("button", name="Panels").click()
+    until(lambda: node.board.watched >= tissue, "and open again")
+    page.get_by_role("tab", name="Image").click()
+    until(lambda: not node.board.watched & tissue, "another tab is chosen")
+    page.get_by_role("tab", name="Tissue").click()
+    until(lambda: node.board.watched >= tissue, "and this one again")
+    page.goto("about:blank")
+    until(lambda: node.board.watched == set(), "the page has gone")
+
+
+def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
+    board = simulator.status
+    values = {"state": "fem", "rate_hz": "59.9", "latency_p50_ms": "7.04", "latency_p99_ms": "120"}
+    values |= {"received": "300", "dropped": "3", "residual": "1e-3"}
+    opened(page, "Status")
+    until(lambda: board.is_watched and board.is_force_watched, "status and plots are seen")
+
+    def tell() -> None:
+        now = time.monotonic()
+        board.tell(NodeStatus("tissue_deformer", Level.WELL, "fem", values), now)
+        board.tell(NodeStatus("probe_tracker", Level.ERROR, "the probe is lost", {}), now)
+        board.feel(4.25, now - 1.0)
+
+    def rows() -> list[str]:
+        tell()
+        return [
+            re.sub(r"\s+", " ", text) for text in page.locator(".us-status tbody").all_inner_texts()
+        ]
+
+    until(lambda: len(rows()) == 2, "two nodes are told")
+    assert rows()[1].strip() == "tissue_deformer fem 59.9 7.0 · 120 300 3"
+    assert "the probe is lost" in rows()[0]
+    wrong = page.locator(".us-level-error .us-problem td")
+    assert wrong.evaluate("e => getComputedStyle(e).color") == "rgb(229, 115, 92)"
+    plot = page.get_by_role("img", name=re.compile("^contact force"))
+
+    def is_drawn() -> bool:
+        tell()
+        return "probe 4.25 N" in (plot.get_attribute("aria-label") or "")
+
+    until(is_drawn, "the force is drawn")
+    texts = plot.locator("text").all_text_contents()
+    assert [t.strip() for t in texts if t.strip()] == [
+        "0",
+        "2.5",
+        "5",
+        "−60 s",
+        "−40 s",
+        "−20 s",
+        "now",
+    ]
+    page.get_by_role("button", name="tissue_deformer").click()
+    page.get_by_role("dialog").wait_for()
+    until(lambda: "tissue_deformer" in node.board.watched, "the dialog shows its parameters")
+    page.keyboard.press("Escape")
+    until(lambda: "tissue_deformer" not in node.board.watched, "the dialog is closed")
+    page.get_by_role("tab", name="Image").click()
+    until(lambda: not board.is_watched and not board.is_force_watched, "nobody looks any more")
+
+
+def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
+    page: Any, simulator: Simulator, node: Node
+) -> None:
+    methods = ("fem", "msds")
+    tissue = "tissue_deformer"
+    parameters = [
+        Parameter(tissue, "solver", Kind.TEXT, "fem", choices=methods),
+        Parameter(tissue, "compare_with", Kind.TEXT, "", choices=methods, may_be_nothing=True),
+        Parameter(tissue, "fem.friction", Kind.NUMBER, 0.3, limits=(0.1, 1.0)),
+        Parameter(tissue, "msds.steps", Kind.WHOLE, 20, limits=(1, 100)),
+    ]
+    known = {parameter.name: parameter for parameter in parameters}
+    node.board.tell(NodeParameters(tissue, State.THERE, known))
+    opened(page, "Tissue")
+    panel = page.locator(".us-panels")
+
+    def says(text: str, **values: str) -> None:
+        def is_said() -> bool:
+            status = NodeStatus(tissue, Level.WELL, "fem", {"state": "fem"} | values)
+            simulator.status.tell(status, time.monotonic())
+            return text in panel.inner_text()
+
+        until(is_said, text)
+
+    says("preparing msds: the tissue goes on", state="fem, preparing msds")
+    apart = {"compared_with": "msds", "difference_max_mm": "0.4123", "difference_rms_mm": "0.05"}
+    says("msds is 0.412 mm away at most, 0.05 mm root mean square", **apart)
+    assert panel.get_by_text("Settings of fem").is_visible()
+    assert not panel.get_by_text("Settings of msds").is_visible()
+    known = known | {"solver": known["solver"].with_raw("msds")}
+    node.board.tell(NodeParameters(tissue, State.THERE, known))
+    panel.get_by_text("Settings of msds").wait_for()
+    panel.get_by_text("Settings of fem").wait_for(state="hidden")
+    sentence = "msds: its step is too long; it is set back"
+    simulator.status.tell(NodeStatus(tissue, Level.WARNING, sentence), time.monotonic())
+    until(lambda: sentence in panel.inner_text(), "what was set back is said")

@@ -1,0 +1,290 @@
+"""The 3D scene in a real browser: what is seen where, and what the pointer meets."""
+
+import io
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from us_sim.geometry.collider import RoundedBox
+from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.skin.surface import plane_surface
+from us_sim.slicing.probe.outline import image_outline
+from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
+from us_sim.viewer.meshes.coloured_surface import ColouredSurface
+from us_sim.viewer.meshes.rest_surface import RestSurface
+from us_sim.viewer.meshes.transducer import transducer_packet
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.simulator import Simulator
+
+LIMIT_MS = 60_000
+SCENE = "import('/us_sim/assets/scene/scene.js')"
+VEIN, ARTERY = [0.0, 0.0, 0.015], [0.025, 0.0, 0.015]
+MESH = box_mesh(*(uniform_planes(-0.05, 0.05, 5),) * 2, uniform_planes(0.0, 0.04, 4))
+SKIN = plane_surface((0.12, 0.12), 0.01)
+PROBE = LinearProbe(aperture=0.04, depth=0.03, columns=64, rows=48)
+
+
+def cube(name: str, colour: tuple[float, float, float], middle: list[float]) -> ColouredSurface:
+    """Of 12 mm."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    triangles = np.array([t for a, b, c, d in faces for t in ([a, b, c], [a, c, d])])
+    return ColouredSurface(name, colour, 0.006 * signs + np.array(middle), triangles)
+
+
+class Patient:
+    """Feeds of a flat skin over tissue with two cubes in it, and a probe beside."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        faces = MESH.boundary
+        edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        self.tissue = RestSurface(MESH.nodes, faces, edges)
+        self.skin = RestSurface(SKIN.vertices, SKIN.triangles)
+        cubes = [cube("vein", (0.25, 0.4, 0.85), VEIN), cube("artery", (0.85, 0.15, 0.15), ARTERY)]
+        structures = CarriedSurfaces(MESH, cubes)
+        collider = RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004)
+        parts = [
+            ColouredSurface(part.name, part.colour, part.vertices, part.triangles)
+            for part in transducer_mesh(collider)
+        ]
+        kinds = [
+            "skin_mesh",
+            "skin",
+            "tissue_mesh",
+            "tissue",
+            "strain",
+            "structures",
+            "probe_mesh",
+            "probe",
+        ]
+        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "image_geometry"]}
+        simulator.add(*self.feeds.values())
+        self._offer("skin_mesh", lambda n: self.skin.told("skin_mesh", n))
+        self._offer("tissue_mesh", lambda n: self.tissue.told("tissue_mesh", n))
+        self._offer("structures", lambda n: structures.told("structures", n, self.tissue.number))
+        outline = image_outline(PROBE)
+        self._offer("probe_mesh", lambda n: transducer_packet("probe_mesh", n, parts, outline))
+        matrix = PROBE.image_to_probe.ravel().tolist()
+        self._offer(
+            "image_geometry", lambda n: Packet("image_geometry", n, {"matrix": matrix}, b"")
+        )
+        grey = {"stamp": "0", "rows": 48, "columns": 64, "encoding": "mono8"}
+        self._offer("image", lambda n: Packet("image", n, grey, bytes([200]) * (48 * 64)))
+        pose = {"stamp": "0", "position": [0, 0.04, 0], "quaternion": [0, 0, 0, 1]}
+        pushed = pose | {"force": [0.0, 0.0, -2.5], "torque": [0.0, 0.0, 0.0]}
+        self._offer("probe", lambda n: Packet("probe", n, pushed, b""))
+        self.move(np.zeros(3))
+
+    def move(self, shift: np.ndarray) -> None:
+        """All tissue from rest, m."""
+        moved = MESH.nodes + shift
+        self._offer(
+            "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=0)
+        )
+
+    def _offer(self, kind: str, pack: Callable[[int], Packet]) -> None:
+        self.feeds[kind].offer(pack)
+
+
+@pytest.fixture
+def scene(page: Any, simulator: Simulator) -> SimpleNamespace:
+    """The page with a patient in it, seen from above."""
+    patient = Patient(simulator)
+    page.emulate_media(reduced_motion="reduce")  # views change at once
+    page.goto(page.address)
+    page.wait_for_selector(".us-scene-canvas", timeout=LIMIT_MS)
+
+    def ask(script: str) -> Any:
+        return page.evaluate(f"async () => {{ const scene = await {SCENE}; {script} }}")
+
+    def until(condition: str) -> None:
+        """Wait until it holds; it is a function of the module `scene`."""
+        page.wait_for_function(
+            f"async () => {{ const scene = await {SCENE}; return {condition}; }}", timeout=LIMIT_MS
+        )
+
+    def place(point: list[float]) -> tuple[float, float]:
+        """Where on the page a point of the patient is."""
+        x, y = ask(
+            f"""const {{ stage }} = scene;
+            const {{ x, y }} = stage.project(new stage.THREE.Vector3(...{point}));
+            const box = stage.canvas.getBoundingClientRect();
+            return [x + box.x, y + box.y];"""
+        )
+        return x, y
+
+    def pixel(point: list[float]) -> np.ndarray:
+        """Red, green, blue of a point of the patient, as seen."""
+        x, y = place(point)
+        clip = {"x": x - 1, "y": y - 1, "width": 3, "height": 3}
+        picture = Image.open(io.BytesIO(page.screenshot(clip=clip, timeout=LIMIT_MS)))
+        return np.asarray(picture.convert("RGB"), dtype=float).reshape(-1, 3).mean(axis=0)
+
+    def becomes(point: list[float], holds: Callable[[np.ndarray], bool]) -> np.ndarray:
+        colour = np.zeros(3)
+        deadline = time.monotonic() + 40.0
+        while time.monotonic() < deadline:
+            colour = pixel(point)
+            if holds(colour):
+                return colour
+        pytest.fail(f"the pixel at {point} is {colour}")
+
+    page.wait_for_selector("#hand button", timeout=LIMIT_MS)  # which takes room from the scene
+    until("scene.stage.scene.getObjectByName('vein') && scene.stage.pace.drawn > 0")
+    until(
+        "Math.abs(scene.stage.canvas.height / scene.stage.pace.ratio"
+        " - scene.stage.place.clientHeight) < 2"
+    )
+    ask("scene.view('top')")
+    until("Math.hypot(scene.stage.camera.position.x, scene.stage.camera.position.y) < 0.05")
+    return SimpleNamespace(
+        page=page, patient=patient, ask=ask, until=until, place=place, becomes=becomes
+    )
+
+
+def is_blue(colour: np.ndarray) -> bool:
+    return bool(colour[2] > colour[0] + 40)
+
+
+def is_red(colour: np.ndarray) -> bool:
+    return bool(colour[0] > colour[1] + 60 and colour[0] > colour[2] + 60)
+
+
+def is_skin(colour: np.ndarray) -> bool:
+    return bool(colour[0] > colour[2] + 15 and colour[0] < colour[1] + 70 and colour.min() > 60)
+
+
+def is_dark(colour: np.ndarray) -> bool:
+    return bool(colour.max() < 40)
+
+
+def test_structures_are_seen_where_they_are_in_their_colours(scene):
+    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    scene.becomes(VEIN, is_blue)
+    scene.becomes(ARTERY, is_red)
+    scene.becomes([-0.03, 0.0, 0.015], is_dark)
+    scene.ask("scene.setVisible('vein', false)")
+    scene.becomes(VEIN, is_dark)
+    scene.becomes(ARTERY, is_red)
+
+
+def test_skin_hides_them_unless_one_looks_under_it(scene):
+    scene.ask("scene.setOpacity('skin', 1)")
+    scene.becomes(VEIN, is_skin)
+    scene.page.click("[data-tool=under]")
+    scene.becomes(VEIN, is_blue)
+    scene.page.click("[data-tool=under]")
+    scene.becomes(VEIN, is_skin)
+
+
+def test_structures_go_with_the_tissue(scene):
+    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    scene.becomes(VEIN, is_blue)
+    scene.patient.move(np.array([-0.03, 0.0, 0.0]))
+    scene.becomes([-0.03, 0.0, 0.015], is_blue)
+    scene.becomes([-0.005, 0.0, 0.015], is_red)
+    scene.becomes([0.012, 0.0, 0.015], is_dark)
+
+
+def test_the_pointer_meets_the_skin_and_its_normal(scene):
+    x, y = scene.place([-0.02, -0.03, 0.0])
+    hit = scene.ask(f"return scene.pick({{ clientX: {x}, clientY: {y} }})")
+    assert hit["object"] == "skin"
+    assert hit["point"] == pytest.approx([-0.02, -0.03, 0.0], abs=5e-4)
+    assert hit["normal"] == pytest.approx([0, 0, -1], abs=1e-6)
+    assert scene.ask("return scene.pick({ clientX: 4, clientY: 300 })") is None
+
+
+def test_a_drag_is_the_hands_if_it_takes_it_and_else_the_cameras(scene):
+    scene.ask(
+        """window.told = []; window.takes = true;
+        scene.onPointer((event, hit) => {
+          window.told.push([event.type, hit?.object ?? null]);
+          return window.takes;
+        });"""
+    )
+    x, y = scene.place([-0.02, -0.02, 0.0])
+    before = scene.ask("return scene.stage.camera.position.toArray()")
+
+    def drag() -> None:
+        scene.page.mouse.move(x, y)
+        scene.page.mouse.down()
+        scene.page.mouse.move(x + 40, y + 10, steps=3)
+        scene.page.mouse.up()
+
+    drag()
+    told = scene.ask("return window.told.splice(0)")
+    assert told[0] == ["pointerdown", "skin"]
+    assert ["pointermove", "skin"] in told
+    assert told[-1][0] == "pointerup"
+    assert scene.ask("return scene.stage.camera.position.toArray()") == before
+    scene.ask("window.takes = false")
+    drag()
+    assert scene.ask("return window.told") == [["pointerdown", "skin"]]
+    assert scene.ask("return scene.stage.camera.position.toArray()") != before
+
+
+def test_the_gizmo_says_how_far_along_its_axis_it_was_dragged(scene):
+    scene.ask("scene.view('front')")
+    scene.until("Math.abs(scene.stage.camera.position.x) < 1e-3")
+    scene.ask("window.told = []; scene.setGizmo((said) => window.told.push(said))")
+    # The probe stands at y = 40 mm, and its x arrow points to the right.
+    x, y = scene.place([0.020, 0.04, 0.0])
+    to_x, to_y = scene.place([0.030, 0.04, 0.0])
+    scene.page.mouse.move(x, y)
+    scene.page.mouse.down()
+    scene.page.mouse.move(to_x, to_y, steps=4)
+    scene.page.mouse.up()
+    told = scene.ask("return window.told")
+    assert [told[0]["phase"], told[-1]["phase"]] == ["start", "end"]
+    assert {said["mode"] for said in told} == {"translate"}
+    assert {said["axis"] for said in told} == {"x"}
+    assert told[-1]["amount"] == pytest.approx(0.010, abs=3e-4)
+
+
+def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_only_then(scene):
+    feeds = scene.patient.feeds
+    bar = scene.page.locator(".us-colour-bar")
+    assert not bar.is_visible()
+    assert not feeds["strain"].is_watched
+    scene.page.click("text=Layers")
+    scene.page.click("[data-tissue=displacement]")
+    bar.wait_for(state="visible", timeout=LIMIT_MS)
+    scene.patient.move(np.array([0.0, 0.0, 0.0042]))
+    scene.page.wait_for_function(
+        "() => document.querySelector('.us-colour-bar').innerText.includes('5')", timeout=LIMIT_MS
+    )
+    assert "Displacement (mm)" in bar.inner_text()
+    scene.page.click("[data-tissue=strain]")
+    for _ in range(200):
+        if feeds["strain"].is_watched:
+            break
+        scene.page.wait_for_timeout(50)
+    assert feeds["strain"].is_watched
+    scene.page.click("[data-tissue=off]")
+    bar.wait_for(state="hidden", timeout=LIMIT_MS)
+
+
+def test_keys_choose_views_and_the_force_is_told(scene):
+    scene.page.locator(".us-scene-canvas").focus()
+    scene.page.keyboard.press("2")
+    scene.until("scene.stage.camera.position.x > 0.2 && scene.stage.camera.position.y < 0.1")
+    assert scene.page.locator(".us-force").inner_text() == "2.5 N"
+
+
+def test_nothing_is_drawn_while_nothing_changes(scene):
+    counts: list[int] = []
+    for _ in range(100):
+        counts.append(scene.ask("return scene.stage.pace.drawn"))
+        scene.page.wait_for_timeout(100)
+        if len(counts) > 8 and len(set(counts[-8:])) == 1:
+            return
+    pytest.fail(f"it goes on drawing: {counts}")

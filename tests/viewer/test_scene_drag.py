@@ -1,0 +1,168 @@
+"""What drags in the 3D scene of a real browser ask of the hand, by where they are in space."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_hand import FakeHand
+
+from us_sim.skin.surface import plane_surface
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.meshes.coloured_surface import ColouredSurface
+from us_sim.viewer.meshes.rest_surface import RestSurface
+from us_sim.viewer.meshes.transducer import transducer_packet
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.simulator import Simulator
+
+FACE = [0.005, 0.01, 0.001]  # m, where the probe's face is
+SCENE = "import('/us_sim/assets/scene/scene.js')"
+CAMERA = f"() => {SCENE}.then(m => m.stage.camera.position.toArray())"
+
+
+def box(lower: list[float], upper: list[float]) -> tuple[Any, Any]:
+    """Corners (8, 3) m and triangles (12, 3) of a box, outwards."""
+    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"))
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    return corners.reshape(3, 8).T, np.array(triangles)
+
+
+@pytest.fixture
+def hand(page: Any, simulator: Simulator) -> FakeHand:
+    hand = FakeHand(simulator)
+    skin, mesh, pose = (Feed(kind, rate=None) for kind in ("skin_mesh", "probe_mesh", "probe"))
+    sheet = plane_surface((0.16, 0.16), 0.02)
+    surface = RestSurface(sheet.vertices, sheet.triangles)
+    skin.offer(lambda n: surface.told("skin_mesh", n))
+    body = ColouredSurface("body", (0.9, 0.9, 0.9), *box([-0.02, -0.008, -0.12], [0.02, 0.008, 0]))
+    outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
+    mesh.offer(lambda n: transducer_packet("probe_mesh", n, [body], outline))
+    header = {"stamp": "1", "position": FACE, "quaternion": [0, 0, 0, 1]}
+    pose.offer(lambda n: Packet("probe", n, header, b""))
+    simulator.add(skin, mesh, pose)
+    page.goto(page.address)
+    page.wait_for_function(
+        f"() => {SCENE}.then(m => m.probePose() !== null && m.stage.pace.drawn > 1)"
+    )
+    page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")
+    await_view(page)
+    return hand
+
+
+def await_view(page: Any) -> None:
+    """Until the view has turned to what there is to see."""
+    seen: list[list[float]] = []
+    while len(seen) < 2 or seen[-1] != seen[-2]:
+        seen.append(page.evaluate(CAMERA))
+        page.wait_for_timeout(400)
+        assert len(seen) < 50
+
+
+def on_screen(page: Any, point: Any) -> Any:
+    """CSS pixels (2,) of a point (m) on the page."""
+    return np.array(
+        page.evaluate(
+            f"""() => {SCENE}.then(({{ stage }}) => {{
+                const at = stage.project(new stage.THREE.Vector3(...{json.dumps(list(point))}));
+                const box = stage.canvas.getBoundingClientRect();
+                return [box.left + at.x, box.top + at.y];
+            }})"""
+        )
+    )
+
+
+def drag(page: Any, start: Any, end: Any) -> None:
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=12)
+    page.mouse.up()
+
+
+def test_over_the_skin_the_probe_is_put_under_the_pointer(page: Any, hand: FakeHand) -> None:
+    first, last = [0.06, 0.05, 0.0], [0.05, -0.03, 0.0]
+    drag(page, on_screen(page, first), on_screen(page, last))
+    hand.until(lambda: hand.asked and np.allclose(hand.asked[-1]["to"]["point"], last, atol=1.5e-3))
+    np.testing.assert_allclose(hand.asked[0]["to"]["point"], first, atol=1.5e-3)
+    assert all(set(wish["to"]) == {"point"} and not wish["by"] for wish in hand.asked)
+
+
+def test_the_probe_dragged_along_itself_presses_as_far(page: Any, hand: FakeHand) -> None:
+    grip = np.add(FACE, [0, 0.008, -0.05])
+    drag(page, on_screen(page, grip), on_screen(page, np.add(grip, [0, 0, 0.012])))
+    hand.until(lambda: hand.total("press") > 0.008)
+    page.wait_for_timeout(100)
+    assert hand.total("press") == pytest.approx(0.012, rel=0.25)  # nearer is larger, and begun late
+    assert not any("slide" in wish["by"] or wish["to"] for wish in hand.asked)
+
+
+def test_the_probe_dragged_sideways_slides_with_the_pointer(page: Any, hand: FakeHand) -> None:
+    grip = np.add(FACE, [0, 0.008, -0.02])
+    drag(page, on_screen(page, grip), on_screen(page, np.add(grip, [0.02, 0, 0])))
+    page.wait_for_timeout(150)
+    across, along = hand.total("slide")
+    assert across == pytest.approx(0.02, rel=0.35)
+    assert abs(along) < 0.006
+    assert not any("press" in wish["by"] for wish in hand.asked)
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "sign"), [([0.02, 0, 0], "rock", -1), ([0, 0.02, 0], "fan", 1)]
+)
+def test_with_shift_its_grip_follows_the_pointer(
+    page: Any, hand: FakeHand, to: list[float], name: str, sign: int
+) -> None:
+    grip = np.add(FACE, [0, 0.008, -0.09])
+    page.keyboard.down("Shift")
+    drag(page, on_screen(page, grip), on_screen(page, grip + to))
+    page.keyboard.up("Shift")
+    hand.until(lambda: abs(hand.total(name)) > 0.1)
+    page.wait_for_timeout(100)
+    assert hand.total(name) == pytest.approx(sign * math.atan2(0.02, 0.09), rel=0.4)
+
+
+def test_beside_the_patient_or_with_alt_the_view_turns(page: Any, hand: FakeHand) -> None:
+    before = page.evaluate(CAMERA)
+    drag(page, (30, 400), (90, 430))
+    page.wait_for_function(
+        f"before => {SCENE}.then(({{stage}}) => "
+        "stage.camera.position.toArray().some((x, i) => Math.abs(x - before[i]) > 0.01))",
+        arg=before,
+    )
+    middle = page.evaluate(CAMERA)
+    page.keyboard.down("Alt")
+    drag(page, on_screen(page, [0.06, 0.05, 0]), on_screen(page, [0.02, 0.05, 0]))
+    page.keyboard.up("Alt")
+    page.wait_for_timeout(100)
+    assert page.evaluate(CAMERA) != middle
+    assert not hand.asked
+
+
+def test_the_wheel_presses_over_the_probe_and_with_shift(page: Any, hand: FakeHand) -> None:
+    page.mouse.move(*on_screen(page, np.add(FACE, [0, 0.008, -0.05])))
+    page.mouse.wheel(0, 200)
+    hand.until(lambda: hand.total("press") == pytest.approx(1e-3))
+    page.mouse.move(*on_screen(page, [0.06, 0.05, 0]))
+    page.keyboard.down("Shift")
+    page.mouse.wheel(0, -200)
+    page.keyboard.up("Shift")
+    hand.until(lambda: hand.total("press") == pytest.approx(0.0))
+
+
+def test_the_gizmo_moves_along_the_probes_own_axes(page: Any, hand: FakeHand) -> None:
+    page.get_by_role("button", name="Gizmo", exact=True).click()
+    tip = np.add(FACE, [0, 0, 0.018])
+    drag(page, on_screen(page, tip), on_screen(page, np.add(tip, [0, 0, 0.008])))
+    hand.until(lambda: hand.total("press") == pytest.approx(0.008, abs=5e-4))
+    tip = np.add(FACE, [0.02, 0, 0])
+    drag(page, on_screen(page, tip), on_screen(page, np.add(tip, [0.01, 0, 0])))
+    hand.until(lambda: hand.total("slide") == pytest.approx([0.01, 0.0], abs=5e-4))
+
+
+def test_where_somebody_else_leads_the_view_turns_instead(page: Any, hand: FakeHand) -> None:
+    hand.say(leader="path_player", obstacle="path_player moves the probe")
+    page.wait_for_function("document.querySelector('.us-quantity input').disabled")
+    drag(page, on_screen(page, [0.06, 0.05, 0]), on_screen(page, [0.02, 0.05, 0]))
+    page.wait_for_timeout(100)
+    assert not hand.asked

@@ -1,0 +1,69 @@
+"""Which parameters stand where in the panels."""
+
+from us_sim.viewer.panels.section import common_first
+from us_sim.viewer.panels.tissue import arrange_tissue
+from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.time_gain_sliders import on_sliders, slider_count
+
+
+def known(*names: str, **fields: object) -> dict[str, Parameter]:
+    return {name: Parameter("n", name, Kind.NUMBER, 1.0, **fields) for name in names}
+
+
+def test_the_common_come_first_and_the_rest_by_groups():
+    parameters = known("noise", "gain", "colour.gain", "depth", "colour.steering", "a.b.c")
+    parameters |= known("scene", "qos.x", is_live=False)
+    sections = common_first(("depth", "gain", "time_gain"))(parameters)
+    assert [(s.title, s.names) for s in sections] == [
+        ("", ("depth", "gain")),
+        ("More", ("noise",)),
+        ("Colour", ("colour.gain", "colour.steering")),
+        ("A · b", ("a.b.c",)),
+        ("Given at the start", ("scene", "qos.x")),
+    ]
+    assert sections[-1].labels["qos.x"] == "qos · x"
+
+
+def test_a_node_without_common_ones_begins_with_those_of_no_group():
+    sections = common_first(())(known("marker_rate", "skin.damping"))
+    assert [(s.title, s.names) for s in sections] == [
+        ("", ("marker_rate",)),
+        ("Skin", ("skin.damping",)),
+    ]
+
+
+def test_only_the_settings_of_the_methods_in_use_are_shown():
+    methods = ("fem", "msds", "fem_cg")
+    parameters = {
+        "solver": Parameter("n", "solver", Kind.TEXT, "fem_cg", choices=methods),
+        "compare_with": Parameter(
+            "n", "compare_with", Kind.TEXT, "", choices=methods, may_be_nothing=True
+        ),
+    }
+    parameters |= known("fem.friction", "msds.steps", "fem_cg.iterations", "marker_rate")
+    parameters |= known(
+        *(f"materials.{s}.{p}" for s in ("fat", "bone") for p in ("young_modulus", "density"))
+    )
+
+    def shown() -> list[tuple[str, tuple[str, ...]]]:
+        return [(s.title, s.names) for s in arrange_tissue(parameters) if s.is_shown]
+
+    assert shown() == [
+        ("", ("solver", "compare_with")),
+        ("Settings of fem_cg", ("fem_cg.iterations",)),
+        ("Young's modulus", ("materials.fat.young_modulus", "materials.bone.young_modulus")),
+        ("Materials · fat", ("materials.fat.density",)),
+        ("Materials · bone", ("materials.bone.density",)),
+        ("More", ("marker_rate",)),
+    ]
+    parameters["compare_with"] = parameters["compare_with"].with_raw("msds")
+    assert ("Settings of msds", ("msds.steps",)) in shown()
+    every = {name for section in arrange_tissue(parameters) for name in section.names}
+    assert every == set(parameters)
+
+
+def test_time_gain_is_shown_on_as_many_sliders_as_a_console_has():
+    assert [slider_count([0.0] * n) for n in (1, 2, 3, 12, 13)] == [8, 8, 3, 12, 8]
+    assert on_sliders((3.0,), 4) == [3.0] * 4
+    assert on_sliders((), 2) == [0.0, 0.0]
+    assert on_sliders((0.0, 10.0, 0.0), 5) == [0.0, 5.0, 10.0, 5.0, 0.0]

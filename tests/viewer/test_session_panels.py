@@ -1,0 +1,111 @@
+"""The panels of cases and of the session, in a browser: what they show, and what they ask for."""
+
+import dataclasses
+from concurrent.futures import Future
+
+import cv2
+import numpy as np
+import pytest
+from awaiting import until
+
+from us_sim.viewer.session import LoadableScene, SessionBoard, SessionState
+
+RUNNING = SessionState(True, "running", "upper_arm", "/arm.yaml")
+
+
+@pytest.fixture
+def session(simulator):
+    """The session that pages see, and what they asked of it."""
+    asked = []
+
+    def ask(values):
+        told = Future()
+        told.set_result("there is no such file" if "nowhere.mcap" in values.values() else "")
+        asked.append(dict(values))
+        return told
+
+    simulator.session = SessionBoard(ask=ask)
+    simulator.session.tell_state(RUNNING)
+    return simulator.session, asked
+
+
+def opened(page, tab):
+    """The drawer, at a tab."""
+    page.goto(page.address)
+    page.locator("#us-panels").click()
+    page.get_by_role("tab", name=tab).click()
+
+
+def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
+    board, asked = session
+    _, picture = cv2.imencode(".jpg", np.full((180, 240), 90, np.uint8))
+    board.tell_scenes(
+        (
+            LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+            LoadableScene("liver", "case:/liver", "case", region="abdomen"),
+            LoadableScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
+        )
+    )
+    board.tell_thumbnail("case:/liver", bytes(picture))
+    opened(page, "Cases")
+    page.get_by_text("volume.file: is missing").wait_for()
+    assert page.get_by_role("button", name="Load sweep").is_disabled()
+    page.locator('img[src^="data:image/jpeg"]').first.wait_for()
+    page.get_by_role("button", name="Load liver").click()
+    until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
+    board.tell_state(
+        dataclasses.replace(RUNNING, state="loading liver: reading the volume, 40 %", fraction=0.4)
+    )
+    page.get_by_text("upper arm: loading liver: reading the volume, 40 %").wait_for()
+    until(
+        page.get_by_role("button", name="Load liver").is_disabled,
+        "nothing else can be loaded meanwhile",
+        30.0,
+    )
+    board.tell_state(dataclasses.replace(RUNNING, record="a.mcap"))
+    until(page.get_by_role("button", name="Load liver").is_enabled, "it can be loaded again", 30.0)
+    page.get_by_role("button", name="Load liver").click()
+    page.get_by_role("button", name="Go on recording").click()
+    page.get_by_role("button", name="Load liver").click()
+    page.get_by_role("dialog").get_by_role("button", name="Load").click()
+    until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
+
+
+def test_a_session_is_recorded_and_replayed(page, session):
+    board, asked = session
+    board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
+    opened(page, "Session")
+    file = page.get_by_label("file")
+    until(lambda: file.input_value().startswith("session_"), "a name is proposed", 30.0)
+    file.fill("nowhere.mcap")
+    page.get_by_role("button", name="Record", exact=True).click()
+    page.get_by_text("there is no such file").wait_for()
+    board.tell_state(dataclasses.replace(RUNNING, record="mine.mcap"))
+    page.get_by_text("recording to mine.mcap").wait_for()
+    page.get_by_role("button", name="Stop", exact=True).click()
+    until(lambda: asked[-1] == {"record": ""}, "it is ended", 30.0)
+    page.get_by_label("recording or path").click()
+    page.get_by_role("option", name="hand.mcap").click()
+    page.get_by_role("button", name="Play or pause").click()
+    until(lambda: asked[-1].get("replay") == "/bags/hand.mcap", "it is played", 30.0)
+    assert asked[-1]["replay_as"] == "path"
+    board.tell_state(
+        dataclasses.replace(
+            RUNNING, replay="/bags/hand.mcap", replay_state="playing", position=3.2, duration=12.0
+        )
+    )
+    page.get_by_text("3.2 of 12.0 s, playing").wait_for()
+    count = len(asked)
+    slider = page.get_by_role("slider", name="Time in the replay, s").bounding_box()
+    page.mouse.click(slider["x"] + 0.5 * slider["width"], slider["y"] + 0.5 * slider["height"])
+    until(lambda: len(asked) > count, "the time is asked for", 30.0)
+    assert asked[-1]["replay_time"] == pytest.approx(6.0, abs=0.5)
+    page.get_by_role("button", name="Play or pause").click()
+    until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
+
+
+def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):
+    board, _ = session
+    board.tell_state(SessionState())
+    opened(page, "Session")
+    page.get_by_text("us-sim does not run this simulation").wait_for()

@@ -1,0 +1,76 @@
+"""Shows the simulator in a browser, and lets a person there take the probe."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.health import Health
+from us_sim.nodes.parameters import declared
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.process import run_node
+from us_sim.nodes.remote_parameters import RemoteParameters
+from us_sim.nodes.status_listener import StatusListener
+from us_sim.nodes.viewer_feeds.image_feed import image_feeds
+from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
+from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
+from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
+from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
+from us_sim.nodes.viewer_hand import ViewerHand
+from us_sim.nodes.viewer_session import ViewerSession
+from us_sim.nodes.viewer_settings import ViewerSettings
+from us_sim.viewer.server import WebServer
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["Viewer", "main"]
+
+
+class Viewer(GuardedNode):
+    """A web server beside a node: what a page shows is subscribed to, and nothing else.
+
+    Its parameters are those of `ViewerSettings`.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("viewer", **kwargs)
+        settings = declared(self, ViewerSettings())
+        self.health = Health(self, f"{settings.host}:{settings.port}")
+        self.post = Posted(self)
+        self._remote = RemoteParameters(self, self.post)
+        listener = StatusListener(self, self.post)
+        self._session = ViewerSession(self, self.post)
+        self.simulator = Simulator(
+            nodes=self._remote.board, status=listener.board, session=self._session.board
+        )
+        hand = ViewerHand(self, self.post, self.simulator)
+        self.simulator.add(*image_feeds(self, self.post, settings.rate, hand.asked_by))
+        for bodies in (SkinFeeds, TissueFeeds, ProbeFeeds):
+            self.simulator.add(*bodies(self, self.post, settings.rate).feeds)
+        self.simulator.add(StructuresFeed(self, self.post).feed)
+        self._server = WebServer(self.simulator, settings.host, settings.port)
+        self.health.state = "serving"
+        self.health.values = {"port": str(self._server.port)}
+        print(f"open {self._server.address}", flush=True)
+        if self._server.token:
+            self.get_logger().warning(
+                f"the viewer listens at {settings.host}, for other computers, too: whoever has "
+                f"the address with its token can see and move everything, and nothing is encrypted"
+            )
+
+    def destroy_node(self) -> None:
+        """End the web server first."""
+        self.post.close()
+        self._remote.close()
+        self._session.close()
+        self._server.close()
+        super().destroy_node()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Serve until interrupted."""
+    return run_node(Viewer, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

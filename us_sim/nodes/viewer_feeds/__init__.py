@@ -1,0 +1,1 @@
+"""What streams to the pages of the viewer: one file a stream, subscribed to only while watched."""

@@ -1,0 +1,297 @@
+"""Moves the probe as pages ask for it, unless somebody else does."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+
+from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.conversions import pose_from, pose_message
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.viewer_surface import ViewerSurface
+from us_sim.tracking.virtual_hand.motion import Motion
+from us_sim.tracking.virtual_hand.rest_surface import RestSurface
+from us_sim.tracking.virtual_hand.stance import DEEPEST, HIGHEST, STEEPEST, Stance
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.hand_command import HOME_PRESS, HandCommand
+from us_sim.viewer.packet import Packet
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["ViewerHand"]
+
+PATIENT, TOPIC = "patient", "tracker/pose"
+MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
+"""Poses a second: on two cores the simulator and the browser share them, and a page shows no more
+images than that."""
+RESTING = 5.0
+"""Poses a second; images are called stale after half a second."""
+LOOKS = 2.0
+"""How often within the time from pose to pose it is looked whether one is due."""
+STREAMING, PATIENCE = 3.0, 1.45
+"""From pose to pose: how long after a command the next is expected, and then waited for. A timer's
+pose just before it would hold up the command's own."""
+STATE_RATE = 30.0
+"""Hz at which pages are told at most how the probe is held."""
+LONGEST_STEP = 0.05
+"""s of movement at most between two poses: were the node held up, the probe would leap."""
+KEPT = 512
+"""Poses for which is known what they were asked by."""
+NEAR = 0.02
+"""m from the old place to a new surface: it is another one of the same patient."""
+ASTRAY, SETTLED = 3e-3, 1.0
+"""m, and s of rest, from which on the tracked probe is not where it was put."""
+
+
+class ViewerHand:
+    """A tracker source that pages move: ``tracker/pose`` in frame ``patient``.
+
+    It publishes only while a page watches and nobody else does: a driver or a player leads as long
+    as it has a publisher, and the hand goes on from where that has left the probe. Poses come as
+    soon as a page asks, 60 times a second while the probe moves, 5 times while it rests.
+
+    Args:
+        node: that publishes.
+        post: has work done in the node's thread.
+        simulator: given the stream ``hand`` and the command of the same name.
+    """
+
+    def __init__(self, node: GuardedNode, post: Posted, simulator: Simulator) -> None:
+        self._node, self._post = node, post
+        self.feed = Feed("hand", self._watched, STATE_RATE)
+        simulator.add(self.feed)
+        simulator.commands["hand"] = self._command
+        self._obstacle = "the viewer looks who moves the probe"  # why the hand may not; "" if so
+        self._surface: ViewerSurface | None = None
+        self._standing: RestSurface | None = None  # the surface that the motion is on
+        self._motion: Motion | None = None
+        self._publisher: Any = None
+        self._tracked: Any = None  # subscription
+        self._elsewhere: Pose | None = None  # where somebody else has the probe
+        self._asked: tuple[str, int] | None = None  # page and number of the last command
+        self._asked_by: dict[int, tuple[str, int]] = {}  # by the stamp of a pose
+        self._sent_at = self._rests_since = self._asked_at = 0.0  # s, of the monotonic clock
+        self._leader, self._warning = "nobody", ""
+        self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
+        self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
+        self._moving_timer.cancel()
+        self._resting_timer.cancel()
+
+    def asked_by(self, stamp: int) -> tuple[str, int] | None:
+        """The page, and the number of its command, that the pose of a stamp (ns) contains."""
+        return self._asked_by.get(stamp)
+
+    def _command(self, value: Any, _: int) -> str | None:
+        """What a page sent, in its thread; why it is not done, or None."""
+        try:
+            asked = HandCommand.read(value)
+        except UsSimError as error:
+            return str(error)
+        if self._obstacle:
+            return self._obstacle
+        self._post(lambda: self._obey(asked))
+        return None
+
+    def _watched(self, _: bool) -> None:
+        """A page looks, or none does any more; in that page's thread."""
+        self._post(self._watch)
+
+    def _watch(self) -> None:
+        """Begin when the first page looks, and leave everything when the last has gone."""
+        if self.feed.is_watched and self._surface is None:
+            self._surface = ViewerSurface(self._node, self._stand)
+            self._tracked = self._node.create_subscription(
+                PoseStamped, "probe/pose", self._follow, STREAM
+            )
+            self._resting_timer.reset()
+            self._look()
+        elif not self.feed.is_watched and self._surface is not None:
+            self._let_go()
+            self._surface.close()
+            self._node.destroy_subscription(self._tracked)
+            self._surface = self._tracked = None
+            self._resting_timer.cancel()
+
+    def _stand(self) -> None:
+        """On another surface: where the probe is, if that is near, else at home."""
+        surface = self._surface.best if self._surface is not None else None
+        if surface is None or surface is self._standing:
+            return
+        self._standing = surface
+        if self._motion is None:
+            return
+        stance = self._motion.stance
+        foot = surface.closest(stance.point)
+        if float(np.linalg.norm(foot.point - stance.point)) < NEAR:
+            self._motion.rest_at(replace(stance, point=foot.point))
+        else:
+            self._motion.rest_at(Stance.home(surface, HOME_PRESS))
+
+    def _look(self) -> None:
+        """A few times a second: who leads, is there somewhere to stand, and the pose at rest."""
+        self._stand()
+        self._obstacle = self._hindrance()
+        if self._obstacle:
+            self._let_go()
+            self._tell()
+            return
+        if self._publisher is None:
+            self._take()
+        if self._moving_timer.is_canceled():
+            self._publish()
+
+    def _hindrance(self) -> str:
+        """Why the hand may not move the probe, for a person, or nothing."""
+        node, name = self._node, self._node.resolve_topic_name(TOPIC)
+        others = [info.node_name for info in node.get_publishers_info_by_topic(name)]
+        if self._publisher is not None and node.get_name() in others:
+            others.remove(node.get_name())
+        self._leader = others[0] if others else "tracker"
+        if others:
+            return f"{others[0]} moves the probe: end it to take the probe yourself"
+        hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+        if "probe_tracker" not in hearers:
+            if node.count_publishers(node.resolve_topic_name("probe/pose")):
+                return (
+                    "the probe follows the scene's own tracker: start without --tracker, or with "
+                    "--param probe_tracker.source=pose, to take it yourself"
+                )
+            self._leader = "nobody"
+            return "no simulator with a probe runs yet"
+        if self._standing is None:
+            self._leader = "nobody"
+            return "the patient's surface is awaited"
+        self._leader = "hand"
+        return ""
+
+    def _take(self) -> None:
+        """Lead from here on: from where the probe is, or else where it was held, or at home."""
+        assert self._standing is not None
+        if self._elsewhere is not None:
+            self._motion = Motion(Stance.of(self._elsewhere, self._standing))
+            self._elsewhere = None
+        elif self._motion is None:
+            self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
+        self._publisher = self._node.create_publisher(
+            PoseStamped, TOPIC, STREAM, qos_overriding_options=overridable()
+        )
+        self._rests_since = time.monotonic()
+
+    def _let_go(self) -> None:
+        """Publish no more."""
+        self._moving_timer.cancel()
+        self._warning = ""
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+        if self._motion is not None:
+            self._motion.rest_at(self._motion.stance)
+
+    def _follow(self, message: PoseStamped) -> None:
+        """Where the probe is: there somebody else has it, or there it should not be."""
+        pose = pose_from(message, PATIENT)
+        if self._publisher is None or self._motion is None or self._standing is None:
+            self._elsewhere = pose
+        elif (
+            self._moving_timer.is_canceled()
+            and time.monotonic() - self._rests_since > SETTLED
+            and not self._warning
+        ):
+            wanted = self._motion.stance.pose(self._standing).position
+            distance = float(np.linalg.norm(pose.position - wanted))
+            if distance > ASTRAY:
+                self._warning = (
+                    f"the probe is {1e3 * distance:.0f} mm from where it is held: the scene "
+                    f"registers or calibrates poses in frame patient; give its tracker another "
+                    f"frame"
+                )
+
+    def _obey(self, asked: HandCommand) -> None:
+        """Aim where a page wants the probe, and set out at once."""
+        if self._publisher is None or self._motion is None or self._standing is None:
+            return  # somebody else has taken it meanwhile
+        self._motion.aim(asked.stance(self._motion.goal, self._standing))
+        self._asked = (asked.source, asked.sequence)
+        self._asked_at = time.monotonic()
+        rested = self._moving_timer.is_canceled()
+        if rested:
+            self._moving_timer.reset()
+        if rested or self._asked_at - self._sent_at > 0.5 / MOVING:
+            self._advance(1.0 / MOVING if rested else LONGEST_STEP)
+
+    def _tick(self) -> None:
+        """The next pose of a movement, if it is due."""
+        now = time.monotonic()
+        is_streaming = now - self._asked_at < STREAMING / MOVING
+        if now - self._sent_at > (PATIENCE if is_streaming else 0.9) / MOVING:
+            self._advance(LONGEST_STEP)
+
+    def _advance(self, longest: float) -> None:
+        """Publish where the movement is by now; at most so many s after the last pose."""
+        if self._publisher is None or self._motion is None:
+            self._moving_timer.cancel()
+            return
+        self._motion.advance(min(time.monotonic() - self._sent_at, longest))
+        self._publish()
+        if self._motion.is_at_rest:
+            self._moving_timer.cancel()
+            self._resting_timer.reset()
+            self._rests_since = time.monotonic()
+
+    def _publish(self) -> None:
+        """Where the probe is held."""
+        assert self._motion is not None
+        assert self._standing is not None
+        stamp = self._node.get_clock().now()
+        pose = self._motion.stance.pose(self._standing)
+        if self._asked is not None:  # said first: its image may be there at once
+            self._asked_by[stamp.nanoseconds] = self._asked
+            if len(self._asked_by) > KEPT:
+                del self._asked_by[next(iter(self._asked_by))]
+        self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
+        self._sent_at = time.monotonic()
+        self._node.health.published(TOPIC)
+        self._tell()
+
+    def _tell(self) -> None:
+        """The pages how the probe is held, and by whom."""
+        motion, surface = self._motion, self._standing
+        header: dict[str, Any] = {
+            "leader": self._leader,
+            "obstacle": self._obstacle,
+            "warning": self._warning,
+        }
+        if self._publisher is None and self._elsewhere is not None and surface is not None:
+            header["stance"] = header["goal"] = _numbers(Stance.of(self._elsewhere, surface))
+        elif motion is not None:
+            header |= {"stance": _numbers(motion.stance), "goal": _numbers(motion.goal)}
+        if surface is not None:
+            lower, upper = surface.lower.tolist(), surface.upper.tolist()
+            header["range"] = {
+                "x": [lower[0], upper[0]],
+                "y": [lower[1], upper[1]],
+                "press": [-HIGHEST, DEEPEST],
+                "tilt": [-STEEPEST, STEEPEST],
+            }
+        self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))
+
+
+def _numbers(stance: Stance) -> dict[str, float]:
+    """A stance as pages take it: m and rad, frame ``patient``."""
+    x, y, z = stance.point.tolist()
+    return {
+        "x": x,
+        "y": y,
+        "z": z,
+        "press": stance.press,
+        "rotation": stance.rotation,
+        "fan": stance.fan,
+        "rock": stance.rock,
+    }

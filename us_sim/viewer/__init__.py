@@ -1,0 +1,1 @@
+"""The simulator in a browser: one page, its server, and what streams to it."""

@@ -1,0 +1,44 @@
+"""What the web server serves: the page, its own files, and the stream."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, WebSocket
+from fastapi.staticfiles import StaticFiles
+from nicegui import ui
+
+from us_sim.viewer.page import build_page
+from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import serve_page
+
+__all__ = ["ASSETS", "application"]
+
+ASSETS = Path(__file__).parent / "assets"
+
+
+def application(simulator: Simulator) -> Any:
+    """The ASGI application of one viewer; a process has one."""
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    app.mount("/us_sim/assets", StaticFiles(directory=ASSETS))
+
+    @app.websocket("/us_sim/stream")
+    async def stream(websocket: WebSocket) -> None:
+        await serve_page(websocket, simulator)
+
+    @ui.page("/")
+    def page() -> None:
+        build_page(simulator)
+
+    ui.run_with(
+        app,
+        title="us_sim",
+        dark=True,
+        tailwind=False,  # a compiler in the page, which nothing here needs
+        gzip_middleware_factory=None,
+        binding_refresh_interval=None,
+        show_welcome_message=False,
+        favicon=ASSETS / "probe.svg",
+    )
+    return app

@@ -1,0 +1,85 @@
+/**
+ * The hand that holds the probe: what this page wants of it, and how it is held.
+ *
+ * All lengths are metres and all angles radians, in frame `patient`; `state.stance` is how the
+ * probe is held now, `state.goal` where it goes: {x, y, z, press, rotation, fan, rock}.
+ */
+
+import { events } from "../events.js";
+import { stream } from "../stream.js";
+import { latency } from "./latency.js";
+
+/** ms: wishes that come closer together than a picture are sent as one. */
+const TOGETHER_MS = 14;
+const source = Array.from(crypto.getRandomValues(new Uint32Array(2)), (n) => n.toString(36)).join("");
+
+let sequence = 0;
+let wish = null;
+let earliest = 0;
+let sent = -TOGETHER_MS;
+let isDue = false;
+const handlers = [];
+
+export const hand = {
+  /** The newest of the viewer: {leader, obstacle, warning, stance, goal, range}, or null. */
+  state: null,
+
+  /** Have `handler(state)` called with each newer state. */
+  on(handler) {
+    handlers.push(handler);
+  },
+
+  /** Whether the page may move the probe. */
+  get leads() {
+    return this.state?.leader === "hand";
+  },
+
+  /**
+   * Ask for values (`to`), for changes (`by`), or for a place (`go`: "home", "lift", "upright").
+   *
+   * `time`: ms of `performance.now()`, when the person did what this follows from.
+   */
+  ask({ to = {}, by = {}, go = undefined }, time = performance.now()) {
+    if (go) flush();
+    if (!wish) {
+      wish = { to: {}, by: {} };
+      earliest = time;
+    }
+    Object.assign(wish.to, to);
+    for (const [name, amount] of Object.entries(by)) {
+      if (Array.isArray(amount)) {
+        const before = wish.by[name] ?? amount.map(() => 0);
+        wish.by[name] = amount.map((value, i) => value + before[i]);
+      } else if (name in wish.to) {
+        wish.to[name] += amount;
+      } else {
+        wish.by[name] = (wish.by[name] ?? 0) + amount;
+      }
+    }
+    if (go) wish.go = go;
+    if (performance.now() - sent >= TOGETHER_MS) flush();
+    else if (!isDue) {
+      isDue = true;
+      requestAnimationFrame(flush);
+    }
+  },
+};
+
+function flush() {
+  isDue = false;
+  if (!wish) return;
+  sequence += 1;
+  if (stream.send({ hand: { source, sequence, ...wish } })) latency.asked(sequence, earliest);
+  sent = performance.now();
+  wish = null;
+}
+
+stream.on("hand", (header) => {
+  hand.state = header;
+  for (const handle of handlers) handle(header);
+});
+stream.watch("hand");
+
+events.on("image-drawn", ({ command }) => {
+  if (command?.[0] === source) requestAnimationFrame(() => latency.seen(command[1]));
+});

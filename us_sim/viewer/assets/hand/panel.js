@@ -1,0 +1,136 @@
+/** Sliders with numbers, buttons, and the line that says who holds the probe. */
+
+import { element, events } from "../events.js";
+import { hand } from "./hand.js";
+import { help } from "./help.js";
+import { latency } from "./latency.js";
+
+const MILLIMETRES = { unit: "mm", factor: 1000, digits: 1, step: 0.1 };
+const DEGREES = { unit: "°", factor: 180 / Math.PI, digits: 0, step: 1 };
+const HALF = [-Math.PI, Math.PI];
+
+/** Name of the quantity, label, tooltip, unit, and its range's name in the state, or the range. */
+const QUANTITIES = [
+  ["press", "Press", "How deep the probe is pressed into the skin at rest; below 0 it is lifted (keys W, S)", MILLIMETRES, "press"],
+  ["fan", "Fan", "Tilt about the array: the image plane swings through the tissue (Shift ↑ ↓)", DEGREES, "tilt"],
+  ["rock", "Rock", "Tilt within the image plane (Shift ← →)", DEGREES, "tilt"],
+  ["rotation", "Rotate", "Turn about the skin's normal (keys Q, E)", DEGREES, HALF],
+  ["x", "Across", "Where the probe stands along the patient's x (keys ← →)", MILLIMETRES, "x"],
+  ["y", "Along", "Where the probe stands along the patient's y (keys ↑ ↓)", MILLIMETRES, "y"],
+];
+const BUTTONS = [
+  ["Centre", "Back to the middle of the patient, touching the skin (key H)", () => hand.ask({ go: "home" })],
+  ["Lift", "10 mm off the skin (key L)", () => hand.ask({ go: "lift" })],
+  ["Upright", "Without fan, rock and rotation (key U)", () => hand.ask({ go: "upright" })],
+];
+const SAID_MS = 5000;
+const PACE_MS = 500;
+
+const style = document.createElement("link");
+style.rel = "stylesheet";
+style.href = new URL("./hand.css", import.meta.url).href;
+document.head.append(style);
+
+const place = await element("hand");
+const rows = QUANTITIES.map(makeRow);
+const said = make("p", { className: "us-said" });
+said.setAttribute("role", "status");
+const pace = make("span", { className: "us-pace" });
+pace.title = "From the pointer to the changed image: median of the last movements";
+place.append(make("div", { className: "us-quantities" }, ...rows.map((row) => row.all)), makeBar());
+
+function make(kind, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(kind), properties);
+  made.append(...children);
+  return made;
+}
+
+function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
+  const slider = make("input", { type: "range", step: step / 10, title });
+  const number = make("input", { type: "number", step, title });
+  slider.setAttribute("aria-label", `${label}, ${unit}`);
+  number.setAttribute("aria-label", `${label}, ${unit}`);
+  const all = make(
+    "label",
+    { className: "us-quantity", title },
+    make("span", { textContent: label }),
+    slider,
+    number,
+    make("i", { textContent: unit }),
+  );
+  let isHeld = false;
+  const ask = (value, event) => {
+    if (Number.isFinite(value)) hand.ask({ to: { [name]: value / factor } }, event.timeStamp);
+  };
+  slider.addEventListener("input", (event) => {
+    number.value = slider.valueAsNumber.toFixed(digits);
+    ask(slider.valueAsNumber, event);
+  });
+  number.addEventListener("change", (event) => ask(number.valueAsNumber, event));
+  slider.addEventListener("pointerdown", () => (isHeld = true));
+  for (const end of ["pointerup", "pointercancel", "blur"]) {
+    slider.addEventListener(end, () => (isHeld = false));
+  }
+  return {
+    all,
+    show({ goal, range: ranges }, canMove) {
+      slider.disabled = number.disabled = !canMove;
+      const limits = Array.isArray(range) ? range : ranges?.[range];
+      if (limits) {
+        for (const entry of [slider, number]) {
+          entry.min = (limits[0] * factor).toFixed(digits);
+          entry.max = (limits[1] * factor).toFixed(digits);
+        }
+      }
+      if (!goal) return;
+      const text = (goal[name] * factor).toFixed(digits).replace(/^-(0\.?0*)$/, "$1");
+      if (!isHeld) slider.value = goal[name] * factor;
+      if (document.activeElement !== number && !isHeld) number.value = text;
+    },
+  };
+}
+
+function makeBar() {
+  const bar = make("div", { className: "us-hand-bar" });
+  for (const [textContent, title, onclick] of BUTTONS) {
+    bar.append(make("button", { type: "button", textContent, title, onclick }));
+  }
+  const gizmo = make("button", { type: "button", textContent: "Gizmo" });
+  gizmo.title = "Arrows and rings at the probe, to move and turn it along its own axes";
+  gizmo.setAttribute("aria-pressed", "false");
+  gizmo.onclick = () => {
+    const isOn = gizmo.classList.toggle("us-on");
+    gizmo.setAttribute("aria-pressed", String(isOn));
+    events.tell("gizmo", isOn);
+  };
+  const keys = make("button", { type: "button", textContent: "?", title: "Keys and gestures (key ?)" });
+  keys.onclick = () => help.toggle();
+  bar.append(gizmo, keys, said, pace);
+  return bar;
+}
+
+let problem = "";
+let problemEnds = 0;
+
+function show() {
+  const state = hand.state;
+  if (!state) return;
+  for (const row of rows) row.show(state, hand.leads);
+  const isProblem = performance.now() < problemEnds;
+  said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
+  said.textContent = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
+  said.title = said.textContent;
+}
+
+setInterval(() => {
+  const { count, median } = latency.get();
+  pace.textContent = count ? `${median.toFixed(0)} ms` : "";
+}, PACE_MS);
+
+hand.on(show);
+events.on("problem", (sentence) => {
+  problem = sentence;
+  problemEnds = performance.now() + SAID_MS;
+  setTimeout(show, SAID_MS + 50);
+  show();
+});

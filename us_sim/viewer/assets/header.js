@@ -1,0 +1,36 @@
+/** The header: whether the viewer answers, and how many images come. */
+
+import { element, events } from "./events.js";
+
+const WINDOW_MS = 2000;
+const times = [];
+
+const readout = await element("readout");
+readout.setAttribute("role", "status");
+readout.title = "Ultrasound images drawn in this page, and whether the viewer answers";
+
+let connected = false;
+
+function show() {
+  const now = performance.now();
+  while (times.length && now - times[0] > WINDOW_MS) times.shift();
+  const rate = (1000 * times.length) / WINDOW_MS;
+  readout.textContent = connected ? `${rate.toFixed(0)} images/s` : "the viewer does not answer";
+  readout.classList.toggle("us-wrong", !connected);
+}
+
+events.on("connection", (open) => {
+  connected = open;
+  show();
+});
+let drawn = 0;
+events.on("image-drawn", () => {
+  drawn += 1;
+  times.push(performance.now());
+});
+/** For who measures or tests a page: how many images it has drawn, and of which scene. */
+window.usSim = Object.assign(window.usSim ?? {}, {
+  images: () => drawn,
+  scene: () => document.getElementById("us-scene")?.textContent,
+});
+setInterval(show, 500);

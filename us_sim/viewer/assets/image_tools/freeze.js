@@ -1,0 +1,81 @@
+/** Freezing the image, and looking through the last seconds before that. */
+
+import { events } from "../events.js";
+import { drawImage, onImage, setLive } from "../image.js";
+import { Cine } from "./cine.js";
+
+const cine = new Cine();
+let number = 0;
+let isFrozen = false;
+let playing = null;
+const handlers = [];
+
+function tell() {
+  for (const handle of handlers) handle();
+}
+
+onImage((header, payload) => cine.keep(header, payload, performance.now()));
+
+export const freeze = {
+  cine,
+
+  /** Have `handler()` called when something of it has changed. */
+  on(handler) {
+    handlers.push(handler);
+  },
+
+  get isFrozen() {
+    return isFrozen;
+  },
+
+  get isPlaying() {
+    return playing !== null;
+  },
+
+  /** The number of the image that is shown, of those that are kept. */
+  get number() {
+    return number;
+  },
+
+  /** Hold the newest image, or go on with those that come. */
+  toggle() {
+    isFrozen = !isFrozen;
+    playing = null;
+    number = Math.max(0, cine.frames.length - 1);
+    setLive(!isFrozen);
+    events.tell("image-frozen", isFrozen);
+    tell();
+  },
+
+  /** Show one of the kept images; freezes. */
+  async show(wanted) {
+    if (!isFrozen) this.toggle();
+    number = Math.min(Math.max(wanted, 0), cine.frames.length - 1);
+    const frame = cine.frames[number];
+    if (frame) await drawImage(frame.header, frame.payload);
+    tell();
+  },
+
+  /** Play them as fast as they came, again and again, or stop. */
+  play(on = !playing) {
+    if (!isFrozen) this.toggle();
+    const { frames } = cine;
+    if (!on || frames.length < 2) {
+      playing = null;
+      tell();
+      return;
+    }
+    const from = number === frames.length - 1 ? 0 : frames[number].time - frames[0].time;
+    playing = { began: performance.now() - from };
+    requestAnimationFrame(turn);
+    tell();
+  },
+};
+
+async function turn() {
+  if (!playing) return;
+  const elapsed = (performance.now() - playing.began) % (cine.duration + 100);
+  const wanted = cine.at(elapsed);
+  if (wanted !== number) await freeze.show(wanted);
+  requestAnimationFrame(turn);
+}

@@ -1,0 +1,121 @@
+/** The bar below the ultrasound image: freeze, cine loop, measurements, picture. */
+
+import { element, events } from "../events.js";
+import { isPressing, isTyping } from "../hand/typing.js";
+import { freeze } from "./freeze.js";
+import { overlay } from "./overlay.js";
+import { save } from "./picture.js";
+
+const style = document.createElement("link");
+style.rel = "stylesheet";
+style.href = new URL("./image_tools.css", import.meta.url).href;
+document.head.append(style);
+
+const place = await element("image-tools");
+const bar = document.createElement("div");
+bar.className = "us-image-bar";
+const list = document.createElement("ol");
+list.className = "us-values";
+list.setAttribute("aria-label", "Measured values");
+place.append(bar);
+(await element("ultrasound")).append(list);
+
+function button(text, title, onclick) {
+  const made = Object.assign(document.createElement("button"), { type: "button", title, onclick });
+  made.textContent = text;
+  bar.append(made);
+  return made;
+}
+
+const freezing = button("Freeze", "Hold the image; the last 10 s can be looked through (Space)", () => freeze.toggle());
+const playing = button("Play", "Play the last 10 s again and again (key C)", () => freeze.play());
+const scrubber = Object.assign(document.createElement("input"), {
+  type: "range",
+  className: "us-scrubber",
+  min: 0,
+  step: 1,
+  title: "Look through the last 10 s (keys , and .)",
+});
+scrubber.setAttribute("aria-label", "Image of the last 10 s");
+const moment = Object.assign(document.createElement("span"), { className: "us-moment" });
+moment.title = "Time before the image was frozen";
+bar.append(scrubber, moment);
+const tools = {
+  distance: button("Distance", "Drag from point to point: mm (key D)", () => overlay.use("distance")),
+  ellipse: button("Ellipse", "Drag an axis, then its other end: mm² (key O)", () => overlay.use("ellipse")),
+  note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
+};
+const clearing = button("Clear", "Remove all measurements and texts (key X)", () => overlay.clear());
+button("Save", "Keep the image with its scale and measurements as a PNG file (key P)", save);
+
+scrubber.addEventListener("input", () => {
+  if (freeze.isPlaying) freeze.play(false);
+  freeze.show(scrubber.valueAsNumber);
+});
+
+function press(pressed, on) {
+  pressed.classList.toggle("us-on", on);
+  pressed.setAttribute("aria-pressed", String(on));
+}
+
+function showFreeze() {
+  const { frames } = freeze.cine;
+  press(freezing, freeze.isFrozen);
+  freezing.textContent = freeze.isFrozen ? "Go on" : "Freeze";
+  press(playing, freeze.isPlaying);
+  playing.textContent = freeze.isPlaying ? "Stop" : "Play";
+  scrubber.hidden = moment.hidden = !freeze.isFrozen;
+  if (!freeze.isFrozen || !frames.length) return;
+  scrubber.max = frames.length - 1;
+  scrubber.value = freeze.number;
+  const before = (frames[freeze.number].time - frames.at(-1).time) / 1000;
+  moment.textContent = `${before.toFixed(1)} s`;
+}
+
+function showMeasures() {
+  for (const [name, made] of Object.entries(tools)) {
+    press(made, overlay.tool === name);
+    made.disabled = !overlay.isMeasurable;
+  }
+  clearing.disabled = !overlay.measures.length;
+  list.replaceChildren(
+    ...overlay.measures.map((measure) => {
+      const item = document.createElement("li");
+      item.style.color = measure.colour;
+      const removing = Object.assign(document.createElement("button"), {
+        type: "button",
+        textContent: "×",
+        title: "Remove it",
+        onclick: () => overlay.remove(measure),
+      });
+      removing.setAttribute("aria-label", `Remove ${measure.text}`);
+      item.append(measure.text, removing);
+      return item;
+    }),
+  );
+}
+
+const KEYS = {
+  c: () => freeze.play(),
+  ",": () => freeze.show(freeze.number - 1),
+  ".": () => freeze.show(freeze.number + 1),
+  d: () => overlay.use("distance"),
+  o: () => overlay.use("ellipse"),
+  t: () => overlay.use("note"),
+  x: () => overlay.clear(),
+  p: save,
+};
+addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && overlay.tool) overlay.use(null);
+  if (event.key === " " ? isPressing(event) : isTyping(event)) return;
+  const act = event.key === " " ? () => freeze.toggle() : KEYS[event.key.toLowerCase()] ?? KEYS[event.key];
+  if (!act || event.repeat) return;
+  event.preventDefault();
+  act();
+});
+
+freeze.on(showFreeze);
+overlay.on(showMeasures);
+events.on("connection", showFreeze);
+showFreeze();
+showMeasures();

@@ -1,0 +1,248 @@
+/** Draws what is measured over the image, and lets its points be dragged. */
+
+import { element, events } from "../events.js";
+import { onImage } from "../image.js";
+import { Distance, Ellipse, Note } from "./measures.js";
+import { plane } from "./plane.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+const COLOURS = ["#ffd166", "#6fd08c", "#ff9f68", "#8fb8ff", "#f28fd0"];
+const KINDS = { distance: Distance, ellipse: Ellipse, note: Note };
+/** CSS pixels by which an arrow key moves a point. */
+const NUDGE = 1;
+
+const place = await element("ultrasound");
+const sheet = document.createElementNS(SVG, "svg");
+sheet.classList.add("us-measures");
+sheet.setAttribute("aria-label", "Measurements");
+place.append(sheet);
+
+const measures = [];
+const handlers = [];
+let tool = null;
+let drag = null;
+let colours = 0;
+let isMeasurable = true;
+
+function draw() {
+  const map = isMeasurable ? plane() : null;
+  const focused = document.activeElement?.dataset?.point;
+  sheet.replaceChildren();
+  if (map) for (const [number, measure] of measures.entries()) drawOne(measure, number, map);
+  if (focused) sheet.querySelector(`[data-point="${focused}"]`)?.focus();
+  for (const handle of handlers) handle();
+}
+
+function add(kind, attributes, parent = sheet) {
+  const made = document.createElementNS(SVG, kind);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  parent.append(made);
+  return made;
+}
+
+function drawOne(measure, number, map) {
+  const places = measure.points.map((point) => map.toScreen(point));
+  const group = add("g", { stroke: measure.colour, fill: "none", "stroke-width": 1.6 });
+  const [[x, y]] = places;
+  if (measure instanceof Distance) {
+    add("line", { x1: x, y1: y, x2: places[1][0], y2: places[1][1], "stroke-dasharray": "5 4" }, group);
+  } else if (measure instanceof Ellipse) {
+    add("path", { d: outline(measure, map) }, group);
+  }
+  for (const [index, at] of places.entries()) drawPoint(measure, number, index, at, group);
+  if (measure instanceof Note) write(measure.words, x + 8, y + 5, measure.colour, group);
+  else write(`${number + 1}`, places[1][0] + 9, places[1][1] - 7, measure.colour, group);
+}
+
+function outline(ellipse, map) {
+  const [x, y] = ellipse.centre;
+  const [a, b] = ellipse.halves;
+  const c = Math.cos(ellipse.angle);
+  const s = Math.sin(ellipse.angle);
+  const points = Array.from({ length: 72 }, (_, i) => {
+    const u = a * Math.cos((i * Math.PI) / 36);
+    const v = b * Math.sin((i * Math.PI) / 36);
+    return map.toScreen([x + c * u - s * v, y + s * u + c * v]).map((n) => n.toFixed(2)).join(",");
+  });
+  return `M${points.join("L")}Z`;
+}
+
+function drawPoint(measure, number, index, [x, y], group) {
+  add("path", { d: `M${x - 6},${y}h12M${x},${y - 6}v12` }, group);
+  const handle = add("circle", { cx: x, cy: y, r: 11, class: "us-handle", tabindex: 0 }, group);
+  handle.dataset.point = `${number} ${index}`;
+  handle.setAttribute("role", "button");
+  handle.setAttribute("aria-label", `Point ${index + 1} of ${number + 1}: ${measure.text}`);
+  const title = document.createElementNS(SVG, "title");
+  title.textContent = "Drag, or move with the arrow keys; Delete removes it";
+  handle.append(title);
+}
+
+function write(text, x, y, colour, group) {
+  const label = { x, y, fill: colour, stroke: "#000", "stroke-width": 3, "paint-order": "stroke" };
+  add("text", label, group).textContent = text;
+}
+
+function at(event) {
+  const box = place.getBoundingClientRect();
+  return [event.clientX - box.left, event.clientY - box.top];
+}
+
+function pointOf(target) {
+  const [number, index] = target.dataset.point.split(" ").map(Number);
+  return { measure: measures[number], index };
+}
+
+sheet.addEventListener("pointerdown", (event) => {
+  const map = plane();
+  if (event.button !== 0 || !map) return;
+  if (tool) {
+    const point = map.toPlane(at(event));
+    const measure = Object.assign(new KINDS[tool](point), { colour: COLOURS[colours % COLOURS.length] });
+    colours += 1;
+    if (tool === "note") {
+      event.preventDefault();
+      askWords(measure);
+      overlay.use(null);
+      event.stopPropagation();
+      return;
+    }
+    measures.push(measure);
+    drag = { measure, index: 1, from: point };
+  } else if (event.target.dataset?.point) {
+    const taken = pointOf(event.target);
+    event.target.focus();
+    drag = { ...taken, from: taken.measure.points[taken.index] };
+  } else return;
+  event.stopPropagation();
+  event.preventDefault();
+  const grip = map.toScreen(drag.from);
+  const [x, y] = at(event);
+  drag.offset = tool ? [0, 0] : [grip[0] - x, grip[1] - y];
+  sheet.setPointerCapture(event.pointerId);
+  draw();
+});
+
+sheet.addEventListener("pointermove", (event) => {
+  if (!drag) return;
+  const [x, y] = at(event);
+  drag.measure.move(drag.index, plane().toPlane([x + drag.offset[0], y + drag.offset[1]]));
+  draw();
+});
+
+for (const name of ["pointerup", "pointercancel"]) {
+  sheet.addEventListener(name, () => {
+    if (!drag) return;
+    if (drag.measure.isTooSmall) remove(drag.measure);
+    else if (tool) overlay.use(null);
+    drag = null;
+    draw();
+  });
+}
+
+const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+sheet.addEventListener("keydown", (event) => {
+  if (!event.target.dataset?.point) return;
+  const { measure, index } = pointOf(event.target);
+  if (event.key === "Delete" || event.key === "Backspace") remove(measure);
+  else if (event.key in STEPS) {
+    const map = plane();
+    const [x, y] = map.toScreen(measure.points[index]);
+    const [dx, dy] = STEPS[event.key];
+    measure.move(index, map.toPlane([x + NUDGE * dx, y + NUDGE * dy]));
+  } else return;
+  event.preventDefault();
+  event.stopPropagation();
+  draw();
+});
+
+sheet.addEventListener("dblclick", (event) => {
+  const found = event.target.dataset?.point && pointOf(event.target).measure;
+  if (found instanceof Note) askWords(found);
+});
+
+/** Let the person write the words of a note where it is. */
+function askWords(note) {
+  const entry = document.createElement("input");
+  Object.assign(entry, { className: "us-words", value: note.words, maxLength: 60 });
+  entry.setAttribute("aria-label", "Text on the image; Enter ends it");
+  const [x, y] = plane().toScreen(note.points[0]);
+  Object.assign(entry.style, { left: `${x}px`, top: `${y - 14}px` });
+  place.append(entry);
+  entry.focus();
+  let isOver = false;
+  const end = (isKept) => {
+    if (isOver) return;
+    isOver = true;
+    if (isKept) note.words = entry.value.trim();
+    entry.remove();
+    if (note.isTooSmall) remove(note);
+    else if (!measures.includes(note)) measures.push(note);
+    draw();
+  };
+  entry.addEventListener("pointerdown", (event) => event.stopPropagation());
+  entry.addEventListener("keydown", (event) => {
+    if (event.key === "Enter") end(true);
+    if (event.key === "Escape") end(false);
+    event.stopPropagation();
+  });
+  entry.addEventListener("blur", () => end(true));
+}
+
+function remove(measure) {
+  const index = measures.indexOf(measure);
+  if (index >= 0) measures.splice(index, 1);
+}
+
+export const overlay = {
+  sheet,
+
+  /** What there is, in the order in which it was made; each has `text`, `points` and `colour`. */
+  get measures() {
+    return measures;
+  },
+
+  /** "distance", "ellipse", "note", or null. */
+  get tool() {
+    return tool;
+  },
+
+  /** Whether the image that is shown can be measured. */
+  get isMeasurable() {
+    return isMeasurable;
+  },
+
+  /** Have `handler()` called when something of it has changed. */
+  on(handler) {
+    handlers.push(handler);
+  },
+
+  /** Take a tool in hand, for one measurement; the same again puts it away. */
+  use(wanted) {
+    tool = wanted === tool || !isMeasurable ? null : wanted;
+    sheet.classList.toggle("us-measuring", tool !== null);
+    events.tell("image-tool", tool);
+    draw();
+  },
+
+  remove(measure) {
+    remove(measure);
+    draw();
+  },
+
+  /** Remove everything. */
+  clear() {
+    measures.length = 0;
+    draw();
+  },
+};
+
+new ResizeObserver(draw).observe(place);
+events.on("image-geometry", draw);
+onImage(({ kind }) => {
+  // The annotated picture has borders, so its pixels are elsewhere.
+  const can = kind !== "annotated";
+  if (can === isMeasurable) return;
+  isMeasurable = can;
+  overlay.use(null);
+});

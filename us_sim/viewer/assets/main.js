@@ -1,0 +1,11 @@
+/** Starts the modules of the page. */
+
+import "./image.js";
+import "./header.js";
+import "./strips.js";
+import "./image_tools/image_tools.js";
+import "./hand/panel.js";
+import "./hand/keys.js";
+import "./hand/image_drag.js";
+import "./scene/scene.js";
+import "./hand/scene_drag.js";

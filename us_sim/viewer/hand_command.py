@@ -1,0 +1,136 @@
+"""What a page asks of the hand that moves the probe.
+
+>>> from us_sim.tracking.virtual_hand.rest_surface import RestSurface
+>>> from us_sim.tracking.virtual_hand.stance import Stance
+>>> from us_sim.viewer.hand_command import HandCommand
+>>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
+>>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
+>>> asked.press, asked.rotation
+(0.004, 0.1)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from us_sim.errors import MessageError
+from us_sim.tracking.virtual_hand.rest_surface import RestSurface
+from us_sim.tracking.virtual_hand.stance import Stance
+
+__all__ = ["HOME_PRESS", "LIFTED", "HandCommand"]
+
+HOME_PRESS = 1e-3
+"""m: where the probe begins it touches, so that there is an image."""
+LIFTED = -0.01
+"""m."""
+
+_FARTHEST, _FULL = 10.0, 2.0 * math.pi
+_TO = {"point": 3, "x": 1, "y": 1, "press": 1, "rotation": 1, "fan": 1, "rock": 1}
+_BY = {"slide": 2, "press": 1, "rotation": 1, "fan": 1, "rock": 1}
+_ANGLES = ("rotation", "fan", "rock")
+_SINGLE = ("press", *_ANGLES)
+_PLACES = ("home", "lift", "upright")
+_LONGEST_SOURCE, _LAST = 40, 2**53
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """One wish, as absolute values, changes, or a place that has a name."""
+
+    source: str  # of which page
+    sequence: int  # the page's number of the wish
+    to: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # m and rad, by _TO
+    by: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # m and rad, by _BY
+    go: str | None = None  # home: begin anew; lift: off the skin; upright: no angles
+
+    @classmethod
+    def read(cls, value: Any) -> HandCommand:
+        """The wish in what a page sent, decoded from JSON.
+
+        Raises:
+            MessageError: it is none, with what is wrong.
+        """
+        if not isinstance(value, dict):
+            raise MessageError(f"a command to the hand is an object, not {_shown(value)}")
+        unknown = value.keys() - {"source", "sequence", "to", "by", "go"}
+        if unknown:
+            raise MessageError(f"a command to the hand has no {_shown(min(unknown))}")
+        source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
+        if not isinstance(source, str) or not 0 < len(source) <= _LONGEST_SOURCE:
+            raise MessageError(
+                f"the hand's source is a text of 1 to {_LONGEST_SOURCE} characters, not "
+                f"{_shown(source)}"
+            )
+        if type(sequence) is not int or not 0 <= sequence <= _LAST:
+            raise MessageError(f"the hand's sequence is a count, not {_shown(sequence)}")
+        if go is not None and go not in _PLACES:
+            raise MessageError(f"the hand goes to {', '.join(_PLACES)}, not to {_shown(go)}")
+        to, by = _numbers(value, "to", _TO), _numbers(value, "by", _BY)
+        return cls(source, sequence, to, by, go)
+
+    def stance(self, goal: Stance, surface: RestSurface) -> Stance:
+        """The stance that is wanted now, within what a hand can do.
+
+        Args:
+            goal: what was wanted before.
+            surface: that the probe stands on.
+        """
+        if self.go == "home":
+            goal = Stance.home(surface, HOME_PRESS)
+        elif self.go == "lift":
+            goal = replace(goal, press=LIFTED)
+        elif self.go == "upright":
+            goal = replace(goal, rotation=0.0, fan=0.0, rock=0.0)
+        goal = _with(goal, {name: n[0] for name, n in self.to.items() if name in _SINGLE})
+        if "point" in self.to:
+            goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
+        if "x" in self.to or "y" in self.to:
+            x, y = (self.to.get(name, (goal.point[axis],))[0] for axis, name in enumerate("xy"))
+            goal = replace(goal, point=surface.above(x, y).point)
+        if "slide" in self.by:
+            goal = goal.slid(surface, *self.by["slide"])
+        changed = {n: getattr(goal, n) + self.by[n][0] for n in _SINGLE if n in self.by}
+        return _with(goal, changed).within_reach()
+
+
+def _with(stance: Stance, numbers: dict[str, Any]) -> Stance:
+    """Other values of the numbers by name."""
+    return replace(stance, **numbers)
+
+
+def _numbers(
+    value: dict[str, Any], key: str, sizes: dict[str, int]
+) -> dict[str, tuple[float, ...]]:
+    """The numbers of one part of a command, each as many as there must be."""
+    given = value.get(key, {})
+    if not isinstance(given, dict):
+        raise MessageError(f"the hand's {key} is an object, not {_shown(given)}")
+    numbers = {}
+    for name, listed in given.items():
+        if name not in sizes:
+            raise MessageError(f"the hand cannot move {_shown(name)}: {', '.join(sizes)}")
+        values = listed if isinstance(listed, list) else [listed]
+        proper = all(type(number) in (int, float) and math.isfinite(number) for number in values)
+        if not proper or len(values) != sizes[name]:
+            raise MessageError(
+                f"the hand's {name} is {sizes[name]} finite number{'s' * (sizes[name] > 1)}, not "
+                f"{_shown(listed)}"
+            )
+        limit, unit = (_FULL, "rad") if name in _ANGLES else (_FARTHEST, "m")
+        if max(map(abs, values)) > limit:
+            raise MessageError(
+                f"the hand's {name} is {_shown(listed)}, more than {limit:.3g} {unit}"
+            )
+        numbers[name] = tuple(map(float, values))
+    return numbers
+
+
+def _shown(value: Any) -> str:
+    """A value in a sentence, not too long."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]} …"

@@ -1,0 +1,46 @@
+"""The header's words: which scene runs, and what is being done with it."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from us_sim.viewer.session import SessionState
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["build_headline", "words_of"]
+
+_LOOK_S = 0.5
+
+
+def words_of(state: SessionState) -> tuple[str, str]:
+    """The scene's name, and what is to be known of it; the second is often nothing.
+
+    >>> words_of(SessionState(is_there=True, scene="upper_arm", state="running"))
+    ('upper arm', '')
+    >>> words_of(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
+    ('upper arm', 'starting, 40 %')
+    """
+    name = state.scene.replace("_", " ")
+    if state.is_busy:
+        done = "" if state.state.endswith("%") else f", {100 * state.fraction:.0f} %"
+        return name, f"{state.state}{done}"
+    parts = [state.problem]
+    parts += [f"recording {state.record}"] if state.record else []
+    parts += [f"playing {state.replay}"] if state.replay else []
+    return name, " · ".join(filter(None, parts))
+
+
+def build_headline(simulator: Simulator) -> None:
+    """Make it inside the header."""
+    board = simulator.session
+    name = ui.label().classes("us-scene-name").props('id="us-scene"')
+    words = ui.label().classes("us-quiet us-headline").props('role="status"')
+
+    def look() -> None:
+        scene, told = words_of(board.state)
+        name.set_text(scene)
+        words.set_text(told)
+
+    board.watch()
+    ui.context.client.on_delete(board.unwatch)
+    ui.timer(_LOOK_S, look)

@@ -1,0 +1,95 @@
+"""The bar above the image: what it shows, and what runs over time below it."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from nicegui import ui
+
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["build_modes"]
+
+NODE, OVERLAY = "slice_interpolator", "overlay"
+MODES = {
+    "b-mode": ("B-mode", "The image as it is"),
+    "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
+    "strain": ("Strain", "How much the tissue is shortened along the beams since rest, exactly"),
+    "strain_estimate": ("Elastography", "Strain between two images, as a scanner estimates it"),
+    "velocity": ("Colour", "Velocity of blood along the beams, as colour Doppler shows it"),
+}
+"""Label and tooltip by value of the parameter ``overlay``, and the plain image before them."""
+STRIPS = {
+    "m_mode": ("M-mode", "Echoes along one line of the image over time"),
+    "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
+}
+_LOOK_S = 0.3
+
+
+class _Modes:
+    """The bar of one page."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._mode = "b-mode"
+        self._buttons: dict[str, ui.button] = {}
+        self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
+        with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"'):
+            for mode, (label, tooltip) in MODES.items():
+                self._buttons[mode] = _button(label, tooltip, lambda mode=mode: self._choose(mode))
+            ui.element("span").classes("us-gap")
+            for kind, (label, tooltip) in STRIPS.items():
+                self._buttons[kind] = _button(label, tooltip, lambda kind=kind: self._toggle(kind))
+        self._mark()
+        board = simulator.nodes
+        board.watch(NODE)
+        ui.context.client.on_delete(lambda: board.unwatch(NODE))
+        ui.timer(_LOOK_S, self._look)
+
+    async def _choose(self, mode: str) -> None:
+        if mode != "b-mode":
+            asked = self._simulator.nodes.set(NODE, OVERLAY, mode)
+            refused = await asyncio.wrap_future(asked)
+            if refused:
+                ui.notify(refused, type="warning", multi_line=True)
+                return
+        self._show(mode)
+
+    def _show(self, mode: str) -> None:
+        self._mode = mode
+        kind = "b-mode" if mode == "b-mode" else "annotated"
+        ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => m.setMode('{kind}'))")
+        self._mark()
+
+    def _toggle(self, kind: str) -> None:
+        self._strips[kind] = on = not self._strips[kind]
+        text = "true" if on else "false"
+        ui.run_javascript(
+            f"import('/us_sim/assets/strips.js').then(m => m.showStrip('{kind}', {text}))"
+        )
+        self._mark()
+
+    def _look(self) -> None:
+        """Follow a change that was made elsewhere."""
+        parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
+        known = parameter.raw if parameter else None
+        if self._mode != "b-mode" and known in MODES and known != self._mode:
+            self._mode = known
+            self._mark()
+
+    def _mark(self) -> None:
+        for name, button in self._buttons.items():
+            pressed = self._strips.get(name, name == self._mode)
+            button.props(f'aria-pressed="{str(pressed).lower()}"')
+
+
+def _button(label: str, tooltip: str, on_click: Any) -> ui.button:
+    with ui.button(label, color=None, on_click=on_click).props("flat dense no-caps") as button:
+        ui.tooltip(tooltip)
+    return button
+
+
+def build_modes(simulator: Simulator) -> None:
+    """Make the bar inside the page."""
+    _Modes(simulator)

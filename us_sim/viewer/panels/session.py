@@ -1,0 +1,187 @@
+"""Recording the session, and replaying what was recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from datetime import datetime
+from typing import Any
+
+from nicegui import ui
+
+from us_sim.viewer.panels.while_shown import WhileShown
+from us_sim.viewer.session import NOT_THERE, SessionState
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["build"]
+
+EVERY_S = 0.3
+"""How often it is looked whether something has changed."""
+SETTLE_S = 1.5
+"""For what a person asked for to be so; until then controls stay as they were set."""
+RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
+KINDS = {"path": "Probe's path", "recording": "All as recorded"}
+
+
+class _Session:
+    """The panel of one page."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._board = simulator.session
+        self._bags: dict[str, str] = {}
+        self._is_dragging = False
+        self._touched = 0.0  # s, monotonic: when a person last asked for something
+        self._is_following = False  # while controls are set to what is so
+        with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
+            self._absent = ui.label(NOT_THERE).classes("us-quiet")
+            with ui.column().classes("us-session") as self._all:
+                self._problem = ui.label().classes("us-session-problem").props('role="alert"')
+                self._recording()
+                ui.separator()
+                self._replaying()
+
+    def _recording(self) -> None:
+        ui.label("Record").classes("us-cases-title")
+        self._file = (
+            ui.input("file", value=_proposed()).props("dense outlined").classes("us-wide-field")
+        )
+        self._file.tooltip("MCAP file to write, in the folder that us-sim runs in")
+        with ui.row().classes("us-session-row"):
+            self._record = ui.button("Record", icon="fiber_manual_record", on_click=self._begin)
+            self._record.props("no-caps dense").tooltip("Record all topics to the file")
+            self._stop = ui.button("Stop", icon="stop", on_click=self._end)
+            self._stop.props("no-caps dense").tooltip("End the recording; it is complete then")
+            self._recorded = ui.label().classes("us-quiet").props('role="status"')
+
+    def _replaying(self) -> None:
+        ui.label("Replay").classes("us-cases-title")
+        self._bag = ui.select({}, label="recording or path", with_input=True)
+        self._bag.props("dense outlined").classes("us-wide-field")
+        self._bag.tooltip("Bags in the folder that us-sim runs in, and those that came with it")
+        self._kind = ui.toggle(KINDS, value="path").props("no-caps dense")
+        self._kind.tooltip(
+            "The probe's path moves the probe of the simulation; all as recorded takes the "
+            "simulation's place until the replay ends"
+        )
+        with ui.row().classes("us-session-row"):
+            self._play = ui.button(icon="play_arrow", on_click=self._play_or_pause)
+            self._play.props('dense aria-label="Play or pause"').tooltip("Play, pause, go on")
+            self._close = ui.button(icon="stop", on_click=lambda: self._ask(replay=""))
+            self._close.props('dense aria-label="End replay"').tooltip("End the replay")
+            set_rate, set_loop = map(self._by_person, (self._set_rate, self._set_loop))
+            self._rate = ui.select(RATES, value=1.0, label="speed", on_change=set_rate)
+            self._rate.props("dense outlined").tooltip("Speed factor").classes("us-session-rate")
+            self._loop = ui.switch("loop", value=False, on_change=set_loop)
+            self._loop.tooltip("Begin again at the end")
+        self._time = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0)
+        self._time.props('aria-label="Time in the replay, s"').tooltip("Time in the replay, s")
+        self._time.on("pan", self._drag)
+        self._time.on("change", self._seek)
+        self._where = ui.label().classes("us-quiet").props('role="status"')
+
+    def _refresh(self) -> None:
+        board, state = self._board, self._board.state
+        self._absent.set_visibility(not state.is_there)
+        self._all.set_visibility(state.is_there)
+        self._problem.set_text(state.problem)
+        self._problem.set_visibility(bool(state.problem))
+        self._file.set_enabled(not state.record)
+        self._record.set_enabled(not state.record and state.replay_as == "path")
+        self._stop.set_enabled(bool(state.record))
+        self._recorded.set_text(f"recording to {state.record}" if state.record else "")
+        if dict(board.bags) != self._bags:
+            self._bags = dict(board.bags)
+            self._bag.set_options({file: name for name, file in self._bags.items()})
+        self._follow(state)
+
+    def _follow(self, state: SessionState) -> None:
+        """Show the replay as it is, also if it was changed elsewhere."""
+        plays = bool(state.replay)
+        is_running = plays and state.replay_state == "playing"
+        self._play.props(f"icon={'pause' if is_running else 'play_arrow'}")
+        for control in (self._close, self._time):
+            control.set_enabled(plays)
+        self._kind.set_enabled(not plays)
+        if state.duration > 0.0:
+            self._time.props(f"max={state.duration:.2f}")
+        if not self._is_dragging:
+            self._time.set_value(min(state.position, state.duration) if plays else 0.0)
+        told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}"
+        self._where.set_text(told if plays else "nothing is replayed")
+        if time.monotonic() - self._touched < SETTLE_S:
+            return
+        self._is_following = True
+        try:
+            if plays:
+                if state.replay in self._bag.options and self._bag.value != state.replay:
+                    self._bag.set_value(state.replay)
+                self._kind.set_value(state.replay_as)
+            self._loop.set_value(state.loop)
+            if state.rate in RATES:
+                self._rate.set_value(state.rate)
+        finally:
+            self._is_following = False
+
+    async def _begin(self) -> None:
+        if await self._ask(record=self._file.value.strip()):
+            self._file.set_value(_proposed())
+
+    async def _end(self) -> None:
+        file = self._board.state.record
+        if await self._ask(record=""):
+            ui.notify(f"recorded to {file}", type="positive")
+            self._file.set_value(_proposed())
+
+    async def _play_or_pause(self) -> None:
+        state = self._board.state
+        chosen = self._bag.value
+        if state.replay and chosen in (state.replay, None):
+            if state.replay_state == "finished":
+                await self._ask(replay_time=0.0, replay_paused=False)
+            else:
+                await self._ask(replay_paused=state.replay_state == "playing")
+        elif not chosen:
+            ui.notify("choose a recording or a path first", type="info")
+        else:
+            await self._ask(
+                replay=chosen,
+                replay_as=self._kind.value,
+                replay_paused=False,
+                replay_loop=self._loop.value,
+                replay_rate=float(self._rate.value),
+            )
+
+    def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
+        """What does that where a person has changed a control, and nothing while it follows."""
+        return lambda: None if self._is_following else change()
+
+    async def _set_rate(self) -> None:
+        await self._ask(replay_rate=float(self._rate.value))
+
+    async def _set_loop(self) -> None:
+        await self._ask(replay_loop=bool(self._loop.value))
+
+    def _drag(self, event: Any) -> None:
+        self._is_dragging = event.args == "start"
+
+    async def _seek(self, event: Any) -> None:
+        self._is_dragging = False
+        await self._ask(replay_time=float(event.args))
+
+    async def _ask(self, **values: object) -> bool:
+        """Ask for it; whether that was taken."""
+        self._touched = time.monotonic()
+        refused = await asyncio.wrap_future(self._board.ask(**values))
+        if refused:
+            ui.notify(refused, type="warning", multi_line=True)
+        return not refused
+
+
+def _proposed() -> str:
+    return f"session_{datetime.now():%Y%m%d_%H%M%S}.mcap"
+
+
+def build(simulator: Simulator) -> None:
+    """Make the panel."""
+    _Session(simulator)

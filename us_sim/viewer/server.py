@@ -1,0 +1,129 @@
+"""The web server of the viewer, in a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import socket
+import threading
+from typing import Any
+
+from us_sim.cache import cache_folder
+from us_sim.errors import UsSimError
+from us_sim.viewer.access import Access, is_loopback
+from us_sim.viewer.simulator import Simulator
+
+__all__ = ["WebServer"]
+
+_STARTED_S = 30.0
+_STOPPED_S = 3.0
+_QUEUE = 64
+
+
+class WebServer:
+    """Serves the page until it is closed.
+
+    Args:
+        simulator: what the page shows.
+        host: address to listen at; any but this computer's own needs the token in the address.
+        port: TCP; 0 is any that is free.
+
+    Raises:
+        UsSimError: NiceGUI is not installed, or the address cannot be listened at.
+    """
+
+    def __init__(self, simulator: Simulator, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self._uvicorn, application = _made(simulator)
+        self._socket = _listening(host, port)
+        self.host, self.port = host, int(self._socket.getsockname()[1])
+        self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
+        config = self._uvicorn.Config(
+            Access(application, self.token),
+            log_level="warning",
+            ws_per_message_deflate=False,  # it costs more time than this computer's wire
+            ws_max_size=2**20,
+            timeout_graceful_shutdown=1,
+        )
+        self._server = self._uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="web server", daemon=True)
+        self._thread.start()
+        self._await_start()
+
+    @property
+    def address(self) -> str:
+        """That a person opens."""
+        host = self.host
+        if host in ("0.0.0.0", "::", ""):
+            host = socket.gethostname()
+        shown = f"[{host}]" if ":" in host else host
+        return f"http://{shown}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def close(self) -> None:
+        """Serve no longer."""
+        self._server.should_exit = True
+        self._thread.join(_STOPPED_S)
+        self._socket.close()
+
+    def _run(self) -> None:
+        self._server.run(sockets=[self._socket])
+
+    def _await_start(self) -> None:
+        deadline = threading.Event()
+        for _ in range(int(_STARTED_S / 0.02)):
+            if self._server.started:
+                return
+            if not self._thread.is_alive():
+                break
+            deadline.wait(0.02)
+        raise UsSimError(f"the web server at {self.host}:{self.port} did not start")
+
+
+def _made(simulator: Simulator) -> tuple[Any, Any]:
+    """The server's library, and the application."""
+    # NiceGUI would make a folder of its own wherever the program was started.
+    os.environ.setdefault("NICEGUI_STORAGE_PATH", str(cache_folder() / "viewer"))
+    try:
+        import uvicorn
+
+        from us_sim.viewer.application import application
+    except ImportError as error:
+        raise UsSimError(
+            f"the viewer needs {error.name}: install it with `pip install 'us_sim[viewer]'`"
+        ) from error
+    return uvicorn, application(simulator)
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket that listens there.
+
+    Raises:
+        UsSimError: it cannot.
+    """
+    try:
+        family, kind, protocol, _, where = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listening = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise UsSimError(
+            f"--host {host}: {error.strerror or error}; give an address of this computer"
+        ) from error
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(where)
+        listening.listen(_QUEUE)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            listening.close()
+        if error.errno == errno.EADDRINUSE:
+            raise UsSimError(
+                f"port {port} of {host} is taken: choose another with --port, or 0 for any that "
+                f"is free"
+            ) from error
+        raise UsSimError(
+            f"{host}:{port} cannot be listened at: {error.strerror}; choose another --host or "
+            f"--port"
+        ) from error
+    return listening
