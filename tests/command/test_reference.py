@@ -43,6 +43,9 @@ def test_every_parameter_of_every_node_is_on_it():
         told |= keys_in(sections["imaging"]) | keys_in(sections["probe.geometry.linear"])
         for name in SOLVERS:
             told |= {f"{name}.{key}" for key in keys_in(sections[f"tissue.settings.{name}"])}
+        for name in ("one_euro", "kalman"):
+            told |= {f"{name}.{key}" for key in keys_in(sections[f"tracker.filter.{name}"])}
+        told |= {f"membrane.{key}" for key in keys_in(sections["skin"])}
         material = keys_in(sections["tissue.materials.NAME"])
         told |= {f"materials.{label}.{key}" for label in scene.tissue.materials for key in material}
         for name in ("colour", "spectrum", "m_mode"):

@@ -1,4 +1,4 @@
-"""The command `us-sim bag`: what is in a recording, its attached files, and its repair."""
+"""The command `us-sim bag`: what is in a recording, its attached files, its repair, rerun."""
 
 from __future__ import annotations
 
@@ -30,6 +30,14 @@ def add_bag(commands: Any) -> None:
         "--out", type=Path, help="new folder or .mcap file (default: FILE_repaired beside it)"
     )
     repair.set_defaults(command=_repair)
+    rerun = bag_commands.add_parser(
+        "to-rerun", help="a session with its surfaces, forces and images as rerun shows them"
+    )
+    rerun.add_argument("file", type=Path, metavar="SESSION")
+    rerun.add_argument(
+        "--out", type=Path, metavar="FILE", help="file to write (default: SESSION.rrd beside it)"
+    )
+    rerun.set_defaults(command=_to_rerun)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -56,4 +64,16 @@ def _repair(args: argparse.Namespace) -> int:
     for fault in made.faults:
         print(fault)
     print(f"{made.message_count} messages are in {made.path}")
+    return 0
+
+
+def _to_rerun(args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
+    from us_sim.to_rerun.conversion import to_rerun
+
+    session: Path = args.file
+    file: Path = args.out or session.with_suffix(".rrd")
+    for sentence in to_rerun(session, file, late_progress(f"bag to-rerun {session.name}")):
+        print(sentence)
+    print(file)
     return 0

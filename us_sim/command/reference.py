@@ -160,6 +160,7 @@ def _node_list() -> str:
 def _nodes() -> Iterator[Section]:
     """The parameters of each node."""
     from us_sim.nodes.settings import NODES, SceneNodeSettings
+    from us_sim.skin.settings import MembraneSettings
     from us_sim.slicing.formation.imaging import Imaging
 
     common = "Every node that works on a scene"
@@ -190,6 +191,17 @@ def _nodes() -> Iterator[Section]:
                 "[spectrum](#spectrum), and `flow.STRUCTURE.KEY`, such as `flow.vein.heart_rate`, "
                 "for those of [structures.NAME.flow](#structuresnameflow), while running. Their "
                 "defaults are the scene's."
+            )
+        if node == "probe_tracker":
+            text.append(
+                "`FILTER.KEY` for every key of every filter, such as `one_euro.minimum_cutoff`, "
+                "see [tracker.filter](#trackerfilter), while running. Their defaults, and that of "
+                "`filter`, are the scene's."
+            )
+        if node == "skin_deformer":
+            text.append(
+                f"`membrane.KEY` for {_names(rules_of(MembraneSettings))} of [skin](#skin), while "
+                f"running. Their defaults are the scene's."
             )
         if node == "tissue_deformer":
             text.append(
