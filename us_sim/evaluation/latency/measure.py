@@ -7,16 +7,15 @@ several sizes; recorded or not, looked at or not, and with every core kept busy 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-from us_sim.evaluation.latency.cases import Case, cases
+from us_sim.evaluation.latency.cases import cases
 from us_sim.evaluation.latency.points import Point
 from us_sim.evaluation.latency.report import table, write_report
 from us_sim.evaluation.latency.run_case import run_case
 from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures, words_of
-from us_sim.progress import Progress
+from us_sim.evaluation.row import failures
+from us_sim.evaluation.timed_cases import timed_cases
 from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
 from us_sim.scene.reading import load_scene
@@ -30,25 +29,12 @@ def evaluate_latency(out: Path, quick: bool) -> int:
     keep_on_this_host(network=False)
     planned = cases(quick)
     prepare_volume(load_scene("upper_arm"))
-    points: list[Point] = []
-    done = 0.0
-    with Progress("latency", sum(case.seconds for case in planned), "s") as progress:
-        for case in planned:
-
-            def tell(seconds: float, words: str, case: Case = case, before: float = done) -> None:
-                progress.update(before + min(seconds, case.seconds), f"{case}: {words}")
-
-            points.append(_point(case, tell))
-            done += case.seconds
-            progress.update(done)
+    points = timed_cases(
+        "latency",
+        {case: case.seconds for case in planned},
+        run_case,
+        lambda case, words: Point(case, failure=words),
+    )
     folder.write_rows("latency", points)
     write_report(folder, points)
     return folder.finish(table(points), failures(points))
-
-
-def _point(case: Case, tell: Callable[[float, str], None]) -> Point:
-    try:
-        return run_case(case, tell)
-    # Whatever breaks in one case must not take the others' results along.
-    except Exception as error:
-        return Point(case, failure=words_of(error))

@@ -21,6 +21,7 @@ from us_sim.evaluation.latency.points import Point
 from us_sim.evaluation.latency.scene import write_scene
 from us_sim.evaluation.latency.usage import UsageOverTime, usage_of
 from us_sim.evaluation.own_process import start_module
+from us_sim.evaluation.timed_cases import Tell
 from us_sim.recording.reader import read_bag
 from us_sim.run.graph import NodeProcess, ProcessGroup, player_settings, simulation_nodes
 from us_sim.run.lockstep import render
@@ -36,8 +37,6 @@ _START_S = 300.0  # the first run compiles
 _WARMING_S = 2.0  # of images that do not count
 _SETTLE_S = 1.5  # for what is under way to arrive, and to be recorded
 _SAMPLE_S = 0.5
-
-Tell = Callable[[float, str], None]  # s that are done, and what is done now
 
 
 def run_case(case: Case, tell: Tell) -> Point:
