@@ -18,12 +18,12 @@ PACKAGE = Path(__file__).resolve().parents[1] / "us_sim"
 PICTURE = Path(__file__).with_suffix(".png")
 
 LAYERS = (
-    ("compose and measure", (("command",), ("run", "evaluation"), ("demo", ""))),
+    ("compose and measure", (("command",), ("run", "evaluation", "to_rerun"), ("demo", "", ""))),
     ("nodes", (("nodes",),)),
     (
         "the domain, without ROS",
         (
-            ("scene",),
+            ("scene", "viewer"),
             ("skin", "tissue", "slicing", "tracking"),
             ("", "", "volume", "recording"),
             ("geometry",),

@@ -19,6 +19,7 @@ DOMAIN = [
     "skin",
     "slicing",
     "tracking",
+    "viewer",
     "volume",
     "recording",
     "geometry",
@@ -28,7 +29,7 @@ DOMAIN = [
     "progress",
     "share",
 ]
-UPPER = ("nodes", "run", "demo", "command", "evaluation")
+UPPER = ("nodes", "run", "demo", "command", "evaluation", "to_rerun")
 MESSAGES = [
     "builtin_interfaces",
     "diagnostic_msgs",
@@ -93,10 +94,10 @@ def arrows(rooms: list[str] | tuple[str, ...], forbidden: list[str] | tuple[str,
     ("rooms", "forbidden"),
     [
         (DOMAIN, ["rclpy", *MESSAGES, *UPPER, "standalone"]),
-        (["nodes"], ["run", "demo", "command", "evaluation"]),
-        (["run"], ["evaluation", "command"]),
+        (["nodes"], ["run", "demo", "command", "evaluation", "to_rerun"]),
+        (["run"], ["evaluation", "command", "to_rerun"]),
         (["standalone"], [*DOMAIN, *UPPER, "cache"]),
-        (["run", "demo", "command", "evaluation"], ["standalone"]),
+        (["run", "demo", "command", "evaluation", "to_rerun"], ["standalone"]),
         (
             ["settings"],
             [room for room in DOMAIN if room not in ("settings", "errors")] + ["numpy", "scipy"],
