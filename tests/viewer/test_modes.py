@@ -70,13 +70,13 @@ def test_a_mode_is_asked_for_shown_and_left(
     page.get_by_role("button", name="Strain", exact=True).click()
     page.wait_for_function(f"({image})()?.[1] === 0")
     assert asked == ["strain"]
-    assert not plain.is_watched
+    until(lambda: not plain.is_watched, "nobody watches the plain image any more")
     pressed = page.get_by_role("button", pressed=True)
     assert pressed.all_text_contents() == ["Strain"]
     page.get_by_role("button", name="B-mode").click()
     page.wait_for_function(f"({image})()?.[0] === 90")
     assert asked == ["strain"]  # nothing is asked of the node for the plain image
-    assert not annotated.is_watched
+    until(lambda: not annotated.is_watched, "nobody watches what was drawn over it any more")
 
 
 @pytest.mark.usefixtures("asked")
@@ -86,7 +86,7 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
     page.get_by_role("button", name="Colour").click()
     page.get_by_text("this scene has nothing for 'velocity'").wait_for()
     assert page.get_by_role("button", pressed=True).all_text_contents() == ["B-mode"]
-    assert not annotated.is_watched
+    until(lambda: not annotated.is_watched, "what was refused is not watched")
 
 
 @pytest.mark.usefixtures("asked")
