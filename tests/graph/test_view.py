@@ -230,10 +230,8 @@ def test_a_value_that_is_refused_goes_back_and_says_why(person: Person) -> None:
     field.fill("9000")
     field.press("Enter")
     until(lambda: re.search("400 mm|range|at most", control.inner_text()), "the reason is shown")
-    assert field.input_value() in (before, "9000")
+    until(lambda: field.input_value() == before, "the field shows what the node has")
     person.picture("refused")
-    field.fill(before)
-    field.press("Enter")
 
 
 def test_skin_is_hidden_and_shown(person: Person) -> None:
@@ -246,9 +244,8 @@ def test_skin_is_hidden_and_shown(person: Person) -> None:
     person.page.get_by_role("button", name="Layers").click()
     box = person.page.get_by_role("checkbox", name="Skin")
     box.uncheck()
-    time.sleep(0.5)
+    until(lambda: scene() != shown, "the scene is drawn without skin")
     person.picture("without_skin")
-    assert scene() != shown
     box.check()
     person.page.get_by_role("button", name="Layers").click()
 
@@ -280,7 +277,7 @@ def test_what_is_recorded_is_replayed(person: Person, folder: Path) -> None:
     )
 
 
-def test_another_scene_is_loaded_while_the_page_stays(person: Person, folder: Path) -> None:
+def test_another_scene_is_loaded_while_the_page_stays(person: Person) -> None:
     page = person.page
     person.tab("Cases")
     load = page.get_by_role("button", name="Load upper_arm_path", exact=True)
@@ -294,7 +291,6 @@ def test_another_scene_is_loaded_while_the_page_stays(person: Person, folder: Pa
     drawn = page.evaluate("usSim.images()")
     until(lambda: page.evaluate("usSim.images()") > drawn + 3, "images of the new scene", START_S)
     person.picture("loaded")
-    assert folder.exists()
 
 
 def test_it_fits_a_tablet_in_both_directions(person: Person) -> None:

@@ -55,7 +55,7 @@ class ViewerHand:
 
     It publishes only while a page watches and nobody else does: a driver or a player leads as long
     as it has a publisher, and the hand goes on from where that has left the probe. Poses come as
-    soon as a page asks, 60 times a second while the probe moves, 5 times while it rests.
+    soon as a page asks, `MOVING` times a second while the probe moves, `RESTING` while it rests.
 
     Args:
         node: that publishes.

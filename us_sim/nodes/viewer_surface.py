@@ -21,8 +21,6 @@ __all__ = ["ViewerSurface"]
 
 _PLANE = 0.1
 """m around the origin, of the plane where nothing has a surface."""
-_FACING_UP = 0.3
-"""Least cosine between -z and the normals of the tissue's upper side."""
 
 
 class ViewerSurface:
@@ -86,9 +84,5 @@ class ViewerSurface:
         tetrahedra: Any = self._tetrahedra
         if nodes is None or tetrahedra is None or tetrahedra.max(initial=-1) >= len(nodes):
             return
-        triangles = boundary_triangles(tetrahedra)
-        a, b, c = nodes[triangles.T]
-        across = np.cross(b - a, c - a)
-        facing = -across[:, 2] > _FACING_UP * np.linalg.norm(across, axis=1)
-        self._tissue = RestSurface(nodes, triangles[facing])
+        self._tissue = RestSurface.upper_side(nodes, boundary_triangles(tetrahedra))
         self._changed()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 from us_sim.errors import MeshError
 from us_sim.skin.surface import bent_surface, plane_surface
@@ -130,6 +131,42 @@ def test_the_closest_point_is_that_of_all_triangles_tried_one_by_one():
         distance = np.linalg.norm(surface.closest(point).point - point)
         assert distance <= least + 1e-12
         assert distance == pytest.approx(least, abs=3e-4)
+
+
+def cube(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and outward triangles of a cube of 2 cm about the origin, turned about y (rad)."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
+    hull = ConvexHull(corners)
+    a, b, c = (corners[hull.simplices[:, k]] for k in range(3))
+    inwards = np.einsum("tx,tx->t", np.cross(b - a, c - a), a) < 0  # about the origin
+    triangles = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return corners @ [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]], triangles
+
+
+def test_the_upper_side_of_a_cube_is_its_face_at_the_least_z():
+    surface = RestSurface.upper_side(*cube())
+    np.testing.assert_allclose(surface.lower, [-0.01, -0.01, -0.01])
+    np.testing.assert_allclose(surface.upper, [0.01, 0.01, -0.01])
+    foot = surface.closest(np.array([0.003, 0.004, 0.02]))  # nearer to the lower face
+    np.testing.assert_allclose(foot.point, [0.003, 0.004, -0.01])
+    np.testing.assert_allclose(foot.normal, [0, 0, -1])
+
+
+@pytest.mark.parametrize(("degrees", "is_upper"), [(15, False), (20, True)])
+def test_a_side_that_is_steeper_than_the_limit_is_not_of_the_upper_side(degrees, is_upper):
+    turn = math.radians(degrees)  # the side faces up by sin(turn): 0.26, and 0.34
+    surface = RestSurface.upper_side(*cube(turn))
+    of_the_top = 0.01 * (math.sin(turn) - math.cos(turn))
+    of_the_side = 0.01 * (math.cos(turn) - math.sin(turn))
+    assert surface.upper[2] == pytest.approx(of_the_side if is_upper else of_the_top)
+
+
+def test_what_faces_down_only_has_no_upper_side():
+    vertices, triangles = cube()
+    down = vertices[triangles][:, :, 2].min(axis=1) > 0
+    with pytest.raises(MeshError, match="no triangle"):
+        RestSurface.upper_side(vertices, triangles[down])
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def write_report(folder: ReportFolder, points: Sequence[Point]) -> None:
         "image that contains it has been drawn in the page, or has come. A page that takes gets "
         "everything that the opened page shows, image and meshes, and draws nothing. The browser "
         "is Chromium without a window and without a graphics card: it draws the 3D scene with the "
-        "same cores (SwiftShader), which is the worst that a laptop can have.",
+        "same cores (SwiftShader).",
         "Start is from the command to the first image in the page, opened from opening the page "
         "in the browser to its first image.",
         f"## Memory: {longest.case}",

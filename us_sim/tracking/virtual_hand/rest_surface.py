@@ -24,6 +24,8 @@ _STEP = 1e-3
 """m: a way over the surface is walked in steps of this, each along the tangent where it begins."""
 _TURNS, _NEAR = 30, 1e-9
 """How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
+_FACING_UP = 0.3
+"""Cosine between -z and the normals of a closed surface's upper side, which is more than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,24 @@ class RestSurface:
         """The square of z = 0 within ``half`` m around the origin, with the body at z > 0."""
         vertices = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
         return cls(np.insert(vertices, 2, 0.0, axis=1), np.array([[0, 2, 1], [0, 3, 2]]))
+
+    @classmethod
+    def upper_side(
+        cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
+    ) -> RestSurface:
+        """The part of a closed surface on which a probe can be put: what faces -z.
+
+        Args:
+            vertices: (N, 3) m, frame ``patient``.
+            triangles: (T, 3) indices into them, anticlockwise as seen from outside the body.
+
+        Raises:
+            MeshError: as the class itself; nothing of it faces -z.
+        """
+        a, b, c = (np.asarray(vertices, dtype=np.float64)[triangles[:, k]] for k in range(3))
+        across = np.cross(b - a, c - a)
+        faces_up = -across[:, 2] > _FACING_UP * np.linalg.norm(across, axis=1)
+        return cls(vertices, triangles[faces_up])
 
     def closest(self, point: NDArray[np.float64]) -> Foot:
         """The surface's closest point to one (3,) m."""
