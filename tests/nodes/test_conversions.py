@@ -23,6 +23,7 @@ from us_sim.nodes.conversions import (
     colour_image_message,
     image_message,
     line_from,
+    markers_stamp,
     mesh_from,
     mesh_message,
     nanoseconds_of,
@@ -250,6 +251,18 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
     # Not byte for byte: what fills the gaps between numbers is up to the middleware.
     assert len(serialized) == len(serialize_message(expected))
     assert deserialize_message(serialized, MarkerArray) == expected
+    assert markers_stamp(serialized) == (nanoseconds_of(STAMP) if given_ones else None)
+
+
+def test_an_array_of_markers_says_when_it_is_without_being_decoded():
+    marker = Marker()
+    marker.header.stamp = Time(sec=1_700_000_000, nanosec=999_999_999)
+    data = serialize_message(MarkerArray(markers=[marker, Marker()]))
+    assert markers_stamp(data) == 1_700_000_000_999_999_999
+    assert markers_stamp(serialize_message(MarkerArray())) is None
+    marker.header.stamp = Time(sec=1, nanosec=1_000_000_000)
+    with pytest.raises(StampError, match="no time"):
+        markers_stamp(serialize_message(MarkerArray(markers=[marker])))
 
 
 @quick

@@ -15,6 +15,7 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.skin.surface import bent_surface
 from us_sim.viewer.simulator import Simulator
@@ -28,7 +29,7 @@ class Holder(GuardedNode):
         self.health = Health(self, "test")
         self.post = Posted(self)
         self.simulator = Simulator()
-        self.hand = ViewerHand(self, self.post, self.simulator)
+        self.hand = ViewerHand(self, self.post, self.simulator, RestMesh(self))
 
 
 class Page:

@@ -28,6 +28,7 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
 from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
@@ -60,9 +61,11 @@ def graph(bench: Bench) -> SimpleNamespace:
     node.health = Health(node, "test")
     post = Posted(node)
     feeds: dict[str, Feed] = {}
-    for made in (SkinFeeds, TissueFeeds, ProbeFeeds):
+    rest = RestMesh(node)
+    for made in (SkinFeeds, ProbeFeeds):
         feeds |= {feed.kind: feed for feed in made(node, post, 30.0).feeds}
-    feeds["structures"] = StructuresFeed(node, post).feed
+    feeds |= {feed.kind: feed for feed in TissueFeeds(node, post, 30.0, rest).feeds}
+    feeds["structures"] = StructuresFeed(node, post, rest).feed
 
     def newest(kind: str, when: Callable[[Packet], bool] = lambda _: True) -> Packet:
         found: list[Packet] = []
@@ -179,6 +182,24 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     assert packet.header["parts"][0]["name"] == "vein"
     graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
     assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
+
+
+def test_one_mesh_serves_all_and_is_heard_until_the_last_has_left(graph):
+    topics = ("tissue/rest", "tissue/tetrahedra")
+    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
+    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
+    graph.feeds["structures"].watch(unused)
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/nodes") == 1)
+    graph.feeds["tissue_mesh"].watch(unused)  # for which the mesh is there already
+    assert graph.newest("tissue_mesh").header["points"] == len(MESH.nodes)
+    assert [graph.bench.peer.count_subscribers(topic) for topic in topics] == [1, 1]
+    graph.feeds["structures"].unwatch(unused)
+    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/nodes") == 0)
+    assert [graph.bench.peer.count_subscribers(topic) for topic in topics] == [1, 1]
+    graph.feeds["tissue_mesh"].unwatch(unused)
+    graph.bench.spin_until(
+        lambda: not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
+    )
 
 
 def test_structures_of_another_tissue_are_refused_and_not_tried_again(graph):

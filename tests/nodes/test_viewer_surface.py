@@ -11,6 +11,7 @@ from us_sim.nodes.conversions import cloud_message, mesh_message, tetrahedra_mes
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.skin.surface import plane_surface
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
@@ -23,7 +24,7 @@ class Stander(GuardedNode):
         super().__init__("stander", **kwargs)
         self.health = Health(self, "test")
         self.changes = 0
-        self.surface = ViewerSurface(self, self._count)
+        self.surface = ViewerSurface(self, RestMesh(self), self._count)
 
     def _count(self):
         self.changes += 1

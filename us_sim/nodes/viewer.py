@@ -14,6 +14,7 @@ from us_sim.nodes.remote_parameters import RemoteParameters
 from us_sim.nodes.status_listener import StatusListener
 from us_sim.nodes.viewer_feeds.image_feed import image_feeds
 from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
 from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
@@ -43,11 +44,13 @@ class Viewer(GuardedNode):
         self.simulator = Simulator(
             nodes=self._remote.board, status=listener.board, session=self._session.board
         )
-        hand = ViewerHand(self, self.post, self.simulator)
+        rest = RestMesh(self)
+        hand = ViewerHand(self, self.post, self.simulator, rest)
         self.simulator.add(*image_feeds(self, self.post, settings.rate, hand.asked_by))
-        for bodies in (SkinFeeds, TissueFeeds, ProbeFeeds):
+        for bodies in (SkinFeeds, ProbeFeeds):
             self.simulator.add(*bodies(self, self.post, settings.rate).feeds)
-        self.simulator.add(StructuresFeed(self, self.post).feed)
+        self.simulator.add(*TissueFeeds(self, self.post, settings.rate, rest).feeds)
+        self.simulator.add(StructuresFeed(self, self.post, rest).feed)
         self._server = WebServer(self.simulator, settings.host, settings.port)
         self.health.state = "serving"
         self.health.values = {"port": str(self._server.port)}

@@ -16,6 +16,7 @@ from us_sim.nodes.conversions import pose_from, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.tracking.virtual_hand.motion import Motion
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
@@ -61,10 +62,13 @@ class ViewerHand:
         node: that publishes.
         post: has work done in the node's thread.
         simulator: given the stream ``hand`` and the command of the same name.
+        rest: the tissue's mesh, on which the probe stands where there is no skin.
     """
 
-    def __init__(self, node: GuardedNode, post: Posted, simulator: Simulator) -> None:
-        self._node, self._post = node, post
+    def __init__(
+        self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
+    ) -> None:
+        self._node, self._post, self._rest = node, post, rest
         self.feed = Feed("hand", self._watched, STATE_RATE)
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
@@ -106,7 +110,7 @@ class ViewerHand:
     def _watch(self) -> None:
         """Begin when the first page looks, and leave everything when the last has gone."""
         if self.feed.is_watched and self._surface is None:
-            self._surface = ViewerSurface(self._node, self._stand)
+            self._surface = ViewerSurface(self._node, self._rest, self._stand)
             self._tracked = self._node.create_subscription(
                 PoseStamped, "probe/pose", self._follow, STREAM
             )

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
-from std_msgs.msg import Int32MultiArray
 
-from us_sim.geometry.mesh_faces import boundary_triangles
-from us_sim.nodes.conversions import mesh_from, tetrahedra_from, vectors_from
+from us_sim.nodes.conversions import mesh_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED
+from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 
 __all__ = ["ViewerSurface"]
@@ -27,25 +22,19 @@ class ViewerSurface:
     """The skin at rest; where the scene has none the tissue's upper side, else the plane z = 0.
 
     Args:
-        node: that hears ``skin/mesh``, ``tissue/rest`` and ``tissue/tetrahedra``.
+        node: that hears ``skin/mesh``.
+        rest: the tissue's mesh.
         changed: called when there is another surface.
     """
 
-    def __init__(self, node: GuardedNode, changed: Callable[[], None]) -> None:
-        self._node, self._changed = node, changed
+    def __init__(self, node: GuardedNode, rest: RestMesh, changed: Callable[[], None]) -> None:
+        self._node, self._rest, self._changed = node, rest, changed
         self._skin: RestSurface | None = None
-        self._nodes: NDArray[np.float64] | None = None
-        self._tetrahedra: NDArray[np.int32] | None = None
         self._tissue: RestSurface | None = None
         self._plane = RestSurface.plane(_PLANE)
-        self._heard = [
-            node.create_subscription(message_type, topic, take, LATCHED)
-            for message_type, topic, take in (
-                (Mesh, "skin/mesh", self._take_skin),
-                (PointCloud2, "tissue/rest", self._take_nodes),
-                (Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra),
-            )
-        ]
+        self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
+        rest.watch(self._make_tissue)
+        node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
 
     @property
     def best(self) -> RestSurface | None:
@@ -59,9 +48,8 @@ class ViewerSurface:
 
     def close(self) -> None:
         """Hear no more."""
-        for subscription in self._heard:
-            self._node.destroy_subscription(subscription)
-        self._heard = []
+        self._node.destroy_subscription(self._heard)
+        self._rest.watch(self._make_tissue, is_wanted=False)
 
     def _is_offered(self, topic: str) -> bool:
         return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
@@ -70,19 +58,8 @@ class ViewerSurface:
         self._skin = RestSurface(*mesh_from(message))
         self._changed()
 
-    def _take_nodes(self, message: PointCloud2) -> None:
-        self._nodes = vectors_from(message, "patient")
-        self._make_tissue()
-
-    def _take_tetrahedra(self, message: Int32MultiArray) -> None:
-        self._tetrahedra = tetrahedra_from(message)
-        self._make_tissue()
-
     def _make_tissue(self) -> None:
-        """The tissue's surface, once both parts are there and go together."""
-        nodes: Any = self._nodes
-        tetrahedra: Any = self._tetrahedra
-        if nodes is None or tetrahedra is None or tetrahedra.max(initial=-1) >= len(nodes):
-            return
-        self._tissue = RestSurface.upper_side(nodes, boundary_triangles(tetrahedra))
-        self._changed()
+        """The tissue's upper side, of the mesh that is there now."""
+        if self._rest.mesh is not None:
+            self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
+            self._changed()

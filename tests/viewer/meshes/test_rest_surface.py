@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import MeshError
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.viewer.meshes.rest_surface import RestSurface
 
 SQUARE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
@@ -35,6 +36,19 @@ def test_another_surface_has_another_number():
     one, other = RestSurface(SQUARE, TRIANGLES), RestSurface(SQUARE, TRIANGLES[:1])
     assert one.number != other.number
     assert one.number == RestSurface(SQUARE.copy(), TRIANGLES).number
+
+
+def test_around_a_mesh_are_its_outer_faces_with_each_edge_once():
+    planes = np.linspace(0.0, 0.03, 4)
+    mesh = box_mesh(planes, planes, planes)
+    packet = RestSurface.around(mesh).told("tissue_mesh", 1)
+    count = packet.header["triangles"]
+    assert (packet.header["points"], count) == (64, 6 * 9 * 2)
+    assert packet.header["edges"] == 3 * count // 2  # of a closed surface
+    indices = np.frombuffer(packet.payload, np.uint32, offset=12 * 64)
+    edges = {tuple(edge) for edge in indices[3 * count :].reshape(-1, 2)}
+    sides = indices[: 3 * count].reshape(-1, 3)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    assert edges == {tuple(sorted(side)) for side in sides}
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from us_sim.nodes.conversions.images import (
 )
 from us_sim.nodes.conversions.markers import (
     line_from,
+    markers_stamp,
     structure_markers,
     surface_marker,
     transducer_markers,
@@ -58,6 +59,7 @@ __all__ = [
     "field_message",
     "image_message",
     "line_from",
+    "markers_stamp",
     "mesh_from",
     "mesh_message",
     "nanoseconds_of",

@@ -13,11 +13,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 from us_sim.errors import MeshError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions.packing import CDR_LITTLE_ENDIAN
-from us_sim.nodes.conversions.stamps import require_frame
+from us_sim.nodes.conversions.stamps import nanoseconds_since, require_frame
 
 __all__ = [
     "MarkedTriangles",
     "line_from",
+    "markers_stamp",
     "structure_markers",
     "surface_marker",
     "transducer_markers",
@@ -33,6 +34,9 @@ MarkedTriangles = tuple[str, tuple[float, float, float], NDArray[np.float64]]
 _LINE_WIDTH = 4e-4
 """m, of an image's outline."""
 _OUTLINE_COLOUR = (0.31, 0.70, 0.75, 1.0)
+
+_FIRST_STAMP = 8
+"""Where it is in a serialized array: after the encapsulation and the number of markers."""
 
 _EMPTY = (1, b"\0")  # a string
 _MARKER_TAIL = struct.pack(
@@ -113,6 +117,20 @@ def line_from(message: MarkerArray, frame: str) -> NDArray[np.float64]:
             points = _points_of(marker)
             return points[:-1] if (points[0] == points[-1]).all() else points
     return np.zeros((0, 3))
+
+
+def markers_stamp(data: bytes) -> int | None:
+    """The ns since 1970 at which the first marker of a serialized array is; None where it has none.
+
+    Nothing else of it is decoded: an array may hold megabytes.
+
+    Raises:
+        StampError: it is no time.
+    """
+    order = "<" if data[1:2] == b"\1" else ">"
+    if len(data) < _FIRST_STAMP + 8 or struct.unpack_from(f"{order}I", data, 4)[0] == 0:
+        return None
+    return nanoseconds_since(*struct.unpack_from(f"{order}iI", data, _FIRST_STAMP))
 
 
 def _points_of(marker: Marker) -> NDArray[np.float64]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
@@ -20,29 +19,40 @@ __all__ = ["RestMesh"]
 
 
 class RestMesh:
-    """``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while somebody wants them.
+    """``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while somebody watches them.
+
+    One serves all who work with the mesh, in the node's thread.
 
     Args:
         node: that subscribes.
-        came: called, in the node's thread, when there is another mesh.
     """
 
-    def __init__(self, node: GuardedNode, came: Callable[[], None]) -> None:
-        self._node, self._came = node, came
+    def __init__(self, node: GuardedNode) -> None:
+        self._node = node
+        self._watchers: list[Callable[[], None]] = []
         self._subscriptions: list[Any] = []
         self._rest: PointCloud2 | None = None
         self._tetrahedra: Int32MultiArray | None = None
         self.mesh: TetrahedralMesh | None = None
         self.surface: RestSurface | None = None  # its outer faces, with their edges
 
-    def listen(self, on: bool) -> None:
-        """Begin or end to hear them; the mesh is kept."""
-        if on == bool(self._subscriptions):
+    def watch(self, came: Callable[[], None], is_wanted: bool = True) -> None:
+        """Have ``came`` called when there is another mesh, or no longer.
+
+        The mesh that is there is kept, and nobody is called for it.
+        """
+        if is_wanted == (came in self._watchers):
+            return
+        if is_wanted:
+            self._watchers.append(came)
+        else:
+            self._watchers.remove(came)
+        if bool(self._watchers) == bool(self._subscriptions):
             return
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
-        if on:
+        if self._watchers:
             self._subscriptions = [
                 self._node.create_subscription(
                     PointCloud2, "tissue/rest", self._take_rest, LATCHED
@@ -74,10 +84,9 @@ class RestMesh:
                 f"{tetrahedra.max(initial=-1) + 1}: the two are not of the same mesh"
             )
         mesh = TetrahedralMesh(nodes, tetrahedra)
-        faces = mesh.boundary
-        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        surface = RestSurface(nodes, faces, np.unique(edges, axis=0))
+        surface = RestSurface.around(mesh)
         if self.surface is not None and surface.number == self.surface.number:
             return
         self.mesh, self.surface = mesh, surface
-        self._came()
+        for came in list(self._watchers):
+            self._node.guarded(self._node.resolve_topic_name("tissue/rest"), came)()

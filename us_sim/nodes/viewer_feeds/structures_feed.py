@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 from typing import Any
 
@@ -10,7 +9,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError
-from us_sim.nodes.conversions import nanoseconds_of, vectors_from
+from us_sim.nodes.conversions import markers_stamp, nanoseconds_of, vectors_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import STREAM
@@ -35,9 +34,9 @@ class StructuresFeed:
     tissue each vertex lies, and the page moves the structures with the tissue.
     """
 
-    def __init__(self, node: GuardedNode, post: Posted) -> None:
+    def __init__(self, node: GuardedNode, post: Posted, rest: RestMesh) -> None:
         self._node = node
-        self._rest = RestMesh(node, self._begin)
+        self._rest = rest
         self.feed = Feed("structures", lambda _: post(self._listen), rate=None)
         self._post = post
         self._subscriptions: list[Any] = []
@@ -48,8 +47,10 @@ class StructuresFeed:
 
     def _listen(self) -> None:
         """Hear what is wanted now: the mesh while watched, and the rest until it has been used."""
-        self._rest.listen(self.feed.is_watched)
+        self._rest.watch(self._listen, self.feed.is_watched)
         surface = self._rest.surface
+        if surface is not None and surface.number != self._made_for:
+            self.feed.forget()  # what was carried by the last mesh is of another scene
         wanted = (
             self.feed.is_watched
             and surface is not None
@@ -72,11 +73,6 @@ class StructuresFeed:
                 )
             ]
 
-    def _begin(self) -> None:
-        """There is another mesh: what was carried by the last one is of another scene."""
-        self.feed.forget()
-        self._listen()
-
     def _take_nodes(self, data: bytes) -> None:
         message = made_of(self._node, PointCloud2, _NODES, data, lambda message: message)
         if message is None:
@@ -87,7 +83,7 @@ class StructuresFeed:
         self._try()
 
     def _take_structures(self, data: bytes) -> None:
-        stamp = _stamp_of(data)
+        stamp = markers_stamp(data)
         if stamp is not None:
             self._structures = stamp, data
             self._try()
@@ -143,15 +139,3 @@ def _carried(message: MarkerArray, mesh: TetrahedralMesh) -> CarriedSurfaces:
     if not surfaces:
         raise MeshError("there is no triangle in it")
     return CarriedSurfaces(mesh, surfaces)
-
-
-def _stamp_of(data: bytes) -> int | None:
-    """ns, of the first marker of a serialized array; None where it has none.
-
-    Only of the message that will be used all of it is read.
-    """
-    order = "<" if data[1:2] == b"\1" else ">"
-    if len(data) < 16 or struct.unpack_from(f"{order}I", data, 4)[0] == 0:
-        return None
-    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 8)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -25,14 +25,11 @@ _STRAIN_RATE = 12.0
 class TissueFeeds:
     """The streams ``tissue_mesh``, ``tissue`` and ``strain``, of ``tissue/…``."""
 
-    def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
-        self._rest = RestMesh(node, self._offer)
+    def __init__(self, node: GuardedNode, post: Posted, rate: float, rest: RestMesh) -> None:
+        self._rest = rest
+        self._number: int | None = None  # of the mesh that was told
         self._strain: tuple[TetrahedralMesh, EquivalentStrain] | None = None
-        self._told = Feed(
-            "tissue_mesh",
-            lambda _: post(lambda: self._rest.listen(self._told.is_watched)),
-            rate=None,
-        )
+        self._told = Feed("tissue_mesh", lambda _: post(self._listen), rate=None)
         topic = "tissue/nodes"
         moved = WatchedTopic(node, post, PointCloud2, topic, self._move, "tissue", rate)
         strained = WatchedTopic(
@@ -40,9 +37,15 @@ class TissueFeeds:
         )
         self.feeds: list[Feed] = [self._told, moved.feed, strained.feed]
 
+    def _listen(self) -> None:
+        """Hear of meshes while a page watches; one may be there already."""
+        self._rest.watch(self._offer, self._told.is_watched)
+        self._offer()
+
     def _offer(self) -> None:
         surface = self._rest.surface
-        if surface is not None:
+        if surface is not None and surface.number != self._number:
+            self._number = surface.number
             self._told.offer(lambda sequence: surface.told("tissue_mesh", sequence))
 
     def _move(self, message: PointCloud2, sequence: int) -> Packet | None:

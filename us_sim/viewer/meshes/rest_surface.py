@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.meshes.offsets import Offsets
 from us_sim.viewer.packet import Packet
 
@@ -59,6 +60,13 @@ class RestSurface:
         self._payload = b"".join(part.tobytes() for part in parts)
         #: By which packets name the surface that they move.
         self.number = zlib.crc32(self._payload)
+
+    @classmethod
+    def around(cls, mesh: TetrahedralMesh) -> RestSurface:
+        """All nodes of a mesh with its outer faces, and their edges, each once."""
+        faces = mesh.boundary
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        return cls(mesh.nodes, faces, np.unique(edges, axis=0))
 
     def told(self, kind: str, sequence: int) -> Packet:
         """All of it at rest: points as float32, then triangles and edges as uint32."""
