@@ -44,18 +44,21 @@ def tracker(bench, tmp_path):
     return make
 
 
+ABOVE = """
+  frame: ndi
+  registration: {position: [0, 0, -0.5]}
+  calibration: {position: [0, 0, 0.1]}
+  time_offset: -0.5 s"""
+"""A tracker that stands 0.5 m above the patient and looks down; the face is 0.1 m from the body."""
+
+
 def place(message):
     p = message.pose.position
     return [p.x, p.y, p.z]
 
 
 def test_a_scene_registers_the_device_and_calibrates_the_probe(bench, tracker):
-    # The tracker stands 0.5 m above the patient and looks down; the face is 0.1 m from the body.
-    _, poses = tracker("""
-  frame: ndi
-  registration: {position: [0, 0, -0.5]}
-  calibration: {position: [0, 0, 0.1]}
-  time_offset: -0.5 s""")
+    _, poses = tracker(ABOVE)
     publisher = bench.publisher(PoseStamped, "tracker/pose")
     publisher.publish(pose_at(0.41, 7, frame="ndi"))
     bench.spin_until(lambda: poses)
@@ -65,11 +68,7 @@ def test_a_scene_registers_the_device_and_calibrates_the_probe(bench, tracker):
 
 
 def test_a_pose_in_patient_is_the_probes_own_where_the_device_has_another_frame(bench, tracker):
-    _, poses = tracker("""
-  frame: ndi
-  registration: {position: [0, 0, -0.5]}
-  calibration: {position: [0, 0, 0.1]}
-  time_offset: -0.5 s""")
+    _, poses = tracker(ABOVE)
     publisher = bench.publisher(PoseStamped, "tracker/pose")
     publisher.publish(pose_at(0.007, 7, frame="patient"))
     bench.spin_until(lambda: poses)

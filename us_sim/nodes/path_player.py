@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 from rclpy.time import Time
 from rclpy.timer import Timer
@@ -20,11 +19,11 @@ from us_sim.nodes.conversions import nanoseconds_of, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.playback import Playback
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.nodes.session_settings import PathPlayerSettings
 from us_sim.recording.path import ProbePath, read_path
-from us_sim.recording.playhead import Playhead
 
 __all__ = ["PathPlayer", "main"]
 
@@ -51,7 +50,6 @@ class PathPlayer(GuardedNode):
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next = 0
-        self._playhead = Playhead(settings.rate)
         self._begun = round(1e9 * settings.begun)  # ns
         self._checks = 0
         self._ticking: Timer | None = None
@@ -67,7 +65,8 @@ class PathPlayer(GuardedNode):
             )
         self.health.state = "waiting for the simulation"
         self._starting = self.create_timer(CHECK_S, self._begin)
-        self.add_post_set_parameters_callback(self._seek)
+        self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
+        self._playhead = self._playback.head
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
         if self._path.note:
@@ -92,22 +91,18 @@ class PathPlayer(GuardedNode):
         if self._settings.lockstep:
             self._send()
             return
-        now = self._now
+        now = self._playback.now
         begun = self._begun if 0 < self._begun < now else now
         self._playhead.go_to(round(1e9 * self._settings.time), begun)
         self._skip(now)
         self.get_logger().info(f"playing from pose {self._next}")
         self._tick_at_its_pace()
-        self._use()
+        self._playback.begin()
 
     def _tick_at_its_pace(self) -> None:
         if self._ticking is not None:
             self.destroy_timer(self._ticking)
         self._ticking = self.create_timer(max(1e-9 * self._period, 1e-4), self._tick)
-
-    @property
-    def _now(self) -> int:
-        return self.get_clock().now().nanoseconds
 
     @property
     def _period(self) -> float:
@@ -126,40 +121,25 @@ class PathPlayer(GuardedNode):
 
     def _say_progress(self) -> None:
         """Tell diagnostics where this is, and what it takes to go on in another process."""
-        position = min(self._playhead.position(self._now), int(self._ages[-1]))
+        position = min(self._playhead.position(self._playback.now), int(self._ages[-1]))
         self.health.values = {
             "played": str(self._next),
-            "begun": f"{1e-9 * self._playhead.begun(self._now):.9f}",
+            "begun": f"{1e-9 * self._playhead.begun(self._playback.now):.9f}",
             "position": f"{1e-9 * max(position, 0):.3f}",
             "duration": f"{1e-9 * self._ages[-1]:.3f}",
         }
 
     def _use(self, _: object = None) -> None:
-        """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
-        settings = self._settings
-        if self._ticking is None or settings.lockstep:
-            return
-        if settings.rate != self._playhead.rate:
-            self._playhead.run_at(settings.rate, self._now)
+        """Go on at the rate that was set, or hold still."""
+        if self._ticking is not None and self._settings.rate != self._playhead.rate:
             self._tick_at_its_pace()
-        self._playhead.hold(settings.paused, self._now)
-        if self.health.state != "finished" or settings.loop:
-            self.health.state = "paused" if settings.paused else "playing"
-        self._say_progress()
-        self.health.report()
+        self._playback.use()
 
-    def _seek(self, parameters: list[Parameter]) -> None:
-        """Play on at a time, each time that it is set, also to what it was."""
-        times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
-        if self._ticking is None or not times:
-            return
-        self._playhead.go_to(times[-1], self._now)
-        after = np.searchsorted(self._ages, times[-1])
-        self._next = min(int(after), self.pose_count - 1)
-        self.health.state = "paused" if self._settings.paused else "playing"
+    def _go_to(self, position: int) -> None:
+        """Play on there, and send at once the pose that is held there while it is paused."""
+        self._playhead.go_to(position, self._playback.now)
+        self._next = min(int(np.searchsorted(self._ages, position)), self.pose_count - 1)
         self._send()
-        self._say_progress()
-        self.health.report()
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
@@ -176,7 +156,7 @@ class PathPlayer(GuardedNode):
 
     def _is_due(self) -> bool:
         half = 0.5 * self._period * self._settings.rate
-        return bool(self._ages[self._next] <= self._playhead.position(self._now) + half)
+        return bool(self._ages[self._next] <= self._playhead.position(self._playback.now) + half)
 
     def _imaged(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)
@@ -211,7 +191,7 @@ class PathPlayer(GuardedNode):
     def _again(self) -> None:
         self._next = 0
         self.health.state = "playing"
-        self._playhead.go_to(0, self._now + int(self._period))
+        self._playhead.go_to(0, self._playback.now + int(self._period))
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:

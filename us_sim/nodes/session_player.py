@@ -7,20 +7,18 @@ from collections.abc import Iterator
 from typing import Any
 
 from rclpy.exceptions import NameValidationException
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from rclpy.timer import Timer
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.message_types import message_type
 from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.playback import Playback
 from us_sim.nodes.process import run_node
 from us_sim.nodes.session_settings import SessionPlayerSettings
-from us_sim.recording.playhead import Playhead
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic
 
@@ -67,22 +65,17 @@ class SessionPlayer(GuardedNode):
         self._sent = 0
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
-        self._playhead = Playhead(settings.rate)
         self._first = self._bag.start or 0
         self._length = (self._bag.end or 0) - self._first
         self._until = 0  # of the recording, ns: what is shown of it while it is paused
-        self._ticking: Timer | None = None
         self._start = self.create_timer(START_S, self._begin)
-        self.add_post_set_parameters_callback(self._seek)
+        self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
+        self._playhead = self._playback.head
 
     @property
     def _settings(self) -> SessionPlayerSettings:
         settings: SessionPlayerSettings = self._live.values["player"]
         return settings
-
-    @property
-    def _now(self) -> int:
-        return self.get_clock().now().nanoseconds
 
     def _offer(self, topic: BagTopic) -> str:
         """Publish a topic, or say why it cannot be published."""
@@ -112,8 +105,8 @@ class SessionPlayer(GuardedNode):
         self._start.cancel()
         self._go_to(round(1e9 * self._settings.time))
         self.health.state = "playing"
-        self._ticking = self.create_timer(0.002, self._tick)
-        self._use()
+        self.create_timer(0.002, self._tick)
+        self._playback.begin()
 
     def _tick(self) -> None:
         """Send what is due."""
@@ -122,7 +115,7 @@ class SessionPlayer(GuardedNode):
                 self._go_to(0)
                 self.health.state = "playing"
             return
-        elapsed = max(self._playhead.position(self._now), self._until)
+        elapsed = max(self._playhead.position(self._playback.now), self._until)
         while self._waiting is not None and self._waiting.log_time - self._first <= elapsed:
             self._topics[self._waiting.topic].publish(self._waiting.data)
             self.health.published(self._waiting.topic)
@@ -149,7 +142,7 @@ class SessionPlayer(GuardedNode):
 
     def _say_progress(self) -> None:
         """Tell diagnostics how far it is."""
-        position = min(max(self._playhead.position(self._now), 0), self._length)
+        position = min(max(self._playhead.position(self._playback.now), 0), self._length)
         self.health.values = {
             "position": f"{1e-9 * position:.3f}",
             "duration": f"{1e-9 * self._length:.3f}",
@@ -157,25 +150,7 @@ class SessionPlayer(GuardedNode):
 
     def _use(self, _: object = None) -> None:
         """Go on at the rate that was set, or publish nothing."""
-        settings = self._settings
-        if self._ticking is None:
-            return
-        self._playhead.run_at(settings.rate, self._now)
-        self._playhead.hold(settings.paused, self._now)
-        if self.health.state != "finished" or settings.loop:
-            self.health.state = "paused" if settings.paused else "playing"
-        self._say_progress()
-        self.health.report()
-
-    def _seek(self, parameters: list[Parameter]) -> None:
-        """Play on at a time, each time that it is set, also to what it was."""
-        times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
-        if self._ticking is None or not times:
-            return
-        self._go_to(times[-1])
-        self.health.state = "paused" if self._settings.paused else "playing"
-        self._say_progress()
-        self.health.report()
+        self._playback.use()
 
     def _go_to(self, position: int) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.
@@ -192,7 +167,7 @@ class SessionPlayer(GuardedNode):
             self._sent += 1
             self._waiting = self._next()
         self._until = position + _SHOWN if position else 0
-        self._playhead.go_to(position, self._now)
+        self._playhead.go_to(position, self._playback.now)
 
     def _next(self) -> BagMessage | None:
         """The next message; what is damaged is said, and passed over where that can be."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -98,22 +99,16 @@ def _arrow(marker: Any, pose: Pose, points: NDArray[np.float64], scale: NDArray[
     )
 
 
-def _boxes(marker: Any, pose: Pose, points: NDArray[np.float64], scale: NDArray[np.float64]) -> Any:
-    centres = points if marker.type == _CUBE_LIST else [pose.position]
-    return rerun.Boxes3D(
-        centers=centres,
-        half_sizes=[scale / 2] * len(centres),
-        quaternions=[rerun.Quaternion(xyzw=pose.orientation)] * len(centres),
-        colors=_colours(marker),
-        fill_mode="solid",
-    )
-
-
-def _spheres(
-    marker: Any, pose: Pose, points: NDArray[np.float64], scale: NDArray[np.float64]
+def _solids(
+    draw: Callable[..., Any],
+    marker: Any,
+    pose: Pose,
+    points: NDArray[np.float64],
+    scale: NDArray[np.float64],
 ) -> Any:
-    centres = points if marker.type == _SPHERE_LIST else [pose.position]
-    return rerun.Ellipsoids3D(
+    """Boxes or ellipsoids of one size: one at the marker's pose, or of a list one at each point."""
+    centres = points if marker.type in (_CUBE_LIST, _SPHERE_LIST) else [pose.position]
+    return draw(
         centers=centres,
         half_sizes=[scale / 2] * len(centres),
         quaternions=[rerun.Quaternion(xyzw=pose.orientation)] * len(centres),
@@ -170,10 +165,10 @@ def _triangles(marker: Any, _: Pose, points: NDArray[np.float64], __: NDArray[np
 
 _SHAPES: dict[int, Callable[[Any, Pose, NDArray[np.float64], NDArray[np.float64]], Any]] = {
     _ARROW: _arrow,
-    _CUBE: _boxes,
-    _CUBE_LIST: _boxes,
-    _SPHERE: _spheres,
-    _SPHERE_LIST: _spheres,
+    _CUBE: partial(_solids, rerun.Boxes3D),
+    _CUBE_LIST: partial(_solids, rerun.Boxes3D),
+    _SPHERE: partial(_solids, rerun.Ellipsoids3D),
+    _SPHERE_LIST: partial(_solids, rerun.Ellipsoids3D),
     _CYLINDER: _cylinder,
     _LINE_STRIP: _lines,
     _LINE_LIST: _lines,
