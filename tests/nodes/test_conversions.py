@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
-from us_sim.errors import MeshError, MessageError, ProbeError, StampError, VolumeError
+from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import (
     affine_from,
@@ -29,7 +29,9 @@ from us_sim.nodes.conversions import (
     nanoseconds_of,
     pixels_from,
     pose_from,
+    pose_from_text,
     pose_message,
+    pose_text,
     stamp_message,
     structure_markers,
     surface_marker,
@@ -345,3 +347,13 @@ def test_a_markers_pose_places_its_triangles():
     marker.pose.orientation.w, marker.pose.orientation.z = 0.5**0.5, 0.5**0.5  # a quarter turn
     ((_, _, corners),) = triangles_from(MarkerArray(markers=[marker]), "")
     np.testing.assert_allclose(corners, [[0, 0, 2], [0, 1, 2], [-1, 0, 2]], atol=1e-12)
+
+
+def test_a_pose_is_the_same_after_it_was_a_text():
+    pose = Pose([0.1, -1 / 3, 2e-9], [0.5, -0.5, 0.5, 0.5])
+    back = pose_from_text(pose_text(pose))
+    np.testing.assert_array_equal(back.position, pose.position)
+    np.testing.assert_array_equal(back.orientation, pose.orientation)
+    for wrong in ("", "1 2 3", "a b c d e f g", "0 0 0 0 0 0 0", "nan 0 0 0 0 0 1"):
+        with pytest.raises(PoseError):
+            pose_from_text(wrong)

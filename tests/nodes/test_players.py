@@ -266,6 +266,10 @@ def test_a_path_is_held_still_gone_along_and_played_at_another_pace(bench, path)
     assert set_live(player, rate=100.0) == ""
     bench.spin_until(lambda: player.health.state == "finished")
     assert not player.finished.done()
+    bench.spin_until(lambda: poses and round(poses[-1].pose.position.z * 1e3) == 9)
+    poses.clear()
+    bench.spin_until(lambda: len(poses) > 2)  # the probe is held there
+    assert {round(pose.pose.position.z * 1e3) for pose in poses} == {9}
     poses.clear()
     assert set_live(player, time=0.1, rate=10.0) == ""
     bench.spin_until(lambda: poses and round(poses[-1].pose.position.z * 1e3) == 9)

@@ -2,6 +2,7 @@
 
 import math
 import time
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.skin.surface import bent_surface
+from us_sim.viewer.session import SessionBoard, SessionState
 from us_sim.viewer.simulator import Simulator
 
 
@@ -176,6 +178,52 @@ def test_somebody_else_leads_as_long_as_he_publishes(bench, page, tracked):
     page.await_leader("hand")
     bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.013, abs=1e-6))
     assert depth(tracked[-1]) == pytest.approx(0.004, abs=1e-6)
+
+
+def test_who_comes_when_nobody_moves_the_probe_begins_where_it_is(bench, page, tracked):
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    now = bench.peer.get_clock().now
+    place = Pose([0.013, 0.0, 0.004])
+
+    def has_followed():
+        driver.publish(pose_message(place, now().to_msg(), "patient"))
+        return bool(tracked)
+
+    bench.spin_until(has_followed)
+    bench.peer.destroy_publisher(driver)  # as a viewer that is killed
+    count = len(tracked)
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) > count + 2)
+    positions = [[p.pose.position.x, p.pose.position.z] for p in tracked[count:]]
+    np.testing.assert_allclose(positions, [[0.013, 0.004]] * len(positions), atol=1e-6)
+
+
+@pytest.mark.usefixtures("tracked")
+def test_a_replay_is_ended_on_request_and_nothing_else_is(bench, page):
+    holder, asked = page._holder, []
+    done = Future()
+    done.set_result("")
+    board = SessionBoard(ask=lambda values: asked.append(values) or done)
+    holder.hand._session = board
+    take = holder.simulator.commands["take"]
+    page.open()
+    page.await_leader("hand")
+    assert take(True, 1) is None
+    board.tell_state(SessionState(is_there=True, replay="/somewhere/press.mcap"))
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("bench")
+    assert "bench moves the probe" in take(True, 1)
+    assert not page.state["can_take"]
+    assert asked == []
+    bench.peer.destroy_publisher(driver)
+    player = bench.add(GuardedNode("path_player", context=bench.context))
+    player.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("path_player")
+    assert page.state["can_take"]
+    assert "the replay of press.mcap moves the probe" in page.state["obstacle"]
+    assert take(True, 1) is None
+    assert asked == [{"replay": ""}]
 
 
 def test_no_tracker_that_listens_is_said(bench, page):

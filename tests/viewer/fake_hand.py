@@ -22,6 +22,8 @@ class FakeHand:
         self.state = Feed("hand", rate=None)
         simulator.add(self.image, self.geometry, self.state)
         simulator.commands["hand"] = self._take
+        simulator.commands["take"] = self._take_over
+        self.takes = 0  # how often the probe was to be taken
         matrix = {"matrix": MATRIX}
         self.geometry.offer(lambda n: Packet("image_geometry", n, matrix, b""))
         self.say()
@@ -31,8 +33,12 @@ class FakeHand:
         self.asked.append(value)
         return "the hand cannot" if value.get("go") == "lift" else None
 
+    def _take_over(self, _: Any, __: int) -> None:
+        self.takes += 1
+
     def say(self, **changes: Any) -> None:
-        header = {"leader": "hand", "obstacle": "", "warning": "", "range": RANGES}
+        header = {"leader": "hand", "obstacle": "", "warning": "", "can_take": False}
+        header["range"] = RANGES
         header |= {"stance": STANCE, "goal": STANCE, **changes}
         self.state.offer(lambda n: Packet("hand", n, header, b""))
 

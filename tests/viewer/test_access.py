@@ -5,7 +5,10 @@ from typing import Any
 
 import pytest
 
+from us_sim.errors import UsSimError
 from us_sim.viewer.access import Access, is_loopback
+from us_sim.viewer.server import WebServer
+from us_sim.viewer.simulator import Simulator
 
 
 def asked(
@@ -102,3 +105,10 @@ def test_beyond_this_computer_a_token_is_needed() -> None:
 def test_loopback_is_told_from_other_addresses() -> None:
     assert all(map(is_loopback, ("localhost", "127.0.0.1", "::1", "127.8.8.8", "[::1]")))
     assert not any(map(is_loopback, ("0.0.0.0", "", "192.168.0.2", "::", "localhost.evil")))
+
+
+@pytest.mark.parametrize("token", ["short", "sixteen letters!", "a" * 15, "a" * 16 + "; Path=/"])
+def test_a_token_that_is_no_secret_or_no_part_of_an_address_is_refused(token: str) -> None:
+    pytest.importorskip("nicegui", reason="nicegui is not installed")
+    with pytest.raises(UsSimError, match="16 letters, digits"):
+        WebServer(Simulator(), "0.0.0.0", 0, token)

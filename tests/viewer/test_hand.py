@@ -189,3 +189,20 @@ def test_help_shows_the_keys_and_goes(page: Any, viewer: FakeHand) -> None:
     page.keyboard.press("Escape")
     page.wait_for_selector(".us-help", state="hidden")
     assert not viewer.asked
+
+
+def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(
+    page: Any, viewer: FakeHand
+) -> None:
+    button = page.get_by_role("button", name="Take the probe")
+    centre = page.get_by_role("button", name="Centre")
+    assert not button.is_visible()
+    assert centre.is_enabled()
+    viewer.say(leader="path_player", obstacle="the replay of a.mcap moves the probe", can_take=True)
+    button.wait_for()
+    assert not centre.is_enabled()
+    button.click()
+    viewer.until(lambda: viewer.takes == 1)
+    viewer.say()
+    button.wait_for(state="hidden")
+    assert centre.is_enabled()

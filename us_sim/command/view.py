@@ -32,7 +32,13 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_viewer_options(parser)
     add_setting_options(parser, RunSettings, ("record",))
-    parser.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
+    parser.add_argument(
+        "--path",
+        type=find_bag,
+        metavar="BAG",
+        help="play this bag's probe path, and hold the probe at its end until it is taken",
+    )
+    parser.add_argument("--loop", action="store_true", help="play the path again and again")
     parser.add_argument(
         "--tracker",
         action="store_true",
@@ -66,6 +72,8 @@ def _view(args: argparse.Namespace) -> int:
         return view_running(
             viewer(args), parameters, network=args.network, supervision=supervision(args)
         )
+    if args.loop and args.path is None:
+        raise UsSimError("--loop plays a path again and again: name one with --path")
     from us_sim.scene.reading import load_scene
 
     return run(
@@ -78,4 +86,6 @@ def _view(args: argparse.Namespace) -> int:
         supervision=supervision(args),
         view=viewer(args),
         by_hand=not args.tracker,
+        stay=True,
+        loop=args.loop,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ __all__ = ["PathPlayer", "main"]
 
 CHECK_S, CHECKS = 0.05, 6
 """How often, and how often in a row, everything awaited must be there before the first pose."""
+HELD = 5.0
+"""Poses a second of a probe that is held still; images are called stale after half a second."""
 
 
 class PathPlayer(GuardedNode):
@@ -53,6 +56,7 @@ class PathPlayer(GuardedNode):
         self._begun = round(1e9 * settings.begun)  # ns
         self._checks = 0
         self._ticking: Timer | None = None
+        self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
         self.health = Health(self, str(path))
         qos = EVERY if lockstep else STREAM
@@ -146,13 +150,20 @@ class PathPlayer(GuardedNode):
         if self.health.state == "finished":
             if self._settings.loop:
                 self._again()
+            else:
+                self._hold()
             return
         if self._settings.paused:
-            self._send()  # a probe that is held still is still there
+            self._hold()
             return
         while not self.finished.done() and self.health.state != "finished" and self._is_due():
             self._send()
             self._advance()
+
+    def _hold(self) -> None:
+        """Say a few times a second that a probe which is held still is still there."""
+        if time.monotonic() - self._sent_at > 1.0 / HELD:
+            self._send()
 
     def _is_due(self) -> bool:
         half = 0.5 * self._period * self._settings.rate
@@ -168,6 +179,7 @@ class PathPlayer(GuardedNode):
     def _send(self) -> None:
         i = min(self._next, self.pose_count - 1)
         pose = self._path.pose(i)
+        self._sent_at = time.monotonic()
         restamp = self._settings.restamp and not self._settings.lockstep
         stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._stamps[i]))
         self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))

@@ -23,6 +23,7 @@ from us_sim.nodes.conversions import (
     nanoseconds_of,
     pose_from,
     pose_message,
+    pose_text,
     stamp_message,
     transducer_markers,
     transform_message,
@@ -65,7 +66,8 @@ class ProbeTracker(SceneNode):
     What it listens to is up to ``tracker.source`` of the scene, or the parameter ``source``, see
     `tracker_inputs`. A pose goes
     out once, with the stamp of its measurement. ``probe/status``, latched, says whether the probe
-    is ``tracked``, ``coasting`` or ``lost``, each time that changes. ``probe/marker``, latched, is
+    is ``tracked``, ``coasting`` or ``lost``, each time that changes, and where it was last when it
+    is tracked no more. ``probe/marker``, latched, is
     the transducer to look at. The filter and its settings may change while running.
     """
 
@@ -81,6 +83,7 @@ class ProbeTracker(SceneNode):
         self._source = live.values[OWN].source or self.scene.tracker.source.name
         self._tracking = tracking_of(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
+        self._last: Measurement | None = None  # that was published
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
         self._status = self.latched(DiagnosticStatus, "probe/status")
@@ -245,6 +248,7 @@ class ProbeTracker(SceneNode):
             self._check()
             return
         stamp = stamp_message(probe.stamp)
+        self._last = probe
         self._poses.publish(pose_message(probe.pose, stamp, PATIENT))
         self.health.published("probe/pose", stamp)
         if self._transforms.get_subscription_count():
@@ -285,7 +289,10 @@ class ProbeTracker(SceneNode):
             hardware_id=self._source,
         )
         refused = self._tracking.refused
-        status.values = [KeyValue(key=f"refused {k}", value=str(n)) for k, n in refused.items()]
+        values = {f"refused {kind}": str(count) for kind, count in refused.items()}
+        if self._last is not None and self._state is not TrackingState.TRACKED:
+            values |= {"pose": pose_text(self._last.pose), "stamp": str(self._last.stamp)}
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         self._status.publish(status)
 
     def now(self) -> int:

@@ -54,7 +54,7 @@ class PathPlayerSettings(Settings):
         _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
     )
     stay: bool = setting(
-        description="wait at the end until `time` is set, else end there", default=False
+        description="hold the probe at the end until `time` is set, else end there", default=False
     )
     restamp: bool = setting(
         description="stamp poses when they are sent, else as recorded", default=True

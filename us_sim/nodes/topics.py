@@ -132,7 +132,8 @@ TOPICS = (
     Topic(
         "probe/status",
         "diagnostic_msgs/DiagnosticStatus",
-        "`waiting`, `tracked`, `coasting` or `lost`, each time that changes",
+        "`waiting`, `tracked`, `coasting` or `lost`, each time that changes; then also where the "
+        "probe was last",
         publishers=("probe_tracker",),
         latched=True,
     ),

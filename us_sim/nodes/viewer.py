@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -20,7 +21,7 @@ from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.nodes.viewer_session import ViewerSession
-from us_sim.nodes.viewer_settings import ViewerSettings
+from us_sim.nodes.viewer_settings import TOKEN, ViewerSettings
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
 
@@ -51,7 +52,9 @@ class Viewer(GuardedNode):
             self.simulator.add(*bodies(self, self.post, settings.rate).feeds)
         self.simulator.add(*TissueFeeds(self, self.post, settings.rate, rest).feeds)
         self.simulator.add(StructuresFeed(self, self.post, rest).feed)
-        self._server = WebServer(self.simulator, settings.host, settings.port)
+        self._server = WebServer(
+            self.simulator, settings.host, settings.port, os.environ.get(TOKEN, "")
+        )
         self.health.state = "serving"
         self.health.values = {"port": str(self._server.port)}
         print(f"open {self._server.address}", flush=True)

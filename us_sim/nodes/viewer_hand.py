@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from geometry_msgs.msg import PoseStamped
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pose_from, pose_message
+from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
+from us_sim.nodes.probe_whereabouts import ProbeWhereabouts
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
@@ -29,6 +31,8 @@ from us_sim.viewer.simulator import Simulator
 __all__ = ["ViewerHand"]
 
 PATIENT, TOPIC = "patient", "tracker/pose"
+PLAYERS = ("path_player", "session_player")
+"""Nodes that `session_control` starts and ends."""
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
 images than that."""
@@ -72,13 +76,18 @@ class ViewerHand:
         self.feed = Feed("hand", self._watched, STATE_RATE)
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
+        simulator.commands["take"] = self._ask_for_probe
+        self._session = simulator.session
         self._obstacle = "the viewer looks who moves the probe"  # why the hand may not; "" if so
         self._surface: ViewerSurface | None = None
         self._standing: RestSurface | None = None  # the surface that the motion is on
         self._motion: Motion | None = None
         self._publisher: Any = None
-        self._tracked: Any = None  # subscription
+        self._whereabouts: ProbeWhereabouts | None = None
+        self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
+        self._last_stamp = 0  # ns, of the last pose
+        self._can_take = False  # whether a page can end what moves the probe
         self._asked: tuple[str, int] | None = None  # page and number of the last command
         self._asked_by: dict[int, tuple[str, int]] = {}  # by the stamp of a pose
         self._sent_at = self._rests_since = self._asked_at = 0.0  # s, of the monotonic clock
@@ -111,16 +120,20 @@ class ViewerHand:
         """Begin when the first page looks, and leave everything when the last has gone."""
         if self.feed.is_watched and self._surface is None:
             self._surface = ViewerSurface(self._node, self._rest, self._stand)
-            self._tracked = self._node.create_subscription(
-                PoseStamped, "probe/pose", self._follow, STREAM
+            self._session.watch()
+            self._is_found = False
+            self._whereabouts = ProbeWhereabouts(
+                self._node, self._follow, self._find, self._be_elsewhere
             )
             self._resting_timer.reset()
             self._look()
         elif not self.feed.is_watched and self._surface is not None:
             self._let_go()
             self._surface.close()
-            self._node.destroy_subscription(self._tracked)
-            self._surface = self._tracked = None
+            self._surface = None
+            if self._whereabouts is not None:
+                self._whereabouts.close()
+            self._session.unwatch()
             self._resting_timer.cancel()
 
     def _stand(self) -> None:
@@ -158,6 +171,12 @@ class ViewerHand:
         if self._publisher is not None and node.get_name() in others:
             others.remove(node.get_name())
         self._leader = others[0] if others else "tracker"
+        replayed = self._session.state.replay
+        self._can_take = bool(replayed) and self._leader in PLAYERS
+        if self._can_take:
+            ends = self._session.state.replay_state == "finished"
+            what = "has ended and holds the probe" if ends else "moves the probe"
+            return f"the replay of {PurePath(replayed).name} {what}: Take the probe ends it"
         if others:
             return f"{others[0]} moves the probe: end it to take the probe yourself"
         hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
@@ -172,6 +191,9 @@ class ViewerHand:
         if self._standing is None:
             self._leader = "nobody"
             return "the patient's surface is awaited"
+        if not self._is_found and self._whereabouts is not None and self._whereabouts.is_told:
+            self._leader = "nobody"
+            return "the viewer looks where the probe is"
         self._leader = "hand"
         return ""
 
@@ -198,11 +220,28 @@ class ViewerHand:
         if self._motion is not None:
             self._motion.rest_at(self._motion.stance)
 
-    def _follow(self, message: PoseStamped) -> None:
-        """Where the probe is: there somebody else has it, or there it should not be."""
-        pose = pose_from(message, PATIENT)
-        if self._publisher is None or self._motion is None or self._standing is None:
+    def _ask_for_probe(self, _: Any, __: int) -> str | None:
+        """End what is replayed, so that the hand may go on from there; in a page's thread."""
+        if not self._can_take:
+            return self._obstacle or None
+        self._session.ask(replay="")
+        return None
+
+    def _find(self, pose: Pose | None, stamp: int) -> None:
+        """Where the probe was when poses ended; there it is unless this hand has had it."""
+        self._is_found = True
+        if self._publisher is None and pose is not None and stamp != self._last_stamp:
             self._elsewhere = pose
+        self._look()
+
+    def _be_elsewhere(self) -> None:
+        """Poses come, or came a moment ago: of this hand, if it has had the probe."""
+        self._is_found |= self._motion is not None
+
+    def _follow(self, pose: Pose) -> None:
+        """Where the probe is: there somebody else has it, or there it should not be."""
+        if self._publisher is None or self._motion is None or self._standing is None:
+            self._elsewhere, self._is_found = pose, True
         elif (
             self._moving_timer.is_canceled()
             and time.monotonic() - self._rests_since > SETTLED
@@ -254,6 +293,7 @@ class ViewerHand:
         assert self._motion is not None
         assert self._standing is not None
         stamp = self._node.get_clock().now()
+        self._last_stamp = stamp.nanoseconds
         pose = self._motion.stance.pose(self._standing)
         if self._asked is not None:  # said first: its image may be there at once
             self._asked_by[stamp.nanoseconds] = self._asked
@@ -270,6 +310,7 @@ class ViewerHand:
         header: dict[str, Any] = {
             "leader": self._leader,
             "obstacle": self._obstacle,
+            "can_take": self._can_take,
             "warning": self._warning,
         }
         if self._publisher is None and self._elsewhere is not None and surface is not None:

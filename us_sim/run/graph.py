@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import secrets
 import signal
 import sys
 import time
@@ -16,7 +18,7 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
-from us_sim.nodes.viewer_settings import ViewerSettings
+from us_sim.nodes.viewer_settings import TOKEN, ViewerSettings
 from us_sim.run.deferred_signals import deferred_signals
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
@@ -81,7 +83,17 @@ def simulation_nodes(
 
 def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
     """The process that shows the simulation in browsers, at an address that it says itself."""
-    return NodeProcess(VIEWER, {"host": view.host, "port": view.port}, given or {})
+    settings: dict[str, object] = {"host": view.host, "port": view.port}
+    return NodeProcess(VIEWER, settings, given or {}, {TOKEN: _viewer_token()})
+
+
+@functools.cache
+def _viewer_token() -> str:
+    """One for as long as this program runs: pages find a viewer that was started again by it.
+
+    A person who has set one in the environment keeps it from one run to the next.
+    """
+    return os.environ.get(TOKEN) or secrets.token_urlsafe(16)
 
 
 def scene_settings(scene: Scene) -> dict[str, object]:

@@ -34,6 +34,7 @@ class NodeProcess:
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
+    secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
 
     def __post_init__(self) -> None:
         require_texts(self.all_parameters)
@@ -63,6 +64,7 @@ class RunningNode:
         package = str(Path(__file__).resolve().parents[2])
         search = [package, os.environ.get("PYTHONPATH", "")]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
+        environment |= node.secrets
         self.node = node
         self.process = subprocess.Popen(
             node.command(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
 import socket
 import threading
@@ -29,16 +30,20 @@ class WebServer:
         simulator: what the page shows.
         host: address to listen at; any but this computer's own needs the token in the address.
         port: TCP; 0 is any that is free.
+        token: that one; "" is a new one.
 
     Raises:
-        UsSimError: NiceGUI is not installed, or the address cannot be listened at.
+        UsSimError: NiceGUI is not installed, the address cannot be listened at, or the token is
+            easily guessed or cannot stand in an address.
     """
 
-    def __init__(self, simulator: Simulator, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self, simulator: Simulator, host: str = "127.0.0.1", port: int = 8080, token: str = ""
+    ) -> None:
+        self.token = "" if is_loopback(host) else _checked(token) or secrets.token_urlsafe(16)
         self._uvicorn, application = _made(simulator)
         self._socket = _listening(host, port)
         self.host, self.port = host, int(self._socket.getsockname()[1])
-        self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
         config = self._uvicorn.Config(
             Access(application, self.token),
             log_level="warning",
@@ -93,6 +98,20 @@ def _made(simulator: Simulator) -> tuple[Any, Any]:
             f"the viewer needs {error.name}: install it with `pip install 'us_sim[viewer]'`"
         ) from error
     return uvicorn, application(simulator)
+
+
+def _checked(token: str) -> str:
+    """That token, or none.
+
+    Raises:
+        UsSimError: it will not do.
+    """
+    if token and not re.fullmatch(r"[A-Za-z0-9_.~-]{16,}", token):
+        raise UsSimError(
+            "the viewer's token must have 16 letters, digits, or characters of _.~- at least: set "
+            "US_SIM_VIEWER_TOKEN to another, or not at all"
+        )
+    return token
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -37,7 +37,9 @@ from us_sim.nodes.conversions.meshes import (
 )
 from us_sim.nodes.conversions.poses import (
     pose_from,
+    pose_from_text,
     pose_message,
+    pose_text,
     transform_from,
     transform_message,
     wrench_from,
@@ -65,7 +67,9 @@ __all__ = [
     "nanoseconds_of",
     "pixels_from",
     "pose_from",
+    "pose_from_text",
     "pose_message",
+    "pose_text",
     "require_stamp",
     "stamp_message",
     "structure_markers",

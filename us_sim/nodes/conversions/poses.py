@@ -17,7 +17,9 @@ from us_sim.nodes.conversions.stamps import require_frame
 
 __all__ = [
     "pose_from",
+    "pose_from_text",
     "pose_message",
+    "pose_text",
     "transform_from",
     "transform_message",
     "wrench_from",
@@ -53,6 +55,26 @@ def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
     p.x, p.y, p.z = map(float, pose.position)
     q.x, q.y, q.z, q.w = map(float, pose.orientation)
     return message
+
+
+def pose_text(pose: Pose) -> str:
+    """Position (m) and quaternion x, y, z, w, as a value of diagnostics."""
+    return " ".join(repr(float(number)) for number in (*pose.position, *pose.orientation))
+
+
+def pose_from_text(text: str) -> Pose:
+    """What `pose_text` has written.
+
+    Raises:
+        PoseError: it is no pose.
+    """
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != 7:
+        raise PoseError(f"{text[:80]!r} is no pose: 7 numbers are one, x y z and a quaternion")
+    return Pose(numbers[:3], numbers[3:])
 
 
 def transform_from(message: TransformStamped) -> Pose:

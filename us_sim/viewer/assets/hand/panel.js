@@ -1,6 +1,7 @@
 /** Sliders with numbers, buttons, and the line that says who holds the probe. */
 
 import { element, events } from "../events.js";
+import { stream } from "../stream.js";
 import { hand } from "./hand.js";
 import { help } from "./help.js";
 import { latency } from "./latency.js";
@@ -35,6 +36,11 @@ const place = await element("hand");
 const rows = QUANTITIES.map(makeRow);
 const said = make("p", { className: "us-said" });
 said.setAttribute("role", "status");
+const take = make("button", { type: "button", textContent: "Take the probe", hidden: true });
+take.className = "us-on";
+take.title = "End the replay; the probe stays where it is, and you hold it";
+take.onclick = () => stream.send({ take: true });
+const moves = []; // buttons that need the probe
 const pace = make("span", { className: "us-pace" });
 pace.title = "From the pointer to the changed image: median of the last movements";
 place.append(make("div", { className: "us-quantities" }, ...rows.map((row) => row.all)), makeBar());
@@ -93,7 +99,7 @@ function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
 function makeBar() {
   const bar = make("div", { className: "us-hand-bar" });
   for (const [textContent, title, onclick] of BUTTONS) {
-    bar.append(make("button", { type: "button", textContent, title, onclick }));
+    moves.push(make("button", { type: "button", textContent, title, onclick }));
   }
   const gizmo = make("button", { type: "button", textContent: "Gizmo" });
   gizmo.title = "Arrows and rings at the probe, to move and turn it along its own axes";
@@ -105,7 +111,8 @@ function makeBar() {
   };
   const keys = make("button", { type: "button", textContent: "?", title: "Keys and gestures (key ?)" });
   keys.onclick = () => help.toggle();
-  bar.append(gizmo, keys, said, pace);
+  moves.push(gizmo);
+  bar.append(take, ...moves, keys, said, pace);
   return bar;
 }
 
@@ -116,6 +123,8 @@ function show() {
   const state = hand.state;
   if (!state) return;
   for (const row of rows) row.show(state, hand.leads);
+  for (const button of moves) button.disabled = !hand.leads;
+  take.hidden = !state.can_take;
   const isProblem = performance.now() < problemEnds;
   said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
   said.textContent = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
