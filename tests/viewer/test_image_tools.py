@@ -212,15 +212,43 @@ def test_the_kept_picture_has_the_image_its_scale_and_the_values(page: Any, tmp_
     assert (picture[: rows[0]].max(axis=2) > 150).any()  # scene and time, above
 
 
-def test_the_annotated_picture_is_not_measured(page: Any, simulator: Simulator) -> None:
-    encoded = cv2.imencode(".jpg", np.full((60, 80, 3), 90, np.uint8))[1].tobytes()
+def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> None:
+    """A picture in colour in place of the image, as wide and high as that."""
+    encoded = cv2.imencode(".jpg", np.full((rows, columns, 3), 90, np.uint8))[1].tobytes()
     feed = Feed("annotated", rate=None)
-    header = {"stamp": "1", "rows": 60, "columns": 80, "encoding": "jpeg"}
+    header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "jpeg"}
     feed.offer(lambda n: Packet("annotated", n, header, encoded))
     simulator.add(feed)
     page.evaluate("import('/us_sim/assets/image.js').then(m => m.setMode('annotated'))")
-    page.wait_for_function("document.querySelector('.us-image').width === 80")
-    assert page.get_by_role("button", name="Distance", exact=True).is_disabled()
+    page.wait_for_function(
+        f"""() => {{
+            const canvas = document.querySelector(".us-image");
+            const [red, green] = canvas.getContext("2d").getImageData(9, 9, 1, 1).data;
+            return canvas.width === {columns} && Math.abs(red - 90) < 3 && red === green;
+        }}"""
+    )
+
+
+def test_the_annotated_picture_is_measured_as_the_image_below_it(
+    page: Any, simulator: Simulator
+) -> None:
+    page.keyboard.press("d")
+    drag(page, at(page, -8, 5), at(page, 4, 5))
+    show_annotated(page, simulator, COLUMNS, ROWS)
+    page.get_by_role("button", name="Distance", exact=True).click()
+    drag(page, at(page, 0, 6), at(page, 0, 33))
+    lengths = [float(value.split()[0]) for value in values(page)]
+    assert lengths == pytest.approx([12, 27], abs=0.1)
+
+
+def test_a_picture_of_another_size_is_not_measured_and_says_why(
+    page: Any, simulator: Simulator
+) -> None:
+    button = page.get_by_role("button", name="Distance", exact=True)
+    assert button.get_attribute("title") == "Drag from point to point: mm (key D)"
+    show_annotated(page, simulator, 80, 60)
+    _until(button.is_disabled)
+    assert "another size than the B-mode image" in button.get_attribute("title")
     page.keyboard.press("d")
     drag(page, (900, 300), (1000, 300))
     assert values(page) == []

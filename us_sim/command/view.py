@@ -86,6 +86,5 @@ def _view(args: argparse.Namespace) -> int:
         supervision=supervision(args),
         view=viewer(args),
         by_hand=not args.tracker,
-        stay=True,
-        loop=args.loop,
+        playing={"stay": True, "loop": args.loop} if args.path is not None else None,
     )

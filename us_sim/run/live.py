@@ -6,7 +6,8 @@ import contextlib
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,8 +91,7 @@ def run(
     supervision: SupervisionSettings,
     view: ViewerSettings | None = None,
     by_hand: bool = False,
-    stay: bool = False,
-    loop: bool = False,
+    playing: Mapping[str, object] | None = None,
 ) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
@@ -105,25 +105,15 @@ def run(
         supervision: when a node hangs, and how often it is started again.
         view: address of the page that shows the simulation; None is no page.
         by_hand: poses come on ``tracker/pose``, whatever the scene's tracker is.
-        stay: at the path's end the probe is held there, and the run goes on.
-        loop: the path begins again at its end.
+        playing: parameters of what plays the path.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
             recorded.
     """
     keep_on_this_host(network=network)
-    playing = {"stay": stay, "loop": loop} if path is not None and (stay or loop) else {}
-    request = Request(
-        scene,
-        parameters,
-        record,
-        path,
-        playing=playing,
-        duration=duration,
-        view=view,
-        by_hand=by_hand,
-    )
+    request = Request(scene, parameters, record, path, duration=duration, view=view)
+    request = replace(request, by_hand=by_hand, playing=playing or {})
     plan = plan_of(request)
     prepare_volume(scene, path)
     outcome = follow(plan, None, supervision, request)

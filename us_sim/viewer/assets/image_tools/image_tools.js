@@ -23,6 +23,7 @@ place.append(bar);
 function button(text, title, onclick) {
   const made = Object.assign(document.createElement("button"), { type: "button", title, onclick });
   made.textContent = text;
+  made.dataset.title = title;
   bar.append(made);
   return made;
 }
@@ -75,7 +76,8 @@ function showFreeze() {
 function showMeasures() {
   for (const [name, made] of Object.entries(tools)) {
     press(made, overlay.tool === name);
-    made.disabled = !overlay.isMeasurable;
+    made.disabled = Boolean(overlay.obstacle);
+    made.title = overlay.obstacle || made.dataset.title;
   }
   clearing.disabled = !overlay.measures.length;
   list.replaceChildren(

@@ -22,10 +22,14 @@ const handlers = [];
 let tool = null;
 let drag = null;
 let colours = 0;
-let isMeasurable = true;
+/** Columns and rows of the B-mode image of this geometry; the annotated one is drawn over it. */
+let plain = null;
+let matrix = null;
+/** Why nothing can be measured, for a person. */
+let obstacle = "There is no image yet";
 
 function draw() {
-  const map = isMeasurable ? plane() : null;
+  const map = obstacle ? null : plane();
   const focused = document.activeElement?.dataset?.point;
   sheet.replaceChildren();
   if (map) for (const [number, measure] of measures.entries()) drawOne(measure, number, map);
@@ -207,9 +211,9 @@ export const overlay = {
     return tool;
   },
 
-  /** Whether the image that is shown can be measured. */
-  get isMeasurable() {
-    return isMeasurable;
+  /** Why the image that is shown cannot be measured, for a person; "" where it can. */
+  get obstacle() {
+    return obstacle;
   },
 
   /** Have `handler()` called when something of it has changed. */
@@ -219,7 +223,7 @@ export const overlay = {
 
   /** Take a tool in hand, for one measurement; the same again puts it away. */
   use(wanted) {
-    tool = wanted === tool || !isMeasurable ? null : wanted;
+    tool = wanted === tool || obstacle ? null : wanted;
     sheet.classList.toggle("us-measuring", tool !== null);
     events.tell("image-tool", tool);
     draw();
@@ -238,11 +242,23 @@ export const overlay = {
 };
 
 new ResizeObserver(draw).observe(place);
-events.on("image-geometry", draw);
-onImage(({ kind }) => {
-  // The annotated picture has borders, so its pixels are elsewhere.
-  const can = kind !== "annotated";
-  if (can === isMeasurable) return;
-  isMeasurable = can;
-  overlay.use(null);
+events.on("image-geometry", (geometry) => {
+  if (matrix !== null && matrix !== String(geometry)) plain = null;
+  matrix = String(geometry);
+  block("");
+  draw();
 });
+onImage(({ kind, columns, rows }) => {
+  if (kind !== "annotated") plain = [columns, rows];
+  const isLikePlain = !plain || (plain[0] === columns && plain[1] === rows);
+  block(isLikePlain ? "" : "This picture has another size than the B-mode image, whose scale is known");
+});
+
+/** Say why nothing can be measured, or that it can. */
+function block(why) {
+  const wanted = plane() ? why : "It is not known yet where in the patient the image's pixels are";
+  if (wanted === obstacle) return;
+  obstacle = wanted;
+  if (obstacle) overlay.use(null);
+  else draw();
+}

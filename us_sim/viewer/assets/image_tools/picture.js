@@ -20,7 +20,7 @@ export function picture() {
   const scale = Math.max(LEAST, image.height) / (last[1] - first[1]); // pixels a mm
   const width = Math.round((last[0] - first[0]) * scale);
   const height = Math.round((last[1] - first[1]) * scale);
-  const measures = overlay.isMeasurable ? overlay.measures : [];
+  const measures = overlay.obstacle ? [] : overlay.measures;
   const lines = measures.filter((measure) => !(measure instanceof Note));
   const canvas = document.createElement("canvas");
   canvas.width = LEFT + width + EDGE;
