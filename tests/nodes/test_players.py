@@ -16,10 +16,10 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Int32MultiArray, String
 
 from us_sim.errors import BagError
-from us_sim.nodes.conversions import image_message
+from us_sim.nodes.conversions import image_message, stamp_message
 from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.session_player import SessionPlayer
-from us_sim.recording.path import ProbePath, write_path
+from us_sim.recording.path import ProbePath, read_path, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
 
@@ -300,3 +300,36 @@ def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
     assert [message.data for message in said] == ["5", "6", "7", "8", "9"]
     assert not player.count_publishers("/excluded")
     assert not player.finished.done()
+
+
+def ask(bench, player, service, **fields):
+    """What one of a player's services answers."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", "_", service).lower()
+    kind = getattr(pytest.importorskip("rosbag2_interfaces.srv"), service)
+    client = bench.peer.create_client(kind, f"/{player.get_name()}/{name}")
+    bench.spin_until(client.service_is_ready)
+    answer = client.call_async(kind.Request(**fields))
+    bench.spin_until(answer.done)
+    return answer.result()
+
+
+def test_a_player_is_controlled_by_the_services_of_rosbag2(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(path), paused=True, stay=True)
+    bench.spin_until(lambda: poses)
+    assert ask(bench, player, "IsPaused").paused
+    begun = int(read_path(path).log_times[0])
+    there = stamp_message(begun + 100_000_000)
+    assert ask(bench, player, "Seek", time=there).success  # the sixth pose
+    bench.spin_until(lambda: round(poses[-1].pose.position.z * 1e3) == 5)
+    for outside in (begun - 1, begun + 10**9):
+        assert not ask(bench, player, "Seek", time=stamp_message(outside)).success
+    assert ask(bench, player, "SetRate", rate=50.0).success
+    assert not ask(bench, player, "SetRate", rate=-1.0).success
+    assert ask(bench, player, "GetRate").rate == 50.0
+    ask(bench, player, "TogglePaused")
+    bench.spin_until(lambda: round(poses[-1].pose.position.z * 1e3) == 9)
+    ask(bench, player, "Pause")
+    assert ask(bench, player, "IsPaused").paused
+    ask(bench, player, "Resume")
+    assert not ask(bench, player, "IsPaused").paused

@@ -21,6 +21,7 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.playback import Playback
+from us_sim.nodes.player_services import offer_player_services
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.nodes.session_settings import PathPlayerSettings
@@ -71,6 +72,10 @@ class PathPlayer(GuardedNode):
         self._starting = self.create_timer(CHECK_S, self._begin)
         self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
         self._playhead = self._playback.head
+        if not lockstep:
+            length = int(self._ages[-1])
+            first = int(self._path.log_times[0])
+            offer_player_services(self, lambda: self._settings, first, length)
         self.pose_count = len(self._path)
         self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
         if self._path.note:

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from rclpy.node import Node
 
+from us_sim.nodes.rosbag2_service import offer_service
 from us_sim.recording.losses import Loss
 
 __all__ = ["Controlled", "RecorderEvents", "offer_services"]
@@ -44,18 +45,9 @@ class Controlled(Protocol):
 
 def offer_services(node: Node, recorder: Controlled) -> bool:
     """Offer rosbag2's services; False where ``rosbag2_interfaces`` is not installed."""
-    try:
-        from rosbag2_interfaces import srv
-    except ImportError:
-        return False
 
-    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> None:
-        def answer(request: Any, response: Any) -> Any:
-            act(request, response)
-            return response
-
-        if hasattr(srv, service):  # Record is newer than Jazzy
-            node.create_service(getattr(srv, service), f"~/{name}", answer)
+    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
+        return offer_service(node, service, name, act)
 
     def toggle(_: Any, __: Any) -> None:
         (recorder.resume if recorder.paused else recorder.pause)()
@@ -64,13 +56,14 @@ def offer_services(node: Node, recorder: Controlled) -> bool:
         response.error_string = recorder.record(request.uri)
         response.return_code = int(bool(response.error_string))
 
-    offer("Pause", "pause", lambda *_: recorder.pause())
+    if not offer("Pause", "pause", lambda *_: recorder.pause()):
+        return False
     offer("Resume", "resume", lambda *_: recorder.resume())
     offer("TogglePaused", "toggle_paused", toggle)
     offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", recorder.paused))
     offer("SplitBagfile", "split_bagfile", lambda *_: recorder.split())
     offer("Stop", "stop", lambda *_: recorder.stop())
-    offer("Record", "record", record)
+    offer("Record", "record", record)  # newer than Jazzy
     offer(
         "Snapshot",
         "snapshot",

@@ -17,6 +17,7 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.message_types import message_type
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.playback import Playback
+from us_sim.nodes.player_services import offer_player_services
 from us_sim.nodes.process import run_node
 from us_sim.nodes.session_settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
@@ -71,6 +72,7 @@ class SessionPlayer(GuardedNode):
         self._start = self.create_timer(START_S, self._begin)
         self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
         self._playhead = self._playback.head
+        offer_player_services(self, lambda: self._settings, self._first, self._length)
 
     @property
     def _settings(self) -> SessionPlayerSettings:
