@@ -31,15 +31,21 @@ def simulator(served: Any) -> Simulator:
     return simulator
 
 
+@pytest.fixture(scope="session")
+def profile(browser: Any) -> Any:
+    """A person's browser, which loads the page's files once."""
+    return browser.new_context(viewport={"width": 1280, "height": 720})
+
+
 @pytest.fixture
-def page(browser: Any, served: Any, simulator: Simulator) -> Iterator[Any]:  # noqa: ARG001
+def page(profile: Any, served: Any, simulator: Simulator) -> Iterator[Any]:  # noqa: ARG001
     """A page of 1280 × 720 that is not loaded yet: ``page.goto(page.address)`` does.
 
     Afterwards it is refused what no page may have: errors, on the console or otherwise, and
     requests that go beyond the viewer.
     """
     server, _ = served
-    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page = profile.new_page()
     page.address = server.address
     wrong: list[str] = []
     watched(page, server.address, wrong)

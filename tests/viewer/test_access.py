@@ -1,6 +1,7 @@
 """Who may open the page."""
 
 import asyncio
+import threading
 from typing import Any
 
 import pytest
@@ -44,7 +45,12 @@ def asked(
     async def send(message: Any) -> None:
         sent.append(message)
 
-    asyncio.run(Access(app, token)(scope, receive, send))
+    # In a thread of its own: in this one a browser of other tests may have its loop.
+    answering = threading.Thread(
+        target=lambda: asyncio.run(Access(app, token)(scope, receive, send))
+    )
+    answering.start()
+    answering.join()
     return sent[0] if sent == ["passed"] else sent
 
 
