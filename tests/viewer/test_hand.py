@@ -206,3 +206,16 @@ def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(
     viewer.say()
     button.wait_for(state="hidden")
     assert centre.is_enabled()
+
+
+def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
+    page: Any, viewer: FakeHand
+) -> None:
+    told = page.locator("#hand [role=status]")
+    page.get_by_role("button", name="Lift").click()
+    page.wait_for_function("document.querySelector('.us-said').textContent === 'the hand cannot'")
+    viewer.say(leader="driver", obstacle="driver moves the probe")
+    page.wait_for_function("document.querySelector('.us-quantity input').disabled")
+    viewer.say()
+    page.wait_for_function("!document.querySelector('.us-quantity input').disabled")
+    assert told.inner_text() == "You hold the probe"

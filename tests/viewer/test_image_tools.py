@@ -147,6 +147,7 @@ def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
         await_grey(page, grey)
     page.keyboard.press(" ")
     _until(lambda: not images.feed.is_watched)
+    assert page.locator("#readout").inner_text() == "frozen"
     images.show(99)
     for _ in range(3):
         page.keyboard.press(",")
@@ -239,6 +240,11 @@ def test_the_annotated_picture_is_measured_as_the_image_below_it(
     drag(page, at(page, 0, 6), at(page, 0, 33))
     lengths = [float(value.split()[0]) for value in values(page)]
     assert lengths == pytest.approx([12, 27], abs=0.1)
+    scale = page.locator(".us-scale")
+    assert not scale.is_visible()  # that picture has scales of its own
+    page.keyboard.press(" ")
+    page.keyboard.press(",")  # the image before it, which has not
+    scale.wait_for()
 
 
 def test_a_picture_of_another_size_is_not_measured_and_says_why(

@@ -2,6 +2,7 @@
 
 import json
 import socket
+import time
 import urllib.error
 import urllib.request
 from typing import Any
@@ -15,6 +16,7 @@ from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.status import Level, NodeStatus
 
 PIXEL = 1e-4  # m
 MATRIX = [PIXEL, 0, 0, -0.0256, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
@@ -143,3 +145,43 @@ def test_the_header_says_what_runs_and_what_is_done_with_it(
     simulator.session.tell_state(done)
     page.get_by_text("recording press.mcap").wait_for()
     assert page.evaluate("usSim.scene()") == "liver"
+
+
+@pytest.mark.parametrize("size", [(768, 1024), (1024, 768), (1280, 720)])
+def test_the_panels_can_be_closed_however_the_screen_was_turned(
+    page: Any, size: tuple[int, int]
+) -> None:
+    page.set_viewport_size({"width": 768, "height": 1024})
+    page.goto(page.address)
+    button = page.get_by_role("button", name="Panels")
+    tabs = page.get_by_role("tab")
+    button.click()
+    tabs.last.wait_for()
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+
+    def is_whole(tab: Any) -> bool:
+        """Whether nothing lies over a tab, and nothing of it is cut off."""
+        box = tab.bounding_box()
+        x, y = box["x"] + box["width"] - 2, box["y"] + box["height"] / 2
+        on_top = f"document.elementFromPoint({x}, {y})?.closest('[role=tab]')?.textContent"
+        right = box["x"] + box["width"]
+        return right <= size[0] + 1 and page.evaluate(on_top) == tab.text_content()
+
+    for tab in tabs.all():
+        until(lambda tab=tab: is_whole(tab), "each tab can be seen and clicked")
+    button.click(timeout=10_000)
+    tabs.last.wait_for(state="hidden")
+
+
+def test_the_table_of_nodes_is_above_the_plots(page: Any, simulator: Simulator) -> None:
+    page.goto(page.address)
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab", name="Status").click()
+    now = time.monotonic()
+    for number in range(9):
+        simulator.status.tell(NodeStatus(f"node_{number}", Level.WELL, "runs"), now)
+    page.get_by_text("node_8").wait_for()
+    table = page.locator(".us-status").bounding_box()
+    plot = page.locator(".us-plot").first.bounding_box()
+    assert table["height"] > 9 * 30
+    assert table["y"] + table["height"] <= plot["y"]

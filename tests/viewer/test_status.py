@@ -1,8 +1,10 @@
 """What pages know of nodes: newest status, problems, silence, and bounded histories."""
 
+import time
+
 import pytest
 
-from us_sim.viewer.status import Level, NodeStatus, StatusBoard
+from us_sim.viewer.status import GONE_S, Level, NodeStatus, StatusBoard
 
 VALUES = {
     "state": "fem",
@@ -50,6 +52,17 @@ def test_a_silent_node_is_gone_and_later_forgotten():
     assert board.node("b", now=3.1).rate is None
     assert [s.name for s in board.nodes(now=60.5)] == ["a"]
     assert board.node("c", now=3.0) is None
+
+
+def test_nobody_is_silent_who_was_not_listened_to():
+    board = StatusBoard()
+    board.watch(pages=1)
+    begun = time.monotonic()
+    board.tell(said("a"), now=begun - 2 * GONE_S)
+    assert [s.level for s in board.nodes(begun + 0.5)] == [Level.WELL]
+    assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
+    board.watch(pages=1)  # another page, which changes nothing
+    assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
 
 
 def test_histories_are_of_the_numbers_that_are_plotted_and_bounded():

@@ -125,10 +125,8 @@ class LiveTissue:
             made = materials_of(self._scene, materials, model.mesh, self._volume)
             return replace(model, materials=made)
 
-        reasons = [
-            f"{own.solver} compared with {own.compare_with or 'nothing'}" if key == OWN else key
-            for key in changed
-        ]
+        compared = f" compared with {own.compare_with}" if own.compare_with else ""
+        reasons = [f"{own.solver}{compared}" if key == OWN else key for key in changed]
         return Plan(
             own.solver,
             own.compare_with or "",

@@ -174,9 +174,11 @@ class ViewerHand:
         replayed = self._session.state.replay
         self._can_take = bool(replayed) and self._leader in PLAYERS
         if self._can_take:
-            ends = self._session.state.replay_state == "finished"
-            what = "has ended and holds the probe" if ends else "moves the probe"
-            return f"the replay of {PurePath(replayed).name} {what}: Take the probe ends it"
+            what = "moves the probe"
+            if self._session.state.replay_state == "finished":
+                holds = self._leader == PLAYERS[0]
+                what = "has ended and holds the probe" if holds else "has ended"
+            return f"the replay of {PurePath(replayed).name} {what}"
         if others:
             return f"{others[0]} moves the probe: end it to take the probe yourself"
         hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
+
 from nicegui import ui
 
 from us_sim.viewer.session import SessionState
@@ -19,6 +21,9 @@ def words_of(state: SessionState) -> tuple[str, str]:
     ('upper arm', '')
     >>> words_of(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
+    >>> replay = {"replay": "/home/a/press.mcap", "replay_state": "finished"}
+    >>> words_of(SessionState(is_there=True, scene="upper_arm", record="b.mcap", **replay))
+    ('upper arm', 'recording b.mcap · replay of press.mcap: finished')
     """
     name = state.scene.replace("_", " ")
     if state.is_busy:
@@ -26,7 +31,8 @@ def words_of(state: SessionState) -> tuple[str, str]:
         return name, f"{state.state}{done}"
     parts = [state.problem]
     parts += [f"recording {state.record}"] if state.record else []
-    parts += [f"playing {state.replay}"] if state.replay else []
+    if state.replay:
+        parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")
     return name, " · ".join(filter(None, parts))
 
 

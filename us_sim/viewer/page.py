@@ -76,7 +76,9 @@ def _block(name: str) -> None:
 
 
 def _drawer(simulator: Simulator) -> ui.right_drawer:
-    drawer = ui.right_drawer(value=False, bordered=True).classes("us-drawer").props("width=380")
+    drawer = ui.right_drawer(value=False, bordered=True).classes("us-drawer")
+    # Quasar would cover the header, with the button that closes it, where a screen is narrow.
+    drawer.props("width=380 behavior=desktop")
     with drawer:
         if PANELS:
             with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -110,6 +111,7 @@ class StatusBoard:
         self._histories: dict[tuple[str, str], deque[Point]] = {}
         self._forces: deque[Point] = deque(maxlen=int(HISTORY_S * FORCES_A_SECOND))
         self._pages = self._plots = 0
+        self._since = 0.0  # s, monotonic, from when on pages look; nothing is heard before
 
     @property
     def is_watched(self) -> bool:
@@ -122,10 +124,15 @@ class StatusBoard:
         return self._plots > 0
 
     def watch(self, pages: int = 0, plots: int = 0) -> None:
-        """So many pages, or plots of the force, more look; fewer where negative."""
+        """So many pages, or plots of the force, more look; fewer where negative.
+
+        Nobody is silent for not having been listened to while no page looked.
+        """
         with self._lock:
             before = self.is_watched, self.is_force_watched
             self._pages += pages
+            if self.is_watched and not before[0]:
+                self._since = time.monotonic()
             self._plots += plots
             changed = before != (self.is_watched, self.is_force_watched)
         if changed:
@@ -162,7 +169,7 @@ class StatusBoard:
             known = sorted(self._nodes.values(), key=lambda status: status.name)
         return [
             dataclasses.replace(status, level=Level.GONE, message="silent", values={})
-            if now - status.heard > GONE_S
+            if now - max(status.heard, self._since) > GONE_S
             else status
             for status in known
             if now - status.heard < FORGOTTEN_S

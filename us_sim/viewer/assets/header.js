@@ -10,17 +10,23 @@ readout.setAttribute("role", "status");
 readout.title = "Ultrasound images drawn in this page, and whether the viewer answers";
 
 let connected = false;
+let frozen = false;
 
 function show() {
   const now = performance.now();
   while (times.length && now - times[0] > WINDOW_MS) times.shift();
   const rate = (1000 * times.length) / WINDOW_MS;
-  readout.textContent = connected ? `${rate.toFixed(0)} images/s` : "the viewer does not answer";
+  const shown = frozen ? "frozen" : `${rate.toFixed(0)} images/s`;
+  readout.textContent = connected ? shown : "the viewer does not answer";
   readout.classList.toggle("us-wrong", !connected);
 }
 
 events.on("connection", (open) => {
   connected = open;
+  show();
+});
+events.on("image-frozen", (on) => {
+  frozen = on;
   show();
 });
 let drawn = 0;

@@ -51,6 +51,7 @@ export function onImage(handler) {
 /** Draw what a packet of the image holds; also one that was kept. */
 export async function drawImage(header, payload) {
   const { columns, rows } = header;
+  scale.hidden = header.kind === "annotated"; // that one has scales of its own
   if (canvas.width !== columns || canvas.height !== rows) {
     canvas.width = columns;
     canvas.height = rows;
@@ -96,7 +97,6 @@ export function setMode(mode) {
   if (wanted === shown) return;
   stream.watch(shown, false);
   shown = wanted;
-  scale.hidden = wanted === "annotated"; // that one has scales of its own
   stream.watch(shown, live);
 }
 

@@ -118,6 +118,7 @@ function makeBar() {
 
 let problem = "";
 let problemEnds = 0;
+let led = false;
 
 function show() {
   const state = hand.state;
@@ -125,6 +126,8 @@ function show() {
   for (const row of rows) row.show(state, hand.leads);
   for (const button of moves) button.disabled = !hand.leads;
   take.hidden = !state.can_take;
+  if (hand.leads && !led) problemEnds = 0; // what was in the way is not any more
+  led = hand.leads;
   const isProblem = performance.now() < problemEnds;
   said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
   said.textContent = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
