@@ -33,7 +33,7 @@ from numba.core.serialize import dumps
 
 from us_sim.cache import cache_folder
 
-__all__ = ["kernel_folder", "njit"]
+__all__ = ["kernel_folder", "njit", "warm_up"]
 
 _DIGEST = 32  # bytes of a checksum, at the beginning of a file
 _WRITABLE_BY_OTHERS = 0o022
@@ -202,3 +202,13 @@ def _say_once(kind: str, sentence: str, *words: object) -> None:
     """A warning the first time; many kernels are damaged by one cause."""
     _logger.log(logging.DEBUG if kind in _said else logging.WARNING, sentence, *words)
     _said.add(kind)
+
+
+def warm_up() -> None:
+    """Have numba made ready: the first kernel of a process takes far longer than the others."""
+    _nothing()
+
+
+@njit(cache=True)
+def _nothing() -> None:
+    """The kernel that does nothing."""

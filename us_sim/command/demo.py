@@ -62,16 +62,20 @@ def _add_options(demo: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from us_sim.run.live import demo
+    from us_sim.run.forking import ForkServer
 
-    return demo(
-        scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
-        args.volume,
-        args.out,
-        node_parameters(args.param),
-        network=args.network,
-        supervision=supervision(args),
-        source=args.source,
-        path=args.path,
-        view=viewed(args),
-    )
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import demo
+
+        return demo(
+            scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
+            args.volume,
+            args.out,
+            node_parameters(args.param),
+            network=args.network,
+            supervision=supervision(args),
+            source=args.source,
+            path=args.path,
+            view=viewed(args),
+            forks=forks,
+        )

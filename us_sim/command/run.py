@@ -60,33 +60,45 @@ def _add_options(run: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from us_sim.run.live import dry_run, run
-    from us_sim.scene.reading import load_scene
+    from us_sim.run.forking import ForkServer
 
     asked = read_settings(args, RunSettings)
-    scene = load_scene(scene_name(args), volume=args.volume)
-    parameters = node_parameters(args.param)
     if args.dry_run:
-        from us_sim.scene.readable_files import check_files
+        return _dry_run(args, asked)
+    parameters = node_parameters(args.param)
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import run
+        from us_sim.scene.reading import load_scene
 
-        checked = check_files(scene)
-        path = args.path or (Path(scene.path) if scene.path else None)
-        if path is not None and not scene.volume.phantom:
-            from us_sim.scene.building import volume_of
-            from us_sim.scene.image_in_volume import check_path_in_volume
+        return run(
+            load_scene(scene_name(args), volume=args.volume),
+            parameters,
+            record=asked.record,
+            path=args.path,
+            duration=asked.duration,
+            network=args.network,
+            supervision=supervision(args),
+            view=viewed(args),
+            forks=forks,
+        )
 
-            check_path_in_volume(scene, path, volume_of(scene))
-        print(dry_run(scene, parameters, record=asked.record, path=args.path, view=viewed(args)))
-        if checked:
-            print(f"readable  {', '.join(checked)}")
-        return 0
-    return run(
-        scene,
-        parameters,
-        record=asked.record,
-        path=args.path,
-        duration=asked.duration,
-        network=args.network,
-        supervision=supervision(args),
-        view=viewed(args),
-    )
+
+def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
+    """Say what would run, having looked into the files that it names."""
+    from us_sim.run.live import dry_run
+    from us_sim.scene.readable_files import check_files
+    from us_sim.scene.reading import load_scene
+
+    scene = load_scene(scene_name(args), volume=args.volume)
+    checked = check_files(scene)
+    path = args.path or (Path(scene.path) if scene.path else None)
+    if path is not None and not scene.volume.phantom:
+        from us_sim.scene.building import volume_of
+        from us_sim.scene.image_in_volume import check_path_in_volume
+
+        check_path_in_volume(scene, path, volume_of(scene))
+    parameters = node_parameters(args.param)
+    print(dry_run(scene, parameters, record=asked.record, path=args.path, view=viewed(args)))
+    if checked:
+        print(f"readable  {', '.join(checked)}")
+    return 0

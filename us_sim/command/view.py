@@ -59,7 +59,7 @@ def _view(args: argparse.Namespace) -> int:
     from us_sim.command.scene_options import node_parameters, scene_name, supervision, viewer
     from us_sim.command.setting_options import read_settings
     from us_sim.errors import UsSimError
-    from us_sim.run.live import run, view_running
+    from us_sim.run.forking import ForkServer
 
     parameters = node_parameters(args.param)
     if args.attach:
@@ -69,22 +69,27 @@ def _view(args: argparse.Namespace) -> int:
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
                 "--record and --tracker, or leave out --attach"
             )
+        from us_sim.run.live import view_running
+
         return view_running(
             viewer(args), parameters, network=args.network, supervision=supervision(args)
         )
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
-    from us_sim.scene.reading import load_scene
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import run
+        from us_sim.scene.reading import load_scene
 
-    return run(
-        load_scene(scene_name(args, "upper_arm"), volume=args.volume),
-        parameters,
-        record=read_settings(args, RunSettings, ("record",)).record,
-        path=args.path,
-        duration=None,
-        network=args.network,
-        supervision=supervision(args),
-        view=viewer(args),
-        by_hand=not args.tracker,
-        playing={"stay": True, "loop": args.loop} if args.path is not None else None,
-    )
+        return run(
+            load_scene(scene_name(args, "upper_arm"), volume=args.volume),
+            parameters,
+            record=read_settings(args, RunSettings, ("record",)).record,
+            path=args.path,
+            duration=None,
+            network=args.network,
+            supervision=supervision(args),
+            view=viewer(args),
+            by_hand=not args.tracker,
+            playing={"stay": True, "loop": args.loop} if args.path is not None else None,
+            forks=forks,
+        )

@@ -10,6 +10,7 @@ from pathlib import Path
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.domain_lock import alone_on_domain
+from us_sim.run.forking import ForkServer
 from us_sim.run.graph import VIEWER, ProcessGroup
 from us_sim.run.losses import Outcome
 from us_sim.run.monitored import Monitored
@@ -28,7 +29,11 @@ RIVALRY_S = 5.0
 
 
 def follow(
-    plan: Plan, log: Path | None, settings: SupervisionSettings, request: Request | None = None
+    plan: Plan,
+    log: Path | None,
+    settings: SupervisionSettings,
+    request: Request | None = None,
+    forks: ForkServer | None = None,
 ) -> Outcome:
     """Start the plan's processes and stay with them until they are done; how it went.
 
@@ -38,12 +43,13 @@ def follow(
         settings: when a node hangs, and how often it is started again.
         request: that the plan was made for, which may change while it runs. None where what runs
             is no simulation, of which there is one on a domain.
+        forks: that the processes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: a node cannot start, or another simulation runs on this domain.
     """
     with contextlib.nullcontext() if request is None else alone_on_domain():
-        group = ProcessGroup(log)
+        group = ProcessGroup(log, forks)
         supervisor = simulation = None
         startup = 0.0
         # A page loads while the others are looked for and started.

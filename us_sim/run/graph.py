@@ -20,6 +20,7 @@ from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
 from us_sim.nodes.viewer_settings import TOKEN, ViewerSettings
 from us_sim.run.deferred_signals import deferred_signals
+from us_sim.run.forking import ForkServer
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
 
@@ -145,9 +146,11 @@ class ProcessGroup:
 
     Args:
         log: where their output goes; None shows it on this terminal, above any progress.
+        forks: that they are forked from; None starts each as a program.
     """
 
-    def __init__(self, log: Path | None = None) -> None:
+    def __init__(self, log: Path | None = None, forks: ForkServer | None = None) -> None:
+        self._forks = forks
         self._running: dict[str, RunningNode] = {}
         self._standbys: dict[str, RunningNode] = {}
         self._leaving: list[tuple[str, RunningNode, float]] = []  # and until when they may take
@@ -167,7 +170,7 @@ class ProcessGroup:
                 standby = self._standbys.pop(process.node, None)
                 show = self._tell if process.node == VIEWER else self._show
                 if standby is None or not standby.go_on(process, show):
-                    standby = RunningNode(process, show)
+                    standby = RunningNode(process, show, self._forks)
                 self._running[process.node] = standby
 
     def stand_by(self, process: NodeProcess) -> bool:
@@ -175,7 +178,8 @@ class ProcessGroup:
         standby = self._standbys.get(process.node)
         if standby is None or standby.process.poll() is not None:
             with deferred_signals():
-                standby = self._standbys[process.node] = RunningNode(process, None)
+                standby = RunningNode(process, None, self._forks)
+                self._standbys[process.node] = standby
         return standby.said == STANDING_BY
 
     def _tell(self, line: str) -> None:

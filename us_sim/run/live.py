@@ -16,6 +16,7 @@ from us_sim.nodes.settings import checked_parameters
 from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.progress import Progress, late_progress
 from us_sim.run.following import follow
+from us_sim.run.forking import ForkServer
 from us_sim.run.graph import (
     NodeProcess,
     Parameters,
@@ -92,6 +93,7 @@ def run(
     view: ViewerSettings | None = None,
     by_hand: bool = False,
     playing: Mapping[str, object] | None = None,
+    forks: ForkServer | None = None,
 ) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
@@ -106,6 +108,7 @@ def run(
         view: address of the page that shows the simulation; None is no page.
         by_hand: poses come on ``tracker/pose``, whatever the scene's tracker is.
         playing: parameters of what plays the path.
+        forks: that the nodes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
@@ -116,7 +119,7 @@ def run(
     request = replace(request, by_hand=by_hand, playing=playing or {})
     plan = plan_of(request)
     prepare_volume(scene, path)
-    outcome = follow(plan, None, supervision, request)
+    outcome = follow(plan, None, supervision, request, forks)
     for file in outcome.files:
         print(f"recorded to {file}")
     _require_nothing_lost(outcome)
@@ -134,6 +137,7 @@ def demo(
     source: str | None = None,
     path: Path | None = None,
     view: ViewerSettings | None = None,
+    forks: ForkServer | None = None,
 ) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
@@ -148,6 +152,7 @@ def demo(
             None is the one that the scene's tracker asks for.
         path: bag or recording that is played in place of the scene's own path.
         view: address of the page that shows the simulation; None is no page.
+        forks: that the nodes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
@@ -174,7 +179,7 @@ def demo(
         plan = plan_of(request)
         prepare_volume(scene, played)
     started = time.monotonic()
-    outcome = follow(plan, out / "nodes.log", supervision, request)
+    outcome = follow(plan, out / "nodes.log", supervision, request, forks)
     try:
         _report(scene, out, outcome, time.monotonic() - started, video)
     except UsSimError as error:

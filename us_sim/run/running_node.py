@@ -11,10 +11,10 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from us_sim.errors import UsSimError
 from us_sim.run.end_with_parent import end_with_parent
+from us_sim.run.forking import ForkedProcess, ForkServer, package_on_path
 from us_sim.run.parameter_texts import require_texts
 
 __all__ = ["COMPLAINT", "STANDING_BY", "STOP_S", "NodeProcess", "RunningNode"]
@@ -58,22 +58,30 @@ class RunningNode:
     Args:
         node: what it runs.
         show: what is done with its lines; None for one that stands by.
+        forks: that it is forked from, where that can be.
     """
 
-    def __init__(self, node: NodeProcess, show: Callable[[str], None] | None) -> None:
-        package = str(Path(__file__).resolve().parents[2])
-        search = [package, os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, search))}
+    def __init__(
+        self,
+        node: NodeProcess,
+        show: Callable[[str], None] | None,
+        forks: ForkServer | None = None,
+    ) -> None:
+        command = node.command()
+        environment = os.environ | {"PYTHONPATH": package_on_path()}
         environment |= node.secrets
+        environment |= {} if show else {STANDBY: "1"}
         self.node = node
-        self.process = subprocess.Popen(
-            node.command(),
-            stdin=subprocess.DEVNULL if show else subprocess.PIPE,
+        is_fed = show is None
+        forked = forks.fork(node.node, command, environment, is_fed=is_fed) if forks else None
+        self.process: subprocess.Popen[str] | ForkedProcess = forked or subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE if is_fed else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=environment if show else environment | {STANDBY: "1"},
+            env=environment,
             start_new_session=True,
             preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
