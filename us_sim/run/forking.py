@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
+import math
 import os
 import select
 import signal
@@ -62,7 +63,7 @@ class ForkedProcess:
                     self.returncode = os.waitstatus_to_exitcode(status)
             return self.returncode
 
-    def wait(self, timeout: float) -> int:
+    def wait(self, timeout: float = math.inf) -> int:
         """Its exit status.
 
         Raises:
@@ -107,13 +108,18 @@ class ForkServer:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", _MODULE, " " * _ROOM],
-                stdin=theirs,
+                stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": package_on_path()},
                 start_new_session=True,
                 preexec_fn=end_with_parent,
             )
+
+    @property
+    def pid(self) -> int | None:
+        """Of its process; None where there is none."""
+        return self._process.pid if self._process else None
 
     def __enter__(self) -> ForkServer:
         return self
@@ -157,9 +163,7 @@ class ForkServer:
             ours.pop_all()
         os.close(ready)
         stdin = None if feed is None else os.fdopen(feed, "w", encoding="utf-8")
-        return ForkedProcess(
-            int(pid), stdin, os.fdopen(heard, encoding="utf-8", errors="replace")
-        )
+        return ForkedProcess(int(pid), stdin, os.fdopen(heard, encoding="utf-8", errors="replace"))
 
     def close(self) -> None:
         """End it; nodes go on."""

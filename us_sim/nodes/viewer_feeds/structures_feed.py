@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -18,7 +18,9 @@ from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_feeds.watched_topic import made_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.feed import Feed
-from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
+
+if TYPE_CHECKING:
+    from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
 
 __all__ = ["StructuresFeed"]
 
@@ -138,4 +140,6 @@ def _carried(message: MarkerArray, mesh: TetrahedralMesh) -> CarriedSurfaces:
     surfaces = surfaces_of(message, "patient")
     if not surfaces:
         raise MeshError("there is no triangle in it")
+    from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces  # with its kernels
+
     return CarriedSurfaces(mesh, surfaces)

@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
@@ -97,9 +96,7 @@ class BeamGrid:
     def _pixel_places(self, probe: Probe) -> tuple[NDArray, NDArray]:
         """Where each pixel lies among samples and beams, as `cv2.remap` takes it."""
         line, distance = probe.pixel_beams
-        row, column = distance_transform_edt(
-            np.isnan(line), return_distances=False, return_indices=True
-        )
+        row, column = _nearest(~np.isnan(line))
         beam = (line[row, column] + 0.5) * (self.beams / probe.lines) - 0.5
         sample = distance[row, column] / self.step - 0.5
         beam = np.clip(beam, 0, self.beams - 1).astype(np.float32)
@@ -125,10 +122,18 @@ class BeamGrid:
 
 def _nearest_shown(probe: Probe) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Row and column of the pixel nearest to each that a beam reaches, all in steps of two."""
-    row, column = distance_transform_edt(
-        np.isnan(probe.pixel_beams[0, ::2, ::2]), return_distances=False, return_indices=True
-    )
+    row, column = _nearest(~np.isnan(probe.pixel_beams[0, ::2, ::2]))
     return row, column
+
+
+def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(2, rows, columns) row and column of the marked pixel that is nearest to each."""
+    from scipy.ndimage import distance_transform_edt  # which only a fan needs
+
+    nearest: NDArray[np.int32] = distance_transform_edt(
+        ~marked, return_distances=False, return_indices=True
+    )
+    return nearest
 
 
 def aperture(probe: Probe, depth: NDArray[Any]) -> NDArray[np.float64]:

@@ -24,11 +24,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.spatial import cKDTree
 
 from us_sim.errors import VolumeError
-from us_sim.slicing.flow.centreline import centreline, resampled
 
 __all__ = ["DIRECTIONS", "Lumen", "lumen_of"]
 
@@ -93,6 +90,8 @@ class Lumen:
         Args:
             points: (P, 3) m.
         """
+        from scipy.spatial import cKDTree
+
         last = len(self.centres) - 1
         station = cKDTree(self.centres).query(points)[1].astype(np.float64)
         for _ in range(3):
@@ -122,6 +121,8 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
     Raises:
         VolumeError: they are no tube; the sentence begins with what they are instead.
     """
+    from us_sim.slicing.flow.centreline import centreline, resampled
+
     inside = np.argwhere(lumen)
     if not len(inside):
         raise VolumeError("is nowhere in the volume")
@@ -163,6 +164,8 @@ class _Walls:
         index_to_patient: NDArray[np.float64],
         reach: float,
     ) -> None:
+        from scipy.ndimage import gaussian_filter
+
         margin = 3
         first = np.maximum(low - margin, 0)
         end = np.minimum(high + margin, lumen.shape)
@@ -204,6 +207,8 @@ class _Walls:
         return np.asarray(points @ self._to_index[:3, :3].T + self._to_index[:3, 3])
 
     def _at(self, index: NDArray[np.float64]) -> NDArray[np.float32]:
+        from scipy.ndimage import map_coordinates
+
         coordinates = np.moveaxis(index, -1, 0)
         sampled = map_coordinates(self._inside, coordinates, order=1, mode="nearest")
         return np.asarray(sampled, dtype=np.float32)

@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
+from us_sim.geometry.connected_parts import connected_parts
 from us_sim.geometry.mesh_faces import FACES, MOST_NODES, face_order
 
 __all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
@@ -190,9 +189,8 @@ def _check_hinges(
     tetrahedra: NDArray[np.integer], one: NDArray[np.intp], other: NDArray[np.intp]
 ) -> None:
     """Whether tetrahedra hang together by faces; the pairs (P,) and (P,) have one in common."""
-    count = len(tetrahedra)
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(count, count))
-    bodies, body = connected_components(graph, directed=False)
+    body = connected_parts(len(tetrahedra), one, other)
+    bodies = int(body.max()) + 1
     if bodies == 1:
         return
     nodes = tetrahedra.max() + 1

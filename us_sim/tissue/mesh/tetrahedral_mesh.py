@@ -17,10 +17,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import MeshError
+from us_sim.geometry.connected_parts import connected_parts
 from us_sim.geometry.mesh_faces import boundary_faces, boundary_triangles
 from us_sim.tissue.mesh.check import EDGES, check_mesh, signed_volumes
 
@@ -82,11 +81,9 @@ class TetrahedralMesh:
         return (boundary_faces(self.tetrahedra) // 4).astype(np.int32)
 
     @cached_property
-    def parts(self) -> NDArray[np.int32]:
+    def parts(self) -> NDArray[np.int64]:
         """(N,) which part each node belongs to, from 0; parts touch nowhere."""
-        count = len(self.nodes)
-        graph = coo_array((np.ones(len(self.edges)), tuple(self.edges.T)), shape=(count, count))
-        return connected_components(graph, directed=False)[1]
+        return connected_parts(len(self.nodes), *self.edges.T)
 
 
 def uniform_planes(lo: float, hi: float, n: int) -> NDArray[np.float64]:
