@@ -18,7 +18,6 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.run.domain_lock import alone_on_domain
 from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, RECORDER, ending
 from us_sim.run.monitored import Monitored
@@ -29,6 +28,7 @@ from us_sim.run.watch import Watch
 from us_sim.scene.reading import load_scene
 from us_sim.settings.setting import rules_of
 from us_sim.share import find_bag
+from us_sim.viewer.viewer_settings import ViewerSettings
 
 LOOK_S = 0.1
 COMPILES = {"sigterm_timeout": "2", "sigkill_timeout": "1"}

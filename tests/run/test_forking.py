@@ -115,7 +115,7 @@ def test_what_has_threads_is_not_forked(tmp_path, monkeypatch):
             group.stop()
 
 
-def test_closed_it_leaves_no_process(tmp_path):
+def test_closed_it_leaves_no_process():
     forks = server()
     pid = forks.pid
     forks.close()

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 from us_sim.command.setting_options import add_setting_options, read_settings
-from us_sim.progress import late_progress
 from us_sim.settings.registry import CALIBRATIONS
 
 __all__ = ["add_calibrate"]
@@ -30,6 +29,8 @@ def _add_calibrations(parser: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(name: str, args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
+
     settings = read_settings(args, CALIBRATIONS.settings(name))
     print(CALIBRATIONS.load(name)(settings, late_progress(f"calibrate {name}")))
     return 0

@@ -12,7 +12,7 @@ from us_sim.errors import UsSimError
 from us_sim.run.supervision_settings import SupervisionSettings
 
 if TYPE_CHECKING:
-    from us_sim.nodes.viewer_settings import ViewerSettings
+    from us_sim.viewer.viewer_settings import ViewerSettings
 
 __all__ = [
     "add_network_option",
@@ -89,7 +89,7 @@ def supervision(args: argparse.Namespace) -> SupervisionSettings:
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
     """Where the page is served."""
-    from us_sim.nodes.viewer_settings import ViewerSettings
+    from us_sim.viewer.viewer_settings import ViewerSettings
 
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
@@ -106,7 +106,7 @@ def viewer(args: argparse.Namespace) -> ViewerSettings:
     Raises:
         UsSimError: a value will not do.
     """
-    from us_sim.nodes.viewer_settings import ViewerSettings
+    from us_sim.viewer.viewer_settings import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 

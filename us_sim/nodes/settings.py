@@ -25,7 +25,6 @@ from us_sim.nodes.session_settings import (
     SessionPlayerSettings,
     SessionRecorderSettings,
 )
-from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
@@ -34,6 +33,7 @@ from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
 __all__ = [

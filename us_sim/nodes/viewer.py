@@ -21,9 +21,9 @@ from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.nodes.viewer_session import ViewerSession
-from us_sim.nodes.viewer_settings import TOKEN, ViewerSettings
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = ["Viewer", "main"]
 

@@ -102,7 +102,7 @@ class ForkServer:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        if sys.platform != "linux" or not _adopt_orphans():
+        if sys.platform != "linux" or not _adopt_orphans(True):
             return
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -170,6 +170,7 @@ class ForkServer:
         process, self._process = self._process, None
         if process is None:
             return
+        _adopt_orphans(False)
         self._control.close()
         process.terminate()
         try:
@@ -185,9 +186,9 @@ def package_on_path() -> str:
     return os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
 
 
-def _adopt_orphans() -> bool:
+def _adopt_orphans(yes: bool) -> bool:
     """Become the parent of what descends from this process when its own has ended; whether so."""
-    return bool(ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0)
+    return bool(ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, int(yes), 0, 0, 0) == 0)
 
 
 def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:

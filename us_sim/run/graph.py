@@ -18,11 +18,11 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import checked_parameters
-from us_sim.nodes.viewer_settings import TOKEN, ViewerSettings
 from us_sim.run.deferred_signals import deferred_signals
 from us_sim.run.forking import ForkServer
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
+from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = [
     "NodeProcess",

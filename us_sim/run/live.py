@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.nodes.settings import checked_parameters
-from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.progress import Progress, late_progress
 from us_sim.run.following import follow
 from us_sim.run.forking import ForkServer
@@ -33,6 +32,7 @@ from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
+from us_sim.viewer.viewer_settings import ViewerSettings
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from us_sim.nodes.viewer_settings import ViewerSettings
 from us_sim.run.graph import RECORDER, VIEWER, Parameters
 from us_sim.scene.scene import Scene
+from us_sim.viewer.viewer_settings import ViewerSettings
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
