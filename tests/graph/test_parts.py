@@ -40,7 +40,8 @@ def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str
     for file in modules.glob("*.json"):
         program, names = json.loads(file.read_text())
         by_node[Path(program).stem] = set(names)
-    del by_node["__main__"]
+    for program in ("__main__", "fork_server"):
+        by_node.pop(program, None)
     return by_node, {topic.name for topic in read_bag(recording).topics}
 
 

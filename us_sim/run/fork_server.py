@@ -138,7 +138,8 @@ def _become(request: _Request, between: int) -> None:
     os.environ.update(request.environment)
     sys.orig_argv = request.command
     end_at_once_when_interrupted()
-    sys.argv = ["-m", *request.command[request.command.index("--ros-args") :]]
+    program = Path(__file__).parents[1] / "nodes" / f"{request.node}.py"
+    sys.argv = [str(program), *request.command[request.command.index("--ros-args") :]]
     _show_command(request.command)
     os.write(ready, str(os.getpid()).encode())
     for file in request.files:

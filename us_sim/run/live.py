@@ -62,11 +62,8 @@ def dry_run(
             f"no --path: poses come from `{scene.tracker.source.name}`",
         )
     )
-    rows.append(
-        ("runs", "session_recorder", f"records to {record}")
-        if record
-        else ("left out", "session_recorder", "no --record")
-    )
+    recorder = ("runs", f"records to {record}") if record else ("left out", "no --record")
+    rows.append((recorder[0], "session_recorder", recorder[1]))
     rows.append(
         ("runs", "viewer", f"serves a page at {view.host}, port {view.port or 'any'}")
         if view
@@ -395,8 +392,8 @@ def _report(
             f"{vessel}: {_change(pressed, '+.0%')} at full press, "
             f"{_change(released, '+.1%')} after release"
         )
-    recorded = [file.name for file in outcome.files]
-    for name in (*recorded, "contact_sheet.png", "summary.json", "nodes.log"):
+    recordings = (file.name for file in outcome.files)
+    for name in (*recordings, "contact_sheet.png", "summary.json", "nodes.log"):
         print(out / name)
 
 
