@@ -8,7 +8,7 @@
 
 import { events } from "./events.js";
 
-const RETRY_MS = 500;
+const RETRY_MS = 250;
 const utf8 = new TextDecoder();
 
 class Stream {
@@ -76,6 +76,7 @@ class Stream {
   }
 
   #tellWatched() {
+    panelsReturnSoon();
     this.send({ watch: document.hidden ? [] : [...this.#watched] });
   }
 
@@ -95,6 +96,13 @@ class Stream {
       console.error(error);
     }
   }
+}
+
+/** Have NiceGUI's socket, which the panels work by, look for a viewer as often as this one does. */
+function panelsReturnSoon() {
+  const manager = window.socket?.io;
+  manager?.reconnectionDelay(RETRY_MS);
+  manager?.reconnectionDelayMax(RETRY_MS);
 }
 
 export const stream = new Stream();
