@@ -53,22 +53,19 @@ def dry_run(
     rows = [
         ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
     ]
-    rows.append(
-        ("runs", "path_player", f"plays {path}")
-        if path
-        else (
-            "left out",
-            "path_player",
+    optional = {
+        "path_player": (
+            path and f"plays {path}",
             f"no --path: poses come from `{scene.tracker.source.name}`",
-        )
-    )
-    recorder = ("runs", f"records to {record}") if record else ("left out", "no --record")
-    rows.append((recorder[0], "session_recorder", recorder[1]))
-    rows.append(
-        ("runs", "viewer", f"serves a page at {view.host}, port {view.port or 'any'}")
-        if view
-        else ("left out", "viewer", "no --view")
-    )
+        ),
+        "session_recorder": (record and f"records to {record}", "no --record"),
+        "viewer": (
+            view and f"serves a page at {view.host}, port {view.port or 'any'}",
+            "no --view",
+        ),
+    }
+    for node, (what, without) in optional.items():
+        rows.append(("runs", node, what) if what else ("left out", node, without))
     lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
     lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
     lines.append(
