@@ -43,8 +43,9 @@ LOOKS = 2.0
 STREAMING, PATIENCE = 3.0, 1.45
 """From pose to pose: how long after a command the next is expected, and then waited for. A timer's
 pose just before it would hold up the command's own."""
-STATE_RATE = 30.0
-"""Hz at which pages are told at most how the probe is held."""
+STATE_RATE = 10.0
+"""Hz at which pages are told at most how the probe is held: to a person's eye sliders follow, and
+more often to lay them out would take time from the image."""
 LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
 KEPT = 512

@@ -16,8 +16,9 @@ function show() {
   const now = performance.now();
   while (times.length && now - times[0] > WINDOW_MS) times.shift();
   const rate = (1000 * times.length) / WINDOW_MS;
-  const shown = frozen ? "frozen" : `${rate.toFixed(0)} images/s`;
-  readout.textContent = connected ? shown : "the viewer does not answer";
+  const rated = frozen ? "frozen" : `${rate.toFixed(0)} images/s`;
+  const words = connected ? rated : "the viewer does not answer";
+  if (readout.textContent !== words) readout.textContent = words;
   readout.classList.toggle("us-wrong", !connected);
 }
 

@@ -1,9 +1,9 @@
 /**
  * The websocket to the viewer: packets of what is watched come, commands go.
  *
- * A packet is 32 bits of length (little endian), so many bytes of JSON, and bytes. The next of a
- * kind is asked for when all handlers of the last have ended, so a slow page gets fewer packets,
- * and always the newest.
+ * A packet is 32 bits of length (little endian), so many bytes of JSON, and bytes. While the
+ * handlers of one are at work the next of its kind is on its way already, but none after that: so
+ * a slow page gets fewer packets, and always the newest.
  */
 
 import { events } from "./events.js";
@@ -16,6 +16,7 @@ class Stream {
   #handlers = new Map();
   #watched = new Set();
   #latest = new Map();
+  #work = new Map(); // by kind, what ends with the handlers of the last packet
 
   constructor() {
     this.#open();
@@ -89,7 +90,13 @@ class Stream {
     const header = JSON.parse(utf8.decode(new Uint8Array(data, 4, length)));
     const payload = new Uint8Array(data, 4 + length);
     this.#latest.set(header.kind, { header, payload });
-    this.send({ next: header.kind }); // on its way while this one is drawn
+    const before = this.#work.get(header.kind);
+    this.#work.set(header.kind, this.#handle(header, payload));
+    await before;
+    this.send({ next: header.kind });
+  }
+
+  async #handle(header, payload) {
     try {
       await Promise.all((this.#handlers.get(header.kind) ?? []).map((handle) => handle(header, payload)));
     } catch (error) {

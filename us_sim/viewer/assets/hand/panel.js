@@ -51,6 +51,11 @@ function make(kind, properties = {}, ...children) {
   return made;
 }
 
+/** Set a property that is another; to set it to what it is would lay out the panel, too. */
+function put(part, property, value) {
+  if (part[property] !== value) part[property] = value;
+}
+
 function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
   const slider = make("input", { type: "range", step: step / 10, title });
   const number = make("input", { type: "number", step, title });
@@ -80,18 +85,17 @@ function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
   return {
     all,
     show({ goal, range: ranges }, canMove) {
-      slider.disabled = number.disabled = !canMove;
       const limits = Array.isArray(range) ? range : ranges?.[range];
-      if (limits) {
-        for (const entry of [slider, number]) {
-          entry.min = (limits[0] * factor).toFixed(digits);
-          entry.max = (limits[1] * factor).toFixed(digits);
-        }
+      for (const entry of [slider, number]) {
+        put(entry, "disabled", !canMove);
+        if (!limits) continue;
+        put(entry, "min", (limits[0] * factor).toFixed(digits));
+        put(entry, "max", (limits[1] * factor).toFixed(digits));
       }
       if (!goal) return;
       const text = (goal[name] * factor).toFixed(digits).replace(/^-(0\.?0*)$/, "$1");
       if (!isHeld) slider.value = goal[name] * factor;
-      if (document.activeElement !== number && !isHeld) number.value = text;
+      if (document.activeElement !== number && !isHeld) put(number, "value", text);
     },
   };
 }
@@ -130,13 +134,14 @@ function show() {
   led = hand.leads;
   const isProblem = performance.now() < problemEnds;
   said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
-  said.textContent = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
-  said.title = said.textContent;
+  const words = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
+  put(said, "textContent", words);
+  put(said, "title", words);
 }
 
 setInterval(() => {
   const { count, median } = latency.get();
-  pace.textContent = count ? `${median.toFixed(0)} ms` : "";
+  put(pace, "textContent", count ? `${median.toFixed(0)} ms` : "");
 }, PACE_MS);
 
 hand.on(show);

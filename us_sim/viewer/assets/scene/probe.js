@@ -72,6 +72,7 @@ let outline = null; // Float32Array of points: along the face, then back at the 
 let geometry = null; // 16 numbers, row by row: column, row, 0, 1 to m
 let size = [0, 0]; // columns and rows of the image
 let last = null; // the newest packet's header
+let told = ""; // the force in words
 const shown = { probe: true, image: true, force: true };
 const up = new THREE.Vector3(0, 1, 0);
 const before = new THREE.Matrix4();
@@ -169,8 +170,8 @@ function push(newton) {
   const size = newton ? Math.hypot(...newton) : 0;
   const text = `${size.toFixed(1)} N`;
   force.visible = shown.force && size > LEAST_NEWTON;
-  if (label.textContent === text) return false;
-  label.textContent = text;
+  if (told === text) return false;
+  told = text;
   if (size <= LEAST_NEWTON) return true;
   const direction = new THREE.Vector3(...newton).divideScalar(size);
   const length = Math.min(LONGEST, 0.012 + METRES_PER_NEWTON * size);
@@ -184,6 +185,7 @@ function push(newton) {
 stage.afterDrawing(() => {
   label.hidden = !(force.visible && frame.visible);
   if (label.hidden) return;
+  if (label.textContent !== told) label.textContent = told;
   const tip = head.getWorldPosition(new THREE.Vector3());
   const { x, y } = stage.project(tip);
   label.style.transform = `translate(${x.toFixed(0)}px, ${y.toFixed(0)}px)`;

@@ -9,6 +9,7 @@
 
 import { THREE, OrbitControls } from "nicegui-scene";
 import { element } from "../events.js";
+import { Readback } from "./readback.js";
 
 /** Part of the time that drawing may take; less where the image waits for it meanwhile. */
 const BUSY = 0.65;
@@ -23,6 +24,8 @@ const STILL_MS = 300;
 const IMAGE_MS = 1000 / 30;
 const RATIOS = [0.5, 0.7, 0.85, 1];
 const AVERAGED = 0.8;
+/** ms before the next drawing at which what is to be drawn then is asked for. */
+const AHEAD_MS = 50;
 
 const place = await element("scene");
 const canvas = document.createElement("canvas");
@@ -34,7 +37,7 @@ place.append(canvas);
 
 const isSlow = drawsInSoftware();
 const renderer = new THREE.WebGLRenderer({
-  canvas,
+  canvas: isSlow ? new OffscreenCanvas(1, 1) : canvas,
   antialias: !isSlow,
   alpha: false,
   powerPreference: "high-performance",
@@ -42,6 +45,7 @@ const renderer = new THREE.WebGLRenderer({
 renderer.setClearColor("#0e1113");
 renderer.localClippingEnabled = true; // see cut.js
 const gl = renderer.getContext();
+const readback = isSlow ? new Readback(gl, canvas) : null;
 
 const scene = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(30, 1, 0.01, 3);
@@ -112,6 +116,7 @@ function draw() {
   } catch (error) {
     console.error(error);
   }
+  readback?.ask();
   const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
   gl.flush();
   finish(fence, now, fine, done.resolve);
@@ -124,12 +129,15 @@ function finish(fence, begun, fine, done) {
     return;
   }
   gl.deleteSync(fence);
-  done();
+  if (!gl.isContextLost()) readback?.show();
   const end = performance.now();
   const took = end - begun;
   isDrawing = false;
   drawn += 1;
   earliest = begun + Math.max(SHORTEST_MS, took / (isSlow ? BUSY_SLOW : BUSY));
+  const early = earliest - AHEAD_MS - end;
+  if (early > 0) setTimeout(done, early);
+  else done();
   if (!fine) {
     cost = cost ? AVERAGED * cost + (1 - AVERAGED) * took : took;
     if (cost > LONG_MS && level > 0) [level, cost] = [level - 1, 0];
@@ -149,7 +157,7 @@ function size(ratio) {
   const was = renderer.getSize(new THREE.Vector2());
   if (renderer.getPixelRatio() === ratio && was.x === width && was.y === height) return;
   renderer.setPixelRatio(ratio);
-  renderer.setSize(width, height);
+  renderer.setSize(width, height, false);
   camera.aspect = width / height;
   camera.updateProjectionMatrix();
 }
@@ -162,7 +170,10 @@ export const stage = {
   camera,
   controls,
 
-  /** Something has moved, or looks otherwise: draw it. Resolves when it is drawn. */
+  /**
+   * Something has moved, or looks otherwise: draw it. Resolves when it is drawn, and newer would
+   * be drawn soon: what comes before that is work for nothing.
+   */
   move() {
     moved = performance.now();
     isDirty = true;
@@ -209,5 +220,8 @@ export const stage = {
 controls.addEventListener("change", () => stage.move());
 new ResizeObserver(() => stage.move()).observe(place);
 document.addEventListener("visibilitychange", () => stage.move());
-canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-canvas.addEventListener("webglcontextrestored", () => stage.move());
+renderer.domElement.addEventListener("webglcontextlost", (event) => {
+  event.preventDefault();
+  readback?.forget();
+});
+renderer.domElement.addEventListener("webglcontextrestored", () => stage.move());
