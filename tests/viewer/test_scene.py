@@ -1,5 +1,6 @@
 """The 3D scene in a real browser: what is seen where, and what the pointer meets."""
 
+import base64
 import io
 import time
 from collections.abc import Callable
@@ -95,9 +96,20 @@ class Patient:
 
 
 @pytest.fixture
-def scene(page: Any, simulator: Simulator) -> SimpleNamespace:
-    """The page with a patient in it, seen from above."""
+def scene_of(page: Any, simulator: Simulator) -> Callable[[], SimpleNamespace]:
+    """Loads the page with a patient in it, seen from above."""
     patient = Patient(simulator)
+    return lambda: opened(page, patient)
+
+
+@pytest.fixture
+def scene(scene_of: Callable[[], SimpleNamespace]) -> SimpleNamespace:
+    """The page with a patient in it, seen from above."""
+    return scene_of()
+
+
+def opened(page: Any, patient: Patient) -> SimpleNamespace:
+    """The page as it is when all has come, and what can be asked of it."""
     page.emulate_media(reduced_motion="reduce")  # views change at once
     page.goto(page.address)
     page.wait_for_selector(".us-scene-canvas", timeout=LIMIT_MS)
@@ -271,6 +283,74 @@ def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_on
     assert feeds["strain"].is_watched
     scene.page.click("[data-tissue=off]")
     bar.wait_for(state="hidden", timeout=LIMIT_MS)
+
+
+def test_along_the_patient_it_is_the_right_way_up(scene):
+    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    scene.patient.move(np.array([0.0, 0.03, 0.0]))
+    scene.becomes([0.0, 0.03, 0.015], is_blue)
+    scene.becomes([0.0, -0.03, 0.015], is_dark)
+
+
+def test_it_keeps_to_its_place_when_the_window_becomes_another(scene):
+    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    scene.becomes(VEIN, is_blue)
+    for width, height in ((900, 1000), (1400, 620)):
+        scene.page.set_viewport_size({"width": width, "height": height})
+        scene.until(
+            "Math.abs(scene.stage.canvas.height / scene.stage.pace.ratio"
+            " - scene.stage.place.clientHeight) < 2 &&"
+            " Math.abs(scene.stage.canvas.width / scene.stage.pace.ratio"
+            " - scene.stage.place.clientWidth) < 2"
+        )
+        scene.becomes(VEIN, is_blue)
+        scene.becomes(ARTERY, is_red)
+        scene.becomes([-0.03, 0.0, 0.015], is_dark)
+
+
+def test_where_the_processor_draws_the_page_has_the_picture_and_not_what_is_drawn_into(scene):
+    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    scene.becomes(VEIN, is_blue)
+    kinds = scene.ask(
+        "return [...document.querySelectorAll('canvas')]"
+        ".map((canvas) => canvas.getContext('2d') !== null);"
+    )
+    assert all(kinds)
+    assert pixel_of_file(scene, VEIN) == pytest.approx(scene.becomes(VEIN, is_blue), abs=12)
+
+
+def pixel_of_file(scene: SimpleNamespace, point: list[float]) -> np.ndarray:
+    """Red, green, blue of a point of the patient, in the PNG file that a browser would save."""
+    data, width = scene.ask(
+        "const { canvas } = scene.stage; return [canvas.toDataURL(), canvas.clientWidth];"
+    )
+    picture = Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB")
+    left, top = scene.ask(
+        "const box = scene.stage.canvas.getBoundingClientRect(); return [box.x, box.y];"
+    )
+    x, y = scene.place(point)
+    factor = picture.width / width
+    return np.array(picture.getpixel((int(factor * (x - left)), int(factor * (y - top)))), float)
+
+
+HARDWARE = """const { getParameter } = WebGL2RenderingContext.prototype;
+WebGL2RenderingContext.prototype.getParameter = function (name) {
+    return name === 0x9246 ? "a graphics card" : getParameter.call(this, name);
+};"""
+"""Has the browser say that a graphics card draws (UNMASKED_RENDERER_WEBGL)."""
+
+
+def test_with_a_graphics_card_it_looks_the_same_and_is_drawn_into_the_page(page, scene_of):
+    seen = scene_of()
+    seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    read = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
+    page.add_init_script(HARDWARE)
+    seen = scene_of()
+    assert not seen.ask("return scene.stage.pace.isSlow")
+    assert seen.ask("return scene.stage.canvas.getContext('webgl2') !== null")
+    seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
+    drawn = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
+    np.testing.assert_allclose(read, drawn, atol=12)
 
 
 def test_keys_choose_views_and_the_force_is_told(scene):
