@@ -43,9 +43,8 @@ def hand(page: Any, simulator: Simulator) -> FakeHand:
     pose.offer(lambda n: Packet("probe", n, header, b""))
     simulator.add(skin, mesh, pose)
     page.goto(page.address)
-    page.wait_for_function(
-        f"() => {SCENE}.then(m => m.probePose() !== null && m.stage.pace.drawn > 1)"
-    )
+    page.evaluate(f"async () => {{ window.scene = await {SCENE}; }}")
+    page.wait_for_function("window.scene.probePose() !== null && window.scene.stage.pace.drawn > 1")
     page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")
     await_view(page)
     return hand
@@ -126,8 +125,8 @@ def test_beside_the_patient_or_with_alt_the_view_turns(page: Any, hand: FakeHand
     before = page.evaluate(CAMERA)
     drag(page, (30, 400), (90, 430))
     page.wait_for_function(
-        f"before => {SCENE}.then(({{stage}}) => "
-        "stage.camera.position.toArray().some((x, i) => Math.abs(x - before[i]) > 0.01))",
+        "before => window.scene.stage.camera.position.toArray()"
+        ".some((x, i) => Math.abs(x - before[i]) > 0.01)",
         arg=before,
     )
     middle = page.evaluate(CAMERA)

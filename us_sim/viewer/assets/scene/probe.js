@@ -6,7 +6,7 @@
 
 import { THREE } from "nicegui-scene";
 import { events } from "../events.js";
-import { imageCanvas } from "../image.js";
+import { imageCanvas, onImage } from "../image.js";
 import { stream } from "../stream.js";
 import { cut } from "./cut.js";
 import { softMaterial, styleOf } from "./shading.js";
@@ -73,6 +73,7 @@ let geometry = null; // 16 numbers, row by row: column, row, 0, 1 to m
 let size = [0, 0]; // columns and rows of the image
 let last = null; // the newest packet's header
 let told = ""; // the force in words
+let onPlane = []; // bytes of the image on the plane
 const shown = { probe: true, image: true, force: true };
 const up = new THREE.Vector3(0, 1, 0);
 const before = new THREE.Matrix4();
@@ -195,13 +196,20 @@ events.on("image-geometry", (matrix) => {
   geometry = matrix;
   layOut();
 });
-events.on("image-drawn", () => {
+onImage((header, payload) => {
   const { width, height } = imageCanvas();
   if (width !== size[0] || height !== size[1]) layOut();
-  if (!image.visible || !frame.visible) return;
+  // A probe at rest sends the same image again and again.
+  if (!image.visible || !frame.visible || isSame(payload, onPlane)) return;
+  onPlane = payload;
   texture.needsUpdate = true;
   stage.refresh();
 });
+
+function isSame(bytes, others) {
+  return bytes.length === others.length && bytes.every((byte, i) => byte === others[i]);
+}
+
 for (const kind of ["probe_mesh", "probe"]) stream.watch(kind);
 
 export const probe = {

@@ -211,9 +211,13 @@ export const stage = {
     };
   },
 
-  /** Pictures drawn, ms that the last ones took, and pixels for each CSS pixel. */
+  /**
+   * Pictures drawn, ms that the last ones took, pixels for each CSS pixel, whether the processor
+   * draws, and whether there is nothing left to be drawn.
+   */
   get pace() {
-    return { drawn, cost, ratio: renderer.getPixelRatio(), isSlow };
+    const isAtRest = isFine && !isDirty && !isDrawing;
+    return { drawn, cost, ratio: renderer.getPixelRatio(), isSlow, isAtRest };
   },
 };
 
