@@ -157,7 +157,8 @@ def opened(page: Any, patient: Patient) -> SimpleNamespace:
                 return colour
         pytest.fail(f"the pixel at {point} is {colour}")
 
-    page.wait_for_selector("#hand button", timeout=LIMIT_MS)  # which takes room from the scene
+    # The hand's panel takes room from the scene.
+    page.wait_for_selector("#hand button:visible", timeout=LIMIT_MS)
     until("scene.stage.scene.getObjectByName('vein') && scene.stage.pace.drawn > 0")
     until(
         "Math.abs(scene.stage.canvas.height / scene.stage.pace.ratio"
@@ -369,7 +370,7 @@ def test_keys_choose_views_and_the_force_is_told(scene):
     scene.page.locator(".us-scene-canvas").focus()
     scene.page.keyboard.press("2")
     scene.until("scene.stage.camera.position.x > 0.2 && scene.stage.camera.position.y < 0.1")
-    assert scene.page.locator(".us-force").inner_text() == "2.5 N"
+    scene.until("document.querySelector('.us-force').innerText === '2.5 N'")
 
 
 def test_nothing_is_drawn_while_nothing_changes(scene):

@@ -11,7 +11,7 @@ import { THREE, OrbitControls } from "nicegui-scene";
 import { element } from "../events.js";
 import { Readback } from "./readback.js";
 
-/** Part of the time that drawing may take; less where the image waits for it meanwhile. */
+/** Part of the time that drawing may take; less where the processor draws. */
 const BUSY = 0.65;
 const BUSY_SLOW = 0.2;
 /** ms between two drawings at least, and how long one may take before pixels become coarser. */
