@@ -19,14 +19,17 @@ ARGUMENTS = (
     "--disable-component-update",
     "--disable-sync",
 )
+PROGRAMS = ("chromium-headless-shell", "chromium")
+"""The first has no window of its own to draw, and takes a third less time."""
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
     """The browser; where there is none the test is skipped."""
-    program = os.environ.get("US_SIM_TEST_CHROMIUM") or shutil.which("chromium")
+    found = [os.environ.get("US_SIM_TEST_CHROMIUM"), *map(shutil.which, PROGRAMS)]
+    program = next(filter(None, found), None)
     if not program:
-        pytest.skip("there is no chromium on PATH, nor in US_SIM_TEST_CHROMIUM")
+        pytest.skip(f"neither {' nor '.join(PROGRAMS)} on PATH, nor US_SIM_TEST_CHROMIUM")
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with playwright.sync_playwright() as tool:
         browser = tool.chromium.launch(executable_path=program, args=list(ARGUMENTS))
