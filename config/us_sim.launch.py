@@ -22,6 +22,7 @@ from us_sim.run.domain_lock import alone_on_domain
 from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, RECORDER, ending
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import plan_of
+from us_sim.run.request import Request
 from us_sim.run.restarts import Restarts, going_on
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import Watch
@@ -66,7 +67,7 @@ def session(context):
         raise UsSimError(f"view:={given['view']}: must be true or false")
     view = ViewerSettings() if given["view"] == "true" else None
     by_hand = view is not None and path is None
-    plan = plan_of(scene, {}, record=record, path=path, view=view, by_hand=by_hand)
+    plan = plan_of(Request(scene, record=record, path=path, view=view, by_hand=by_hand))
     supervised = Supervised(plan, settings, context.launch_configurations.get("ros_namespace", ""))
     left_out = [part for part in scene.parts() if not part.needed]
     return [
@@ -90,7 +91,7 @@ class Supervised:
         self.resources.enter_context(alone_on_domain(namespace))
         self.monitor = Monitored(plan.nodes, supervised=True, namespace=namespace)
         self.resources.callback(self.monitor.close)
-        self.monitor.refuse_company()
+        self.monitor.refuse_company(plan.nodes)
 
     def action(self, process):
         """What starts a node."""
