@@ -219,3 +219,20 @@ def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
     viewer.say()
     page.wait_for_function("!document.querySelector('.us-quantity input').disabled")
     assert told.inner_text() == "You hold the probe"
+
+
+@pytest.mark.parametrize("width", [768, 1024, 1280])
+def test_who_holds_the_probe_can_be_read_whole_beside_how_soon_it_is_seen(
+    page: Any, viewer: FakeHand, width: int
+) -> None:
+    page.set_viewport_size({"width": width, "height": 768})
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab").first.wait_for()
+    sentence = "the replay of a.mcap moves the probe"
+    viewer.say(leader="path_player", obstacle=sentence, can_take=True)
+    told = page.locator(".us-said")
+    viewer.until(lambda: told.inner_text() == sentence)
+    viewer.until(lambda: told.evaluate("e => e.scrollWidth <= e.clientWidth"))
+    beside = page.locator(".us-pace").bounding_box()
+    box = told.bounding_box()
+    assert abs(beside["y"] + beside["height"] / 2 - box["y"] - box["height"] / 2) < 4

@@ -55,6 +55,32 @@ def await_grey(page: Any, grey: int) -> None:
     )
 
 
+def test_nothing_is_drawn_or_measured_before_the_first_image(
+    browser: Any, served: Any, simulator: Simulator, images: Images
+) -> None:
+    simulator.feeds["image"] = Feed("image", rate=None)
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page.goto(served[0].address)
+    page.get_by_text("Waiting for the first image").wait_for()
+    known = "import('/us_sim/assets/image.js').then(m => m.pixelToMillimetres(0, 0) !== null)"
+    _until(lambda: page.evaluate(known))
+    page.set_viewport_size({"width": 1100, "height": 720})  # which has the scale drawn
+    page.wait_for_function("document.querySelector('.us-scale').width > 300")
+    drawn = """() => {
+        const scale = document.querySelector('.us-scale');
+        const data = scale.getContext('2d').getImageData(0, 0, scale.width, scale.height).data;
+        return data.some((value) => value > 0);
+    }"""
+    assert not page.evaluate(drawn)
+    button = page.get_by_role("button", name="Distance", exact=True)
+    assert button.is_disabled()
+    simulator.feeds["image"] = images.feed
+    page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
+    page.wait_for_function(drawn)
+    _until(button.is_enabled)
+    page.close()
+
+
 def at(page: Any, lateral: float, depth: float) -> tuple[float, float]:
     """Where a place of the image plane, mm, is on the page."""
     box = page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")

@@ -185,3 +185,21 @@ def test_the_table_of_nodes_is_above_the_plots(page: Any, simulator: Simulator) 
     plot = page.locator(".us-plot").first.bounding_box()
     assert table["height"] > 9 * 30
     assert table["y"] + table["height"] <= plot["y"]
+
+
+def test_all_views_can_be_chosen_beside_the_panels_of_a_small_screen(page: Any) -> None:
+    page.set_viewport_size({"width": 1024, "height": 768})
+    page.goto(page.address)
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab").last.wait_for()
+    scene = page.locator("#scene")
+
+    def are_inside() -> bool:
+        left = scene.bounding_box()["x"]
+        right = left + scene.bounding_box()["width"]
+        boxes = [button.bounding_box() for button in page.locator(".us-tools-views button").all()]
+        return len(boxes) == 7 and all(
+            left <= box["x"] and box["x"] + box["width"] <= right for box in boxes
+        )
+
+    until(are_inside, "every button of a view is within the scene")

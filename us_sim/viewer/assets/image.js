@@ -36,6 +36,11 @@ export function imageCanvas() {
   return canvas;
 }
 
+/** Whether there is an image in it. */
+export function hasImage() {
+  return waiting.hidden;
+}
+
 /** From (column, row), of pixels, to [lateral, axial] mm in frame `probe`; null if not known. */
 export function pixelToMillimetres(column, row) {
   if (!geometry) return null;
@@ -68,7 +73,10 @@ export async function drawImage(header, payload) {
     context.drawImage(bitmap, 0, 0);
     bitmap.close();
   }
-  waiting.hidden = true;
+  if (!hasImage()) {
+    waiting.hidden = true;
+    drawScale();
+  }
 }
 
 let live = true;
@@ -149,7 +157,7 @@ function drawScale() {
   const ratio = devicePixelRatio;
   scale.width = Math.round(width * ratio);
   scale.height = Math.round(height * ratio);
-  if (!geometry || !canvas.height) return;
+  if (!geometry || !hasImage()) return;
   const draw = scale.getContext("2d");
   draw.scale(ratio, ratio);
   draw.strokeStyle = draw.fillStyle = "#8f9aa3";

@@ -116,7 +116,7 @@ function makeBar() {
   const keys = make("button", { type: "button", textContent: "?", title: "Keys and gestures (key ?)" });
   keys.onclick = () => help.toggle();
   moves.push(gizmo);
-  bar.append(take, ...moves, keys, said, pace);
+  bar.append(take, ...moves, keys, make("div", { className: "us-told" }, said, pace));
   return bar;
 }
 

@@ -1,12 +1,12 @@
 /** Where millimetres of the image plane are on the screen, and back. */
 
-import { imageBox, imageCanvas, pixelToMillimetres } from "../image.js";
+import { hasImage, imageBox, imageCanvas, pixelToMillimetres } from "../image.js";
 
 /** The affine map of now: {toScreen([mm, mm]) -> [CSS px, CSS px] in `#ultrasound`, toPlane}. */
 export function plane() {
   const origin = pixelToMillimetres(0, 0);
   const { width: columns, height: rows } = imageCanvas();
-  if (!origin || !columns) return null;
+  if (!origin || !hasImage()) return null;
   const [ox, oy] = origin;
   const [ax, ay] = pixelToMillimetres(1, 0).map((value, i) => value - origin[i]);
   const [bx, by] = pixelToMillimetres(0, 1).map((value, i) => value - origin[i]);
