@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -16,23 +15,23 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
+from us_sim.nodes.probe_lead import LEAD_TOPIC, Lead, probe_lead
 from us_sim.nodes.probe_whereabouts import ProbeWhereabouts
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.tracking.virtual_hand.motion import Motion
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
-from us_sim.tracking.virtual_hand.stance import DEEPEST, HIGHEST, STEEPEST, Stance
+from us_sim.tracking.virtual_hand.stance import Stance
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.hand_command import HOME_PRESS, HandCommand
+from us_sim.viewer.hand_state import hand_state
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.simulator import Simulator
 
 __all__ = ["ViewerHand"]
 
-PATIENT, TOPIC = "patient", "tracker/pose"
-PLAYERS = ("path_player", "session_player")
-"""Nodes that `session_control` starts and ends."""
+PATIENT = "patient"
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
 images than that."""
@@ -79,7 +78,7 @@ class ViewerHand:
         simulator.commands["hand"] = self._command
         simulator.commands["take"] = self._ask_for_probe
         self._session = simulator.session
-        self._obstacle = "the viewer looks who moves the probe"  # why the hand may not; "" if so
+        self._lead = Lead("nobody", "the viewer looks who moves the probe")
         self._surface: ViewerSurface | None = None
         self._standing: RestSurface | None = None  # the surface that the motion is on
         self._motion: Motion | None = None
@@ -88,11 +87,10 @@ class ViewerHand:
         self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
         self._last_stamp = 0  # ns, of the last pose
-        self._can_take = False  # whether a page can end what moves the probe
         self._asked: tuple[str, int] | None = None  # page and number of the last command
         self._asked_by: dict[int, tuple[str, int]] = {}  # by the stamp of a pose
         self._sent_at = self._rests_since = self._asked_at = 0.0  # s, of the monotonic clock
-        self._leader, self._warning = "nobody", ""
+        self._warning = ""
         self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
         self._moving_timer.cancel()
@@ -108,8 +106,8 @@ class ViewerHand:
             asked = HandCommand.read(value)
         except UsSimError as error:
             return str(error)
-        if self._obstacle:
-            return self._obstacle
+        if self._lead.obstacle:
+            return self._lead.obstacle
         self._post(lambda: self._obey(asked))
         return None
 
@@ -155,8 +153,8 @@ class ViewerHand:
     def _look(self) -> None:
         """A few times a second: who leads, is there somewhere to stand, and the pose at rest."""
         self._stand()
-        self._obstacle = self._hindrance()
-        if self._obstacle:
+        self._lead = self._lead_now()
+        if self._lead.obstacle:
             self._let_go()
             self._tell()
             return
@@ -165,40 +163,18 @@ class ViewerHand:
         if self._moving_timer.is_canceled():
             self._publish()
 
-    def _hindrance(self) -> str:
-        """Why the hand may not move the probe, for a person, or nothing."""
-        node, name = self._node, self._node.resolve_topic_name(TOPIC)
-        others = [info.node_name for info in node.get_publishers_info_by_topic(name)]
-        if self._publisher is not None and node.get_name() in others:
-            others.remove(node.get_name())
-        self._leader = others[0] if others else "tracker"
-        replayed = self._session.state.replay
-        self._can_take = bool(replayed) and self._leader in PLAYERS
-        if self._can_take:
-            what = "moves the probe"
-            if self._session.state.replay_state == "finished":
-                holds = self._leader == PLAYERS[0]
-                what = "has ended and holds the probe" if holds else "has ended"
-            return f"the replay of {PurePath(replayed).name} {what}"
-        if others:
-            return f"{others[0]} moves the probe: end it to take the probe yourself"
-        hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
-        if "probe_tracker" not in hearers:
-            if node.count_publishers(node.resolve_topic_name("probe/pose")):
-                return (
-                    "the probe follows the scene's own tracker: start without --tracker, or with "
-                    "--param probe_tracker.source=pose, to take it yourself"
-                )
-            self._leader = "nobody"
-            return "no simulator with a probe runs yet"
+    def _lead_now(self) -> Lead:
+        """Who moves the probe; the hand, if there is also somewhere to begin."""
+        lead = probe_lead(
+            self._node, self._session.state, is_publishing=self._publisher is not None
+        )
+        if lead.obstacle:
+            return lead
         if self._standing is None:
-            self._leader = "nobody"
-            return "the patient's surface is awaited"
+            return Lead("nobody", "the patient's surface is awaited")
         if not self._is_found and self._whereabouts is not None and self._whereabouts.is_told:
-            self._leader = "nobody"
-            return "the viewer looks where the probe is"
-        self._leader = "hand"
-        return ""
+            return Lead("nobody", "the viewer looks where the probe is")
+        return lead
 
     def _take(self) -> None:
         """Lead from here on: from where the probe is, or else where it was held, or at home."""
@@ -209,7 +185,7 @@ class ViewerHand:
         elif self._motion is None:
             self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
         self._publisher = self._node.create_publisher(
-            PoseStamped, TOPIC, STREAM, qos_overriding_options=overridable()
+            PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
         )
         self._rests_since = time.monotonic()
 
@@ -225,8 +201,8 @@ class ViewerHand:
 
     def _ask_for_probe(self, _: Any, __: int) -> str | None:
         """End what is replayed, so that the hand may go on from there; in a page's thread."""
-        if not self._can_take:
-            return self._obstacle or None
+        if not self._lead.can_take:
+            return self._lead.obstacle or None
         self._session.ask(replay="")
         return None
 
@@ -304,42 +280,21 @@ class ViewerHand:
                 del self._asked_by[next(iter(self._asked_by))]
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
-        self._node.health.published(TOPIC)
+        self._node.health.published(LEAD_TOPIC)
         self._tell()
 
     def _tell(self) -> None:
         """The pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
-        header: dict[str, Any] = {
-            "leader": self._leader,
-            "obstacle": self._obstacle,
-            "can_take": self._can_take,
-            "warning": self._warning,
-        }
+        stance = motion.stance if motion is not None else None
+        goal = motion.goal if motion is not None else None
         if self._publisher is None and self._elsewhere is not None and surface is not None:
-            header["stance"] = header["goal"] = _numbers(Stance.of(self._elsewhere, surface))
-        elif motion is not None:
-            header |= {"stance": _numbers(motion.stance), "goal": _numbers(motion.goal)}
-        if surface is not None:
-            lower, upper = surface.lower.tolist(), surface.upper.tolist()
-            header["range"] = {
-                "x": [lower[0], upper[0]],
-                "y": [lower[1], upper[1]],
-                "press": [-HIGHEST, DEEPEST],
-                "tilt": [-STEEPEST, STEEPEST],
-            }
+            stance = goal = Stance.of(self._elsewhere, surface)
+        header = {
+            "leader": self._lead.who,
+            "obstacle": self._lead.obstacle,
+            "can_take": self._lead.can_take,
+            "warning": self._warning,
+            **hand_state(surface, stance, goal),
+        }
         self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))
-
-
-def _numbers(stance: Stance) -> dict[str, float]:
-    """A stance as pages take it: m and rad, frame ``patient``."""
-    x, y, z = stance.point.tolist()
-    return {
-        "x": x,
-        "y": y,
-        "z": z,
-        "press": stance.press,
-        "rotation": stance.rotation,
-        "fan": stance.fan,
-        "rock": stance.rock,
-    }
