@@ -18,7 +18,9 @@ import atexit, json, os, pathlib, sys
 def write():
     names = [name for name in sys.modules if name.startswith("us_sim.")]
     folder = pathlib.Path(os.environ["MODULES_OF_PROCESSES"])
-    (folder / f"{os.getpid()}.json").write_text(json.dumps([sys.argv[0], names]))
+    part = folder / f"{os.getpid()}.part"
+    part.write_text(json.dumps([sys.argv[0], names]))
+    part.rename(part.with_suffix(".json"))  # one that is ended meanwhile has said nothing
 
 if "MODULES_OF_PROCESSES" in os.environ:
     atexit.register(write)
