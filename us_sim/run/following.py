@@ -135,7 +135,10 @@ def _played(plan: Plan, monitor: Monitored) -> float:
 
 def _status(plan: Plan, monitor: Monitored) -> str:
     """The images so far, their rate and their age, in words."""
-    again = f"begins again every {plan.poses}; " if plan.loops else ""
+    again = ""
+    if plan.loops:
+        when = "at its end" if plan.poses is None else f"every {plan.poses} {_shown(plan)[1]}"
+        again = f"begins again {when}; "
     slicer = monitor.node.reports.get(IMAGER, {})
     count = monitor.node.count(IMAGER, IMAGES)
     if not count:
