@@ -121,10 +121,14 @@ def _numbers(
                 f"the hand's {name} is {sizes[name]} finite number{'s' * (sizes[name] > 1)}, not "
                 f"{_shown(listed)}"
             )
-        limit, unit = (_FULL, "rad") if name in _ANGLES else (_FARTHEST, "m")
+        limit = _FULL if name in _ANGLES else _FARTHEST
         if max(map(abs, values)) > limit:
+            far, end = max(values, key=abs), limit
+            if name in _ANGLES:
+                far, end = math.degrees(far), math.degrees(end)
+            unit = "°" if name in _ANGLES else " m"
             raise MessageError(
-                f"the hand's {name} is {_shown(listed)}, more than {limit:.3g} {unit}"
+                f"the hand's {name} is -{end:.4g} to {end:.4g}{unit}, not {far:.4g}{unit}"
             )
         numbers[name] = tuple(map(float, values))
     return numbers

@@ -75,9 +75,17 @@ function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
   };
   slider.addEventListener("input", (event) => {
     number.value = slider.valueAsNumber.toFixed(digits);
+    if (problem) tell("");
     ask(slider.valueAsNumber, event);
   });
-  number.addEventListener("change", (event) => ask(number.valueAsNumber, event));
+  number.addEventListener("change", (event) => {
+    const { value, min, max } = number;
+    if (min && number.valueAsNumber < min) number.value = min;
+    if (max && number.valueAsNumber > max) number.value = max;
+    const isWithin = number.value === value;
+    tell(isWithin ? "" : `${label}: ${min} to ${max}${unit === "°" ? "" : " "}${unit}`);
+    ask(number.valueAsNumber, event);
+  });
   slider.addEventListener("pointerdown", () => (isHeld = true));
   for (const end of ["pointerup", "pointercancel", "blur"]) {
     slider.addEventListener(end, () => (isHeld = false));
@@ -145,9 +153,12 @@ setInterval(() => {
 }, PACE_MS);
 
 hand.on(show);
-events.on("problem", (sentence) => {
+events.on("problem", tell);
+
+/** Say for a while what is wrong; nothing is, if the sentence is empty. */
+function tell(sentence) {
   problem = sentence;
-  problemEnds = performance.now() + SAID_MS;
-  setTimeout(show, SAID_MS + 50);
+  problemEnds = sentence ? performance.now() + SAID_MS : 0;
+  if (sentence) setTimeout(show, SAID_MS + 50);
   show();
-});
+}
