@@ -69,6 +69,90 @@ def test_keys_are_not_taken_from_who_types(page: Any, viewer: FakeHand) -> None:
     viewer.until(lambda: viewer.asked[-1:] and viewer.asked[-1]["to"] == {"press": 0.0075})
 
 
+@pytest.mark.parametrize(
+    ("typed", "there", "radians", "said"),
+    [("999", "60", 1.0472, "Fan: -60 to 60°"), ("-61", "-60", -1.0472, "Fan: -60 to 60°")],
+)
+def test_a_number_beyond_its_range_is_put_to_the_nearest_end_and_that_is_said(
+    page: Any, viewer: FakeHand, typed: str, there: str, radians: float, said: str
+) -> None:
+    fan = page.locator(".us-quantity input[type=number]").nth(1)
+    line = page.locator(".us-said")
+    fan.fill(typed)
+    page.keyboard.press("Enter")
+    assert fan.input_value() == there
+    viewer.until(lambda: viewer.asked[-1:])
+    assert viewer.asked[-1]["to"] == {"fan": pytest.approx(radians, abs=1e-4)}
+    assert line.inner_text() == said
+    assert "us-wrong" in line.get_attribute("class")
+    fan.fill("20")
+    page.keyboard.press("Enter")
+    viewer.until(lambda: viewer.asked[-1]["to"] == {"fan": pytest.approx(math.radians(20))})
+    assert line.inner_text() == "You hold the probe"
+    assert "us-wrong" not in line.get_attribute("class")
+
+
+def test_a_press_beyond_its_range_is_said_in_millimetres(page: Any, viewer: FakeHand) -> None:
+    press = page.locator(".us-quantity input[type=number]").first
+    press.fill("500")
+    page.keyboard.press("Enter")
+    assert press.input_value() == "25.0"
+    assert page.locator(".us-said").inner_text() == "Press: -50.0 to 25.0 mm"
+    viewer.until(lambda: viewer.asked[-1:] and viewer.asked[-1]["to"] == {"press": 0.025})
+
+
+def test_a_tab_and_a_button_leave_the_page_the_keys_that_they_do_not_use(
+    page: Any, viewer: FakeHand
+) -> None:
+    page.get_by_role("button", name="Panels").click()
+    tabs = page.get_by_role("tab")
+    tabs.first.click()
+    for place in (tabs.first, page.get_by_role("button", name="Gizmo")):
+        place.focus()
+        viewer.asked.clear()
+        page.keyboard.press("s")
+        viewer.until(lambda: viewer.total("press") == pytest.approx(3e-4))
+        page.keyboard.press("?")
+        page.wait_for_selector(".us-help[open]")
+        page.keyboard.press("Escape")
+        page.wait_for_selector(".us-help", state="hidden")
+    viewer.asked.clear()
+    tabs.first.focus()
+    page.keyboard.press("ArrowRight")  # the next tab's
+    page.get_by_role("button", name="Gizmo").focus()
+    page.keyboard.press("ArrowRight")  # a button has no use for it
+    viewer.until(lambda: viewer.asked)
+    assert viewer.total("slide") == pytest.approx([7.5e-4, 0])
+
+
+def test_the_space_bar_is_the_pages_after_a_click_and_a_buttons_after_tab(
+    page: Any, viewer: FakeHand
+) -> None:
+    freezing = page.get_by_role("button", name="Freeze")
+    going_on = page.get_by_role("button", name="Go on")
+    gizmo = page.get_by_role("button", name="Gizmo")
+    page.get_by_role("button", name="Centre", exact=True).click()
+    viewer.until(lambda: viewer.asked[-1:] and viewer.asked[-1].get("go") == "home")
+    page.keyboard.press("Space")
+    going_on.wait_for()
+    page.get_by_role("button", name="Panels").click()
+    page.get_by_role("tab").first.click()
+    page.keyboard.press("Space")
+    freezing.wait_for()
+    page.get_by_role("button", name="?", exact=True).click()
+    page.keyboard.press("Escape")
+    page.wait_for_selector(".us-help", state="hidden")
+    page.keyboard.press("Space")
+    going_on.wait_for()
+    assert not page.locator(".us-help[open]").count()
+    assert [wish.get("go") for wish in viewer.asked] == ["home"]
+    gizmo.focus()
+    for is_on in ("true", "false"):  # and it keeps the focus
+        page.keyboard.press("Space")
+        page.wait_for_selector(f"button[aria-pressed={is_on}]:text('Gizmo')")
+    assert going_on.is_visible()
+
+
 def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: FakeHand) -> None:
     box = box_of_image(page)
     metres = 320 * PIXEL / box["height"]
@@ -185,10 +269,23 @@ def test_the_delay_counts_from_the_key_to_the_painted_image(page: Any, viewer: F
 def test_help_shows_the_keys_and_goes(page: Any, viewer: FakeHand) -> None:
     page.keyboard.press("?")
     page.wait_for_selector(".us-help[open]")
+    (views,) = [key for key, does in listed(page) if does == "views"]
     page.keyboard.press("s")
     page.keyboard.press("Escape")
     page.wait_for_selector(".us-help", state="hidden")
     assert not viewer.asked
+    titles = page.locator("[data-view]").evaluate_all("views => views.map((view) => view.title)")
+    keys = sorted(int(title.split("(key ")[1].rstrip(")")) for title in titles)
+    assert views == f"{keys[0]} to {keys[-1]}"
+    assert keys == list(range(keys[0], keys[-1] + 1))
+
+
+def listed(page: Any) -> list[list[str]]:
+    """The keys of the help, each with what it does."""
+    found: list[list[str]] = page.locator(".us-help dt").evaluate_all(
+        "keys => keys.map(key => [key.textContent, key.nextSibling.textContent])"
+    )
+    return found
 
 
 def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(

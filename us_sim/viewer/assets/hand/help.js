@@ -27,7 +27,7 @@ const PARTS = {
     ["Shift + ↑ ↓", "fan"],
     ["Shift + ← →", "rock"],
     ["H L U", "centre, lift, upright"],
-    ["1 to 5, Home, F", "views"],
+    ["0 to 6", "views"],
     ["?", "this help"],
   ],
 };

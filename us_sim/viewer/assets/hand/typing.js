@@ -1,17 +1,34 @@
-/** Whether keys belong to what has the focus rather than to the page. */
+/** Whether a key belongs to what has the focus rather than to the page. */
 
 const ENTRIES =
-  "input, textarea, select, [contenteditable], [role=slider], [role=listbox], [role=tab], dialog, " +
-  ".q-dialog";
-const PRESSED = "button, a, summary, [role=button], [role=menuitem], [role=checkbox], [role=switch]";
+  "input:not([type=checkbox], [type=radio]), textarea, select, [contenteditable], [role=slider], " +
+  "[role=listbox], dialog, .q-dialog";
+const PRESSED =
+  "button, a, summary, input[type=checkbox], [role=button], [role=menuitem], [role=checkbox], " +
+  "[role=switch], [role=tab]";
+/** Among these the arrows go from one to the next. */
+const NEIGHBOURS = "[role=tab], [role=menuitem], [role=radio], input[type=radio]";
+const PRESSES = [" ", "Enter"];
+const STEPS = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"];
 
-/** Whether the person types, or moves a control, so that no key is for the page. */
+/** Whether the person types, or moves or presses a control, so that the key is not for the page. */
 export function isTyping(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return true;
-  return Boolean(event.target.closest?.(ENTRIES));
+  const isOn = (kinds) => Boolean(event.target.closest?.(kinds));
+  if (isOn(ENTRIES)) return true;
+  if (PRESSES.includes(event.key)) return isOn(`${PRESSED}, ${NEIGHBOURS}`);
+  return STEPS.includes(event.key) && isOn(NEIGHBOURS);
 }
 
-/** Likewise for the space bar and Enter, which press the button that has the focus. */
-export function isPressing(event) {
-  return isTyping(event) || Boolean(event.target.closest?.(PRESSED));
+/**
+ * What the pointer pressed gives the focus back, so that the space bar is the page's again. A click
+ * of the keyboard has no detail: who goes there by Tab stays there.
+ */
+function giveBack(event) {
+  if (!event.detail) return;
+  const pressed = event.target.closest?.(PRESSED);
+  if (pressed?.contains(document.activeElement)) document.activeElement.blur();
 }
+// First, so that what it opens does not give it the focus back; and after what it does itself.
+addEventListener("click", giveBack, { capture: true });
+addEventListener("click", giveBack);

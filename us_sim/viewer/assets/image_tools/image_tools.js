@@ -1,7 +1,7 @@
 /** The bar below the ultrasound image: freeze, cine loop, measurements, picture. */
 
 import { element, events } from "../events.js";
-import { isPressing, isTyping } from "../hand/typing.js";
+import { isTyping } from "../hand/typing.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
 import { save } from "./picture.js";
@@ -109,7 +109,7 @@ const KEYS = {
 };
 addEventListener("keydown", (event) => {
   if (event.key === "Escape" && overlay.tool) overlay.use(null);
-  if (event.key === " " ? isPressing(event) : isTyping(event)) return;
+  if (isTyping(event)) return;
   const act = event.key === " " ? () => freeze.toggle() : KEYS[event.key.toLowerCase()] ?? KEYS[event.key];
   if (!act || event.repeat) return;
   event.preventDefault();
