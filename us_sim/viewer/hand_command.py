@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -115,7 +116,7 @@ def _numbers(
         if name not in sizes:
             raise MessageError(f"the hand cannot move {_shown(name)}: {', '.join(sizes)}")
         values = listed if isinstance(listed, list) else [listed]
-        proper = all(type(number) in (int, float) and math.isfinite(number) for number in values)
+        proper = all(type(n) in (int, float) and abs(n) <= sys.float_info.max for n in values)
         if not proper or len(values) != sizes[name]:
             raise MessageError(
                 f"the hand's {name} is {sizes[name]} finite number{'s' * (sizes[name] > 1)}, not "
