@@ -80,11 +80,14 @@ def ask(simulation, control, **values):
     simulation.take(control.values, set(values))
 
 
-def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path):
+def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path, monkeypatch):
     simulation, supervisor, control = running
     nodes = set(supervisor.plan.nodes)
-    ask(simulation, control, record=str(tmp_path / "a.mcap"))
+    monkeypatch.chdir(tmp_path)
+    ask(simulation, control, record="a.mcap")
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder"}
+    simulation.look()
+    assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
     ask(simulation, control, replay=PATH, replay_rate=0.5)
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}
     player = supervisor.plan.processes[-1].all_parameters

@@ -77,13 +77,20 @@ def test_a_session_is_recorded_and_replayed(page, session):
     opened(page, "Session")
     file = page.get_by_label("file")
     until(lambda: file.input_value().startswith("session_"), "a name is proposed", 30.0)
+    proposed = file.input_value()
     file.fill("nowhere.mcap")
     page.get_by_role("button", name="Record", exact=True).click()
     page.get_by_text("there is no such file").wait_for()
-    board.tell_state(dataclasses.replace(RUNNING, record="mine.mcap"))
-    page.get_by_text("recording to mine.mcap").wait_for()
+    board.tell_state(dataclasses.replace(RUNNING, record="/home/a/mine.mcap"))
+    page.get_by_text("recording to /home/a/mine.mcap").wait_for()
+    page.get_by_text("recording mine.mcap").wait_for()
+    until(lambda: file.input_value() == "mine.mcap", "the field names what is written", 30.0)
     page.get_by_role("button", name="Stop", exact=True).click()
     until(lambda: asked[-1] == {"record": ""}, "it is ended", 30.0)
+    page.get_by_text("recorded to /home/a/mine.mcap").wait_for()
+    board.tell_state(RUNNING)
+    until(lambda: file.input_value().startswith("session_"), "another is proposed", 30.0)
+    assert file.input_value() >= proposed
     page.get_by_label("recording or path").click()
     page.get_by_role("option", name="hand.mcap").click()
     page.get_by_role("button", name="Play or pause").click()
@@ -102,6 +109,28 @@ def test_a_session_is_recorded_and_replayed(page, session):
     assert asked[-1]["replay_time"] == pytest.approx(6.0, abs=0.5)
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
+
+
+def test_it_is_said_what_is_lost_when_all_is_replayed_as_recorded(page, session):
+    board, asked = session
+    board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
+    opened(page, "Session")
+    kind = page.get_by_role("button", name="All as recorded")
+    kind.hover()
+    page.get_by_text("such as solver, materials and depth, is lost").wait_for()
+    page.get_by_label("recording or path").click()
+    page.get_by_role("option", name="hand.mcap").click()
+    kind.click()
+    page.get_by_role("button", name="Play or pause").click()
+    page.get_by_text("what was set since then is lost").wait_for()
+    assert asked[-1]["replay_as"] == "recording"
+    replay = {"replay": "/bags/hand.mcap", "replay_as": "recording", "replay_state": "playing"}
+    board.tell_state(dataclasses.replace(RUNNING, **replay))
+    until(kind.is_disabled, "it cannot be changed now", 30.0)
+    box = kind.bounding_box()
+    page.mouse.move(5, 5)
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, steps=5)
+    page.get_by_text("cannot be changed: end the replay first").wait_for()
 
 
 def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):

@@ -259,7 +259,7 @@ class Simulation:
             "volume": request.scene.volume.name,
             "loading": self._asked[0] if self._making is not None else "",
             "fraction": f"{fraction:.2f}",
-            "record": str(request.record or ""),
+            "record": str(request.record.resolve()) if request.record else "",
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
             "replay_state": player.get("state", "starting") if request.path else "",

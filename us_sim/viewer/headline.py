@@ -22,7 +22,7 @@ def words_of(state: SessionState) -> tuple[str, str]:
     >>> words_of(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
     >>> replay = {"replay": "/home/a/press.mcap", "replay_state": "finished"}
-    >>> words_of(SessionState(is_there=True, scene="upper_arm", record="b.mcap", **replay))
+    >>> words_of(SessionState(is_there=True, scene="upper_arm", record="/home/a/b.mcap", **replay))
     ('upper arm', 'recording b.mcap · replay of press.mcap: finished')
     """
     name = state.scene.replace("_", " ")
@@ -30,7 +30,7 @@ def words_of(state: SessionState) -> tuple[str, str]:
         done = "" if state.state.endswith("%") else f", {100 * state.fraction:.0f} %"
         return name, f"{state.state}{done}"
     parts = [state.problem]
-    parts += [f"recording {state.record}"] if state.record else []
+    parts += [f"recording {PurePath(state.record).name}"] if state.record else []
     if state.replay:
         parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")
     return name, " · ".join(filter(None, parts))

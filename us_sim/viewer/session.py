@@ -46,7 +46,7 @@ class SessionState:
     loading: str = ""  # the origin of another scene that is being made
     fraction: float = 1.0  # of loading or starting that is done
     problem: str = ""  # why the last thing that was asked for came to nothing
-    record: str = ""  # file that is recorded to
+    record: str = ""  # file that is recorded to, with its folder
     replay: str = ""  # bag that is played
     replay_as: str = "path"
     replay_state: str = ""

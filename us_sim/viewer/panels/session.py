@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from datetime import datetime
+from pathlib import PurePath
 from typing import Any
 
 from nicegui import ui
@@ -22,6 +23,17 @@ SETTLE_S = 1.5
 """For what a person asked for to be so; until then controls stay as they were set."""
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
+KINDS_TOLD = (
+    "The probe's path moves the probe of the simulation. All as recorded takes the simulation's "
+    "place; when you end it the nodes start again with what they were given at the start: what "
+    "was set since then, such as solver, materials and depth, is lost"
+)
+KINDS_FIXED = "While something is replayed this cannot be changed: end the replay first"
+STARTED_AGAIN = (
+    "The recording takes the simulation's place. When you end the replay the nodes start again "
+    "with what they were given at the start; what was set since then is lost"
+)
+"""When all is replayed as recorded."""
 
 
 class _Session:
@@ -33,6 +45,7 @@ class _Session:
         self._is_dragging = False
         self._touched = 0.0  # s, monotonic: when a person last asked for something
         self._is_following = False  # while controls are set to what is so
+        self._shown_record = ""  # the recording whose name the field shows
         with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
             self._absent = ui.label(NOT_THERE).classes("us-quiet")
             with ui.column().classes("us-session") as self._all:
@@ -59,11 +72,9 @@ class _Session:
         self._bag = ui.select({}, label="recording or path", with_input=True)
         self._bag.props("dense outlined").classes("us-wide-field")
         self._bag.tooltip("Bags in the folder that us-sim runs in, and those that came with it")
-        self._kind = ui.toggle(KINDS, value="path").props("no-caps dense")
-        self._kind.tooltip(
-            "The probe's path moves the probe of the simulation; all as recorded takes the "
-            "simulation's place until the replay ends"
-        )
+        with ui.element("div"):  # also told while the choice is disabled
+            self._kind = ui.toggle(KINDS, value="path").props("no-caps dense")
+            self._kind_told = ui.tooltip(KINDS_TOLD)
         with ui.row().classes("us-session-row"):
             self._play = ui.button(icon="play_arrow", on_click=self._play_or_pause)
             self._play.props('dense aria-label="Play or pause"').tooltip("Play, pause, go on")
@@ -86,6 +97,9 @@ class _Session:
         self._all.set_visibility(state.is_there)
         self._problem.set_text(state.problem)
         self._problem.set_visibility(bool(state.problem))
+        if state.record != self._shown_record:
+            self._shown_record = state.record
+            self._file.set_value(PurePath(state.record).name if state.record else _proposed())
         self._file.set_enabled(not state.record)
         self._record.set_enabled(not state.record and state.replay_as == "path")
         self._stop.set_enabled(bool(state.record))
@@ -103,6 +117,7 @@ class _Session:
         for control in (self._close, self._time):
             control.set_enabled(plays)
         self._kind.set_enabled(not plays)
+        self._kind_told.set_text(KINDS_FIXED if plays else KINDS_TOLD)
         if state.duration > 0.0:
             self._time.props(f"max={state.duration:.2f}")
         if not self._is_dragging:
@@ -124,14 +139,12 @@ class _Session:
             self._is_following = False
 
     async def _begin(self) -> None:
-        if await self._ask(record=self._file.value.strip()):
-            self._file.set_value(_proposed())
+        await self._ask(record=self._file.value.strip())
 
     async def _end(self) -> None:
         file = self._board.state.record
         if await self._ask(record=""):
             ui.notify(f"recorded to {file}", type="positive")
-            self._file.set_value(_proposed())
 
     async def _play_or_pause(self) -> None:
         state = self._board.state
@@ -144,13 +157,16 @@ class _Session:
         elif not chosen:
             ui.notify("choose a recording or a path first", type="info")
         else:
-            await self._ask(
+            kind = self._kind.value
+            taken = await self._ask(
                 replay=chosen,
-                replay_as=self._kind.value,
+                replay_as=kind,
                 replay_paused=False,
                 replay_loop=self._loop.value,
                 replay_rate=float(self._rate.value),
             )
+            if taken and kind == "recording":
+                ui.notify(STARTED_AGAIN, type="info", multi_line=True, timeout=10_000)
 
     def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
         """What does that where a person has changed a control, and nothing while it follows."""
