@@ -72,12 +72,24 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
         return data.some((value) => value > 0);
     }"""
     assert not page.evaluate(drawn)
+    page.get_by_text("the program is compiled once").wait_for()
     button = page.get_by_role("button", name="Distance", exact=True)
+    of_an_image = [
+        page.get_by_role("button", name=name, exact=True) for name in ("Freeze", "Play", "Save")
+    ]
     assert button.is_disabled()
+    assert all(each.is_disabled() for each in of_an_image)
+    assert {each.get_attribute("title") for each in of_an_image} == {"There is no image yet"}
+    for key in (" ", "c", ",", "."):
+        page.keyboard.press(key)
+    assert not page.evaluate(f"import('{TOOLS}/freeze.js').then(m => m.freeze.isFrozen)")
+    assert page.evaluate(f"import('{TOOLS}/picture.js').then(m => m.picture())") is None
     simulator.feeds["image"] = images.feed
     page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
     page.wait_for_function(drawn)
     _until(button.is_enabled)
+    _until(lambda: all(each.is_enabled() for each in of_an_image))
+    assert "Hold the image" in of_an_image[0].get_attribute("title")
     page.close()
 
 

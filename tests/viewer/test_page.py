@@ -74,6 +74,13 @@ def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     until(lambda: image.is_watched, "the page is back", 5.0)
 
 
+def test_the_header_says_why_few_images_come_at_rest(page: Any, simulator: Simulator) -> None:
+    feeds_of(simulator)
+    page.goto(page.address)
+    page.locator("#readout").get_by_text("0 images/s").wait_for()
+    assert "a few a second while nothing moves" in page.locator("#readout").get_attribute("title")
+
+
 def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> None:
     server, _ = served
     page = browser.new_page()

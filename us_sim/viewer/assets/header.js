@@ -7,7 +7,7 @@ const times = [];
 
 const readout = await element("readout");
 readout.setAttribute("role", "status");
-readout.title = "Ultrasound images drawn in this page, and whether the viewer answers";
+readout.title = "Ultrasound images drawn in this page: only a few a second while nothing moves";
 
 let connected = false;
 let frozen = false;

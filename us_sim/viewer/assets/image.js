@@ -17,7 +17,9 @@ const canvas = Object.assign(document.createElement("canvas"), { className: "us-
 const scale = Object.assign(document.createElement("canvas"), { className: "us-scale" });
 const waiting = Object.assign(document.createElement("p"), {
   className: "us-waiting",
-  textContent: "Waiting for the first image …",
+  textContent:
+    "Waiting for the first image …\n" +
+    "The first start after an installation takes some minutes: the program is compiled once.",
 });
 const badge = Object.assign(document.createElement("p"), { className: "us-stale", hidden: true });
 badge.setAttribute("role", "status");

@@ -1,7 +1,7 @@
 /** Freezing the image, and looking through the last seconds before that. */
 
 import { events } from "../events.js";
-import { drawImage, onImage, setLive } from "../image.js";
+import { drawImage, hasImage, onImage, setLive } from "../image.js";
 import { Cine } from "./cine.js";
 
 const cine = new Cine();
@@ -37,8 +37,9 @@ export const freeze = {
     return number;
   },
 
-  /** Hold the newest image, or go on with those that come. */
+  /** Hold the newest image, or go on with those that come; nothing before the first. */
   toggle() {
+    if (!hasImage()) return;
     isFrozen = !isFrozen;
     playing = null;
     number = Math.max(0, cine.frames.length - 1);
@@ -49,6 +50,7 @@ export const freeze = {
 
   /** Show one of the kept images; freezes. */
   async show(wanted) {
+    if (!hasImage()) return;
     if (!isFrozen) this.toggle();
     number = Math.min(Math.max(wanted, 0), cine.frames.length - 1);
     const frame = cine.frames[number];
@@ -58,6 +60,7 @@ export const freeze = {
 
   /** Play them as fast as they came, again and again, or stop. */
   play(on = !playing) {
+    if (!hasImage()) return;
     if (!isFrozen) this.toggle();
     const { frames } = cine;
     if (!on || frames.length < 2) {

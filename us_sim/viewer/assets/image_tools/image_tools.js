@@ -1,6 +1,7 @@
 /** The bar below the ultrasound image: freeze, cine loop, measurements, picture. */
 
 import { element, events } from "../events.js";
+import { hasImage } from "../image.js";
 import { isTyping } from "../hand/typing.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
@@ -47,7 +48,7 @@ const tools = {
   note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
 };
 const clearing = button("Clear", "Remove all measurements and texts (key X)", () => overlay.clear());
-button("Save", "Keep the image with its scale and measurements as a PNG file (key P)", save);
+const saving = button("Save", "Keep the image with its scale and measurements as a PNG file (key P)", save);
 
 scrubber.addEventListener("input", () => {
   if (freeze.isPlaying) freeze.play(false);
@@ -57,6 +58,14 @@ scrubber.addEventListener("input", () => {
 function press(pressed, on) {
   pressed.classList.toggle("us-on", on);
   pressed.setAttribute("aria-pressed", String(on));
+}
+
+/** What needs an image waits for the first. */
+function showWhetherUsable() {
+  for (const made of [freezing, playing, saving]) {
+    made.disabled = !hasImage();
+    made.title = made.disabled ? "There is no image yet" : made.dataset.title;
+  }
 }
 
 function showFreeze() {
@@ -119,5 +128,7 @@ addEventListener("keydown", (event) => {
 freeze.on(showFreeze);
 overlay.on(showMeasures);
 events.on("connection", showFreeze);
+events.on("image-drawn", () => saving.disabled && showWhetherUsable());
 showFreeze();
+showWhetherUsable();
 showMeasures();

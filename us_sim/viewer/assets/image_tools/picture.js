@@ -1,6 +1,6 @@
 /** The image as a picture to keep: with its scale, measurements, the scene's name and the time. */
 
-import { imageCanvas, pixelToMillimetres } from "../image.js";
+import { hasImage, imageCanvas, pixelToMillimetres } from "../image.js";
 import { overlay } from "./overlay.js";
 import { Ellipse, Note } from "./measures.js";
 
@@ -11,12 +11,12 @@ const TOP = 40;
 const EDGE = 20;
 const LINE = 24;
 
-/** The picture on a canvas. */
+/** The picture on a canvas; null before the first image. */
 export function picture() {
   const image = imageCanvas();
   const first = pixelToMillimetres(-0.5, -0.5);
   const last = pixelToMillimetres(image.width - 0.5, image.height - 0.5);
-  if (!first) return null;
+  if (!first || !hasImage()) return null;
   const scale = Math.max(LEAST, image.height) / (last[1] - first[1]); // pixels a mm
   const width = Math.round((last[0] - first[0]) * scale);
   const height = Math.round((last[1] - first[1]) * scale);
