@@ -57,7 +57,7 @@ class Viewer(GuardedNode):
         )
         self.health.state = "serving"
         self.health.values = {"port": str(self._server.port)}
-        print(f"open {self._server.address}", flush=True)
+        print(f"open {' or '.join(self._server.addresses)}", flush=True)
         if self._server.token:
             self.get_logger().warning(
                 f"the viewer listens at {settings.host}, for other computers, too: whoever has "

@@ -59,11 +59,21 @@ class WebServer:
     @property
     def address(self) -> str:
         """That a person opens."""
-        host = self.host
-        if host in ("0.0.0.0", "::", ""):
-            host = socket.gethostname()
-        shown = f"[{host}]" if ":" in host else host
-        return f"http://{shown}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        return self.addresses[0]
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """All that a person may open.
+
+        Where it listens everywhere that is this computer's name, and, since others may not know
+        that name, the number by which the network knows the computer.
+        """
+        hosts = [self.host]
+        if self.host in ("0.0.0.0", "::", ""):
+            hosts = [socket.gethostname(), *_outward()]
+        token = f"?token={self.token}" if self.token else ""
+        shown = (f"[{host}]" if ":" in host else host for host in hosts)
+        return tuple(f"http://{host}:{self.port}/{token}" for host in shown)
 
     def close(self) -> None:
         """Serve no longer."""
@@ -83,6 +93,16 @@ class WebServer:
                 break
             deadline.wait(0.02)
         raise UsSimError(f"the web server at {self.host}:{self.port} did not start")
+
+
+def _outward() -> list[str]:
+    """The IP address from which this computer would send to others; none without a network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        try:
+            asking.connect(("192.0.2.1", 9))  # an address for examples; nothing is sent
+        except OSError:
+            return []
+        return [str(asking.getsockname()[0])]
 
 
 def _made(simulator: Simulator) -> tuple[Any, Any]:
