@@ -90,7 +90,11 @@ def test_units_are_si_inside():
         ("probe.collider", None, "probe.collider: is missing"),
         ("volume", None, "volume: is missing"),
         ("volume.phantom", "leg", "volume.phantom: 'leg' is not one of upper_arm"),
-        ("volume", {}, "volume.file: is missing; name a file there, or give one with --volume"),
+        (
+            "volume",
+            {},
+            "volume.file: is missing; name a file in the scene file, or give one with --volume",
+        ),
         ("volume.file", "a.mha", "has both `file` and `phantom`"),
         ("volume", {"file": "nowhere.mha"}, "volume.file: there is no file .*nowhere.mha"),
         ("path", "nowhere.mcap", "path: there is no file .*nowhere.mcap"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from us_sim.errors import SettingsError
 from us_sim.settings.amount import dial_unit
 from us_sim.settings.quantity import Quantity, units_of
-from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.parameters import Kind, Parameter, in_words
 
 QUANTITIES = [
     Quantity("length", 1e-4, 0.4),
@@ -140,3 +140,9 @@ def test_lists_are_numbers_in_the_unit_that_is_shown():
 def test_a_name_says_its_group_and_its_words():
     made = Parameter("n", "materials.fat.young_modulus", Kind.NUMBER, 1.0)
     assert (made.group, made.label) == ("materials.fat", "young modulus")
+
+
+def test_names_are_written_as_in_the_field():
+    assert Parameter("n", "colour.nyquist_velocity", Kind.TEXT, "").label == "Nyquist velocity"
+    assert in_words("m_mode.lateral") == "M-mode · lateral"
+    assert in_words("mode") == "mode"

@@ -20,12 +20,14 @@ from typing import Any
 from us_sim.errors import SettingsError
 from us_sim.settings.spelling import shown
 
-__all__ = ["Kind", "NodeParameters", "Parameter", "State"]
+__all__ = ["Kind", "NodeParameters", "Parameter", "State", "in_words"]
 
 _DIGITS = 12
 """Of a number that is shown: fewer than a float has, so that rounding is not seen."""
 _AT_THE_END = 1e-11
 """How far from the end of its range, relatively, a number may be by rounding."""
+_NAMES = {"m mode": "M-mode", "nyquist": "Nyquist"}
+"""That are written otherwise than other words."""
 _WHOLE = 2**63
 """Whole numbers from here on do not fit into a parameter."""
 
@@ -102,7 +104,7 @@ class Parameter:
     @property
     def label(self) -> str:
         """The last part of its name in words."""
-        return self.name.rpartition(".")[2].replace("_", " ")
+        return in_words(self.name.rpartition(".")[2])
 
     def raw_of(self, value: Any) -> Any:
         """What the node is sent for a value that a person has set, in ``unit``.
@@ -190,6 +192,18 @@ class NodeParameters:
     node: str
     state: State = State.ABSENT
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # by name, as declared
+
+
+def in_words(name: str) -> str:
+    """A parameter's name, or a group's, as a person reads it.
+
+    >>> in_words("colour.nyquist_velocity"), in_words("m_mode")
+    ('colour · Nyquist velocity', 'M-mode')
+    """
+    words = name.replace("_", " ").replace(".", " · ")
+    for plain, written in _NAMES.items():
+        words = words.replace(plain, written)
+    return words
 
 
 def _is_nothing(raw: Any) -> bool:

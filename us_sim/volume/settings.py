@@ -48,7 +48,9 @@ class VolumeSettings(Settings):
         if len(given) > 1:
             raise self.refused("", f"has both `{given[0]}` and `{given[1]}`; keep one")
         if not given:
-            raise self.refused("file", "is missing; name a file there, or give one with --volume")
+            raise self.refused(
+                "file", "is missing; name a file in the scene file, or give one with --volume"
+            )
 
     @property
     def name(self) -> str:

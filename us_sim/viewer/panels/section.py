@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from us_sim.viewer.parameters import Parameter
+from us_sim.viewer.parameters import Parameter, in_words
 
 __all__ = [
     "Arrange",
@@ -106,11 +106,11 @@ def chosen_first(choosing: str) -> Arrange:
 def given_at_the_start(parameters: Mapping[str, Parameter], names: Iterable[str]) -> list[Section]:
     """What cannot be changed any more, if there is any."""
     fixed = tuple(name for name in names if not parameters[name].is_live)
-    labels = {name: name.replace("_", " ").replace(".", " · ") for name in fixed}
+    labels = {name: in_words(name) for name in fixed}
     return [Section("fixed", "Given at the start", fixed, labels)] if fixed else []
 
 
 def title_of(group: str) -> str:
     """What comes before parameters' names, in words."""
-    words = group.replace("_", " ").replace(".", " · ")
+    words = in_words(group)
     return words[:1].upper() + words[1:]
