@@ -21,6 +21,10 @@ START_S = 240.0
 ENDED_AT = -1.0
 """mm, how deep the short path presses at its end; a hand that knows no better begins at +1."""
 
+PRESSED = """import("/us_sim/assets/hand/hand.js").then(
+    ({ hand }) => Number((1000 * hand.state.stance.press).toFixed(2)))"""
+"""mm: how deep the probe has come, where the field says how deep it shall."""
+
 
 @pytest.fixture
 def run(small_scene: Path, short_path: Path, tmp_path: Path) -> Iterator[Any]:
@@ -71,7 +75,7 @@ def test_the_session_outlives_its_path_and_its_viewer(browser: Any, run: Any) ->
     press.fill("3.5")
     press.press("Enter")
     press.blur()
-    until(lambda: page.evaluate("usSim.images()") > 5, "images of the press")
+    until(lambda: page.evaluate(PRESSED) == 3.5, "the probe is where it was put")
 
     before = nodes_of(run.process.pid)["viewer"]
     command_line = Path(f"/proc/{before}/cmdline").read_bytes().decode()

@@ -32,7 +32,7 @@ def test_the_node_publishes_poses_until_it_is_interrupted(bench, tmp_path: Path)
     ) as node:
         try:
             assert bench.spin_until(lambda: len(received) >= 5, seconds=30)
-            assert "left_tracker" in listener.get_node_names()
+            assert bench.spin_until(lambda: "left_tracker" in listener.get_node_names(), seconds=30)
             node.send_signal(signal.SIGINT)
             _, errors = node.communicate(timeout=10)
         finally:
