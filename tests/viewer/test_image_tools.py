@@ -42,6 +42,7 @@ def images(page: Any, simulator: Simulator) -> Images:
     page.goto(page.address)
     page.wait_for_selector(".us-image-bar")
     await_grey(page, 40)
+    _until(page.get_by_role("button", name="Distance", exact=True).is_enabled)  # places are known
     return images
 
 
