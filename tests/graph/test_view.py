@@ -6,10 +6,6 @@ own: `docs/viewer_press.png` is one of them.
 
 import os
 import re
-import signal
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,10 +15,10 @@ import numpy as np
 import pytest
 from awaiting import until
 from chromium import watched
+from served_view import START_S, served_view
 
 from us_sim.recording.reader import read_bag
 
-START_S = 240.0
 STEP = 4
 """Of the image's pixels each so many-th of each so many-th row is looked at."""
 PIXELS = """step => {
@@ -116,30 +112,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def address(folder: Path) -> Iterator[str]:
     """Where `us-sim view` of the arm serves its page."""
-    pytest.importorskip("nicegui", reason="nicegui is not installed")
-    log = folder / "view.log"
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "us_sim", "view", "upper_arm", "--port", "0"],
-            cwd=folder,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
-    try:
-        found = until(
-            lambda: process.poll() is not None or re.search(r"http://\S+", log.read_text()),
-            "the address is printed",
-            START_S,
-        )
-        assert process.poll() is None, log.read_text()
-        yield found[0]
-    finally:
-        process.send_signal(signal.SIGINT)
-        killer = threading.Timer(30.0, process.kill)
-        killer.start()
-        process.wait()
-        killer.cancel()
-    assert "Traceback" not in log.read_text()
+    with served_view(folder, "upper_arm") as served:
+        yield served.address
 
 
 @pytest.fixture(scope="module")

@@ -3,21 +3,18 @@
 import os
 import re
 import signal
-import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from awaiting import until
 from chromium import watched
 from many_restarts import nodes_of
+from served_view import START_S, served_view
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
-START_S = 240.0
 ENDED_AT = -1.0
 """mm, how deep the short path presses at its end; a hand that knows no better begins at +1."""
 
@@ -29,32 +26,10 @@ PRESSED = """import("/us_sim/assets/hand/hand.js").then(
 @pytest.fixture
 def run(small_scene: Path, short_path: Path, tmp_path: Path) -> Iterator[Any]:
     """The command's process, what it says, and the address that it prints."""
-    pytest.importorskip("nicegui", reason="nicegui is not installed")
-    log = tmp_path / "view.log"
-    words = ["view", small_scene, "--path", short_path, "--host", "0.0.0.0", "--port", "0"]
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "us_sim", *map(str, words)],
-            cwd=tmp_path,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
-    try:
-        found = until(
-            lambda: process.poll() is not None or re.search(r"http://\S+", log.read_text()),
-            "the address is printed",
-            START_S,
-        )
-        assert process.poll() is None, log.read_text()
-        address = re.sub(r"//[^:/]+", "//127.0.0.1", found[0])
-        yield SimpleNamespace(process=process, address=address, log=log)
-    finally:
-        process.send_signal(signal.SIGINT)
-        killer = threading.Timer(30.0, process.kill)
-        killer.start()
-        process.wait()
-        killer.cancel()
-    assert "Traceback" not in log.read_text()
+    words = (small_scene, "--path", short_path, "--host", "0.0.0.0")
+    with served_view(tmp_path, *words) as served:
+        served.address = re.sub(r"//[^:/]+", "//127.0.0.1", served.address)
+        yield served
 
 
 def test_the_session_outlives_its_path_and_its_viewer(browser: Any, run: Any) -> None:

@@ -20,7 +20,7 @@ ARGUMENTS = (
     "--disable-sync",
 )
 PROGRAMS = ("chromium-headless-shell", "chromium")
-"""The first has no window of its own to draw, and takes a third less time."""
+"""The first has no window of its own to draw."""
 
 
 @contextmanager
