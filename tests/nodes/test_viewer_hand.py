@@ -126,14 +126,24 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
     page.await_leader("hand")
     bench.spin_until(lambda: len(tracked) >= 1)
     first = nanoseconds_of(tracked[-1].header.stamp)
-    assert hand.asked_by(first) is None
+    assert hand.asked.by(first) is None
     page(by={"slide": [0.002, 0.0]})
     page(by={"slide": [0.003, 0.0]})
     bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.005, abs=1e-5))
-    answers = [hand.asked_by(nanoseconds_of(pose.header.stamp)) for pose in tracked]
+    answers = [hand.asked.by(nanoseconds_of(pose.header.stamp)) for pose in tracked]
     assert answers[-1] == ("page", 2)
     moved = [a for a, pose in zip(answers, tracked, strict=True) if pose.pose.position.x > 1e-6]
     assert moved[0] is not None
+
+
+def test_pages_are_told_which_of_them_moves_the_probe_until_it_rests(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    assert page.state["mover"] == ""
+    page(by={"press": 0.001})
+    bench.spin_until(lambda: page.state["mover"] == "page")
+    bench.spin_until(lambda: page.state["mover"] == "")
 
 
 def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):

@@ -37,7 +37,7 @@ class FakeHand:
         self.takes += 1
 
     def say(self, **changes: Any) -> None:
-        header = {"leader": "hand", "obstacle": "", "warning": "", "can_take": False}
+        header = {"leader": "hand", "mover": "", "obstacle": "", "warning": "", "can_take": False}
         header["range"] = RANGES
         header |= {"stance": STANCE, "goal": STANCE, **changes}
         self.state.offer(lambda n: Packet("hand", n, header, b""))

@@ -318,6 +318,16 @@ def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
     assert told.inner_text() == "You hold the probe"
 
 
+def test_it_says_when_another_page_moves_the_probe(page: Any, viewer: FakeHand) -> None:
+    said = "text => document.querySelector('.us-said').textContent === text"
+    viewer.say(mover="another")
+    page.wait_for_function(said, arg="Another page moves the probe")
+    page.keyboard.press("s")
+    viewer.until(lambda: viewer.asked)  # it may be moved here, too
+    viewer.say(mover=viewer.asked[-1]["source"])
+    page.wait_for_function(said, arg="You hold the probe")
+
+
 @pytest.mark.parametrize("width", [768, 1024, 1280])
 def test_who_holds_the_probe_can_be_read_whole_beside_how_soon_it_is_seen(
     page: Any, viewer: FakeHand, width: int

@@ -47,7 +47,7 @@ class Viewer(GuardedNode):
         )
         rest = RestMesh(self)
         hand = ViewerHand(self, self.post, self.simulator, rest)
-        self.simulator.add(*image_feeds(self, self.post, settings.rate, hand.asked_by))
+        self.simulator.add(*image_feeds(self, self.post, settings.rate, hand.asked.by))
         for bodies in (SkinFeeds, ProbeFeeds):
             self.simulator.add(*bodies(self, self.post, settings.rate).feeds)
         self.simulator.add(*TissueFeeds(self, self.post, settings.rate, rest).feeds)

@@ -23,6 +23,7 @@ from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.tracking.virtual_hand.motion import Motion
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import Stance
+from us_sim.viewer.asked_poses import AskedPoses
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.hand_command import HOME_PRESS, HandCommand
 from us_sim.viewer.hand_state import hand_state
@@ -47,8 +48,6 @@ STATE_RATE = 10.0
 more often to lay them out would take time from the image."""
 LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
-KEPT = 512
-"""Poses for which is known what they were asked by."""
 NEAR = 0.02
 """m from the old place to a new surface: it is another one of the same patient."""
 ASTRAY, SETTLED = 3e-3, 1.0
@@ -87,18 +86,13 @@ class ViewerHand:
         self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
         self._last_stamp = 0  # ns, of the last pose
-        self._asked: tuple[str, int] | None = None  # page and number of the last command
-        self._asked_by: dict[int, tuple[str, int]] = {}  # by the stamp of a pose
-        self._sent_at = self._rests_since = self._asked_at = 0.0  # s, of the monotonic clock
+        self.asked = AskedPoses()
+        self._sent_at = self._rests_since = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
         self._moving_timer.cancel()
         self._resting_timer.cancel()
-
-    def asked_by(self, stamp: int) -> tuple[str, int] | None:
-        """The page, and the number of its command, that the pose of a stamp (ns) contains."""
-        return self._asked_by.get(stamp)
 
     def _command(self, value: Any, _: int) -> str | None:
         """What a page sent, in its thread; why it is not done, or None."""
@@ -240,18 +234,17 @@ class ViewerHand:
         if self._publisher is None or self._motion is None or self._standing is None:
             return  # somebody else has taken it meanwhile
         self._motion.aim(asked.stance(self._motion.goal, self._standing))
-        self._asked = (asked.source, asked.sequence)
-        self._asked_at = time.monotonic()
+        self.asked.ask(asked.source, asked.sequence)
         rested = self._moving_timer.is_canceled()
         if rested:
             self._moving_timer.reset()
-        if rested or self._asked_at - self._sent_at > 0.5 / MOVING:
+        if rested or self.asked.at - self._sent_at > 0.5 / MOVING:
             self._advance(1.0 / MOVING if rested else LONGEST_STEP)
 
     def _tick(self) -> None:
         """The next pose of a movement, if it is due."""
         now = time.monotonic()
-        is_streaming = now - self._asked_at < STREAMING / MOVING
+        is_streaming = now - self.asked.at < STREAMING / MOVING
         if now - self._sent_at > (PATIENCE if is_streaming else 0.9) / MOVING:
             self._advance(LONGEST_STEP)
 
@@ -274,10 +267,7 @@ class ViewerHand:
         stamp = self._node.get_clock().now()
         self._last_stamp = stamp.nanoseconds
         pose = self._motion.stance.pose(self._standing)
-        if self._asked is not None:  # said first: its image may be there at once
-            self._asked_by[stamp.nanoseconds] = self._asked
-            if len(self._asked_by) > KEPT:
-                del self._asked_by[next(iter(self._asked_by))]
+        self.asked.published(stamp.nanoseconds)  # said first: its image may be there at once
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
         self._node.health.published(LEAD_TOPIC)
@@ -292,6 +282,7 @@ class ViewerHand:
             stance = goal = Stance.of(self._elsewhere, surface)
         header = {
             "leader": self._lead.who,
+            "mover": self.asked.mover,
             "obstacle": self._lead.obstacle,
             "can_take": self._lead.can_take,
             "warning": self._warning,

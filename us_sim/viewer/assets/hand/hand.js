@@ -21,7 +21,7 @@ let isDue = false;
 const handlers = [];
 
 export const hand = {
-  /** The newest of the viewer: {leader, obstacle, warning, stance, goal, range}, or null. */
+  /** The newest of the viewer: {leader, mover, obstacle, warning, stance, goal, range}, or null. */
   state: null,
 
   /** Have `handler(state)` called with each newer state. */
@@ -32,6 +32,11 @@ export const hand = {
   /** Whether the page may move the probe. */
   get leads() {
     return this.state?.leader === "hand";
+  },
+
+  /** Whether another page moves the probe. */
+  get isMovedElsewhere() {
+    return this.leads && Boolean(this.state.mover) && this.state.mover !== source;
   },
 
   /**

@@ -142,7 +142,8 @@ function show() {
   led = hand.leads;
   const isProblem = performance.now() < problemEnds;
   said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
-  const words = isProblem ? problem : state.warning || state.obstacle || "You hold the probe";
+  const holder = hand.isMovedElsewhere ? "Another page moves the probe" : "You hold the probe";
+  const words = isProblem ? problem : state.warning || state.obstacle || holder;
   put(said, "textContent", words);
   put(said, "title", words);
 }
