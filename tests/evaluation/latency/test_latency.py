@@ -2,6 +2,8 @@
 
 import csv
 import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -76,6 +78,34 @@ def test_a_process_s_own_time_is_counted():
     usage.add(1.0, usage_of(os.getpid()))
     assert usage.processor == pytest.approx(0.3, abs=0.05)
     assert usage_of(2**22 + 1) is None
+
+
+FAMILY = """
+import os, sys
+kept = bytearray(os.urandom(1)) * 80_000_000
+family = [os.getpid()]
+for _ in range(3):
+    child = os.fork()
+    if not child:
+        break
+    family.append(child)
+else:
+    print(*family, flush=True)
+sys.stdin.read()
+os._exit(0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+def test_memory_that_a_family_of_processes_shares_is_counted_once():
+    process = subprocess.Popen(
+        [sys.executable, "-c", FAMILY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    pids = [int(word) for word in process.stdout.readline().split()]
+    uses = [usage_of(pid) for pid in pids]
+    process.communicate("")
+    assert len(uses) == 4
+    assert 80e6 < sum(use.memory for use in uses) < 160e6
 
 
 def test_limits_are_judged_by_the_case_they_are_for():

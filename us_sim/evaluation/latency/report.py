@@ -55,8 +55,9 @@ def write_report(folder: ReportFolder, points: Sequence[Point]) -> None:
         "![Over time](latency_time.png)",
         "## How it was measured",
         f"The arm's path is played again and again at {RATE:.0f} Hz; what comes in the first "
-        f"seconds does not count. Memory is what is resident at the end. Cores are kept busy by "
-        f"as many endless loops as there are cores, at the same priority. Methods run as their "
+        f"seconds does not count. Memory is what is resident at the end; what several processes "
+        f"share is divided among them. Cores are kept busy by as many endless loops as there are "
+        f"cores, at the same priority. Methods run as their "
         f"settings say by default, one thread a node. Scheduling is what the nodes got: realtime "
         f"where they may go before ordinary programs, see their parameter `realtime`.",
     ]

@@ -10,6 +10,7 @@ True
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import numpy as np
 
 __all__ = ["Usage", "UsageOverTime", "usage_of"]
 
+_SHARE = re.compile(r"^Pss:\s+(\d+) kB", re.MULTILINE)  # proc(5): proportional set size
 _WARMING = 60.0  # s, of a run, in which memory may still grow
 _LONG = 120.0  # s, of a run that tells whether it does
 
@@ -26,18 +28,21 @@ class Usage:
     """Of one process until now."""
 
     processor: float  # s, of all its threads
-    memory: float  # bytes, resident
+    memory: float  # bytes, resident; a page that n processes share counts 1/n in each of them
 
 
 def usage_of(pid: int) -> Usage | None:
     """What a process has used; None where it has gone, or the system does not tell."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="utf-8").split()[1])
+        sizes = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8")
+        ticks = int(fields[11]) + int(fields[12])
     except (OSError, IndexError):
         return None
-    ticks = int(fields[11]) + int(fields[12])
-    return Usage(ticks / os.sysconf("SC_CLK_TCK"), float(pages * os.sysconf("SC_PAGE_SIZE")))
+    share = _SHARE.search(sizes)
+    if share is None:  # it has ended, and only its number is left
+        return None
+    return Usage(ticks / os.sysconf("SC_CLK_TCK"), 1024.0 * int(share[1]))
 
 
 @dataclass

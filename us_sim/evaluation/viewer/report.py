@@ -54,6 +54,8 @@ def write_report(folder: ReportFolder, points: Sequence[Point]) -> None:
         "in the browser to its first image.",
         f"## Memory: {longest.case}",
         "![Memory over time](viewer_memory.png)",
+        "Memory is what is resident; what several processes share is divided among them. The "
+        "browser's is that of all its processes; growth is fitted by least squares.",
     ]
     folder.write_report(parts, failures(points))
 
