@@ -112,7 +112,7 @@ class StrainStream(_StrainImages):
         pressed = compression(values)
         mean, quality = f"{100 * pressed.mean:.2g} %", f"{pressed.quality:.2f}"
         self._node.health.values |= {"strain_mean": mean, "compression_quality": quality}
-        return f"mean {mean}, even {quality}"
+        return f"mean {mean}, quality {quality}"
 
 
 class StrainEstimateStream(_StrainImages):
@@ -149,6 +149,9 @@ class StrainEstimateStream(_StrainImages):
         return found.strain
 
     def _note(self, values: NDArray[np.float32]) -> str:
-        mean, found = f"{100 * compression(values).mean:.2g} %", f"{self._correlation:.2f}"
-        self._node.health.values |= {"strain_estimate_mean": mean, "strain_correlation": found}
-        return f"mean {mean}, found {found}"
+        mean, correlation = f"{100 * compression(values).mean:.2g} %", f"{self._correlation:.2f}"
+        self._node.health.values |= {
+            "strain_estimate_mean": mean,
+            "strain_correlation": correlation,
+        }
+        return f"mean {mean}, correlation {correlation}"
