@@ -48,7 +48,7 @@ def strain_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint
     ):
         most = max(float(f"{np.nanpercentile(np.abs(beside), 95.0):.1g}"), 1e-4)  # one digit
         pressed = compression(values)
-        note = f"mean {100 * pressed.mean:.2g} %, even {pressed.quality:.2f}"
+        note = f"mean {100 * pressed.mean:.2g} %, quality {pressed.quality:.2f}"
         overlay = Overlay(values, strain_scale("strain", most), note=note)
         pictures[title] = annotation.draw(now.pixels, overlay=overlay)
     return pictures
