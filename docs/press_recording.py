@@ -36,6 +36,15 @@ COUNT = """import("/us_sim/assets/events.js").then(({ events }) => {
   window.drawnImages = 0;
   events.on("image-drawn", () => (window.drawnImages += 1));
 })"""
+AT_REST = """import("/us_sim/assets/scene/stage.js").then(({ stage }) => new Promise((resolve) => {
+  const latest = performance.now() + 2000;
+  const timer = setInterval(() => {
+    if (!stage.pace.isAtRest && performance.now() < latest) return;
+    clearInterval(timer);
+    resolve(stage.pace.isAtRest);
+  }, 5);
+}))"""
+"""The 3D scene is drawn finely once it is at rest: whether it came to that in a while."""
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -63,6 +72,7 @@ def pictures(page: Any) -> Iterator[Image.Image]:
                 page.keyboard.press(key)
             awaited = page.evaluate("window.drawnImages") + DRAWN_AFTER_KEY
             page.wait_for_function("n => window.drawnImages >= n", arg=awaited, timeout=60_000)
+            page.evaluate(AT_REST)
             yield Image.open(io.BytesIO(page.screenshot())).convert("RGB")
 
 

@@ -343,4 +343,5 @@ def test_status_says_tracked_coasting_lost_and_tracked_again(bench, tracker):
         DiagnosticStatus.WARN,
         DiagnosticStatus.ERROR,
     ]
+    bench.spin_until(lambda: len(poses) >= 2)
     assert len(poses) == 2  # nothing was sent again meanwhile
