@@ -10,7 +10,7 @@ from numba.core import config
 from us_sim.cache import cache_folder
 from us_sim.evaluation.stability import measure as stability
 from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
-from us_sim.evaluation.stability.held_cases import HOLD, held_cases
+from us_sim.evaluation.stability.held_cases import HOLD, SMALL, held_cases
 from us_sim.evaluation.stability.measure import evaluate_stability
 from us_sim.evaluation.stability.meshes import MESHES, SUPPORTS, fixed_nodes, mesh_named, parts
 from us_sim.evaluation.stability.motions import poses_of
@@ -214,6 +214,14 @@ def test_held_cases_are_what_anatomy_is():
     assert {case.held for case in cases} == {HOLD}
     for name, some in (("mesh", "delaunay"), ("collider", "plate"), ("motion", "tilt")):
         assert some in {getattr(case, name) for case in cases}
+
+
+@pytest.mark.parametrize(("number", "seed"), [(135, 1), (988, 1), (90, 2)])
+def test_a_probe_on_soft_tissue_between_stiff_parts_turns_nothing_inside_out(number, seed):
+    trial = try_case("fem_nonlinear", held_cases(number + 1, seed)[number])
+    assert not trial.failure
+    assert trial.held_inverted == 0
+    assert trial.held[-1] <= SMALL
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,16 @@
 """The modulus of the wall against crushing, by its laws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tissue_block import block_mesh
 
-from us_sim.tissue.elasticity.wall import wall_modulus
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.wall import wall_modulus, withstood_force
 
 MESH = block_mesh((4, 3, 3))
 COUNT = len(MESH.tetrahedra)
@@ -49,3 +53,46 @@ def test_it_scales_with_the_moduli_and_does_not_know_the_tetrahedras_order(shear
     random.shuffle(order)
     shuffled = wall_modulus(MESH.tetrahedra[order], shear[order], len(MESH.nodes))
     np.testing.assert_array_equal(shuffled, wall(shear)[order])
+
+
+def withstood(shear):
+    soft = uniform_material(MESH, Material(3.0, 0.25, 1000.0))
+    return withstood_force(MESH, replace(soft, young_modulus=2.5 * shear))
+
+
+def third_of_faces():
+    """(M, 4) m2: by Heron's formula, a third of the face opposite each corner."""
+    areas = np.empty((COUNT, 4))
+    for t, corners in enumerate(MESH.tetrahedra):
+        for i in range(4):
+            a, b, c = MESH.nodes[np.delete(corners, i)]
+            sides = [np.linalg.norm(a - b), np.linalg.norm(b - c), np.linalg.norm(c - a)]
+            half = sum(sides) / 2
+            areas[t, i] = np.sqrt(half * np.prod([half - side for side in sides])) / 3
+    return areas
+
+
+def test_in_uniform_tissue_a_node_withstands_shear_modulus_times_area():
+    expected = np.zeros(len(MESH.nodes))
+    np.add.at(expected, MESH.tetrahedra, 3e3 * third_of_faces())
+    np.testing.assert_allclose(withstood(np.full(COUNT, 3e3)), expected, rtol=1e-12)
+
+
+def test_a_stiff_tetrahedron_beside_soft_ones_counts_no_more_than_their_walls():
+    shear = np.full(COUNT, 100.0)
+    shear[3] = 1e6
+    areas, expected = third_of_faces(), np.zeros(len(MESH.nodes))
+    for t, nodes in enumerate(MESH.tetrahedra):
+        for i, node in enumerate(nodes):
+            alone = (MESH.tetrahedra == node).any(axis=1).sum() == 1
+            counted = shear[t] if t != 3 or alone else 1e4  # the mean of soft and stiff
+            expected[node] += counted * areas[t, i]
+    np.testing.assert_allclose(withstood(shear), expected, rtol=1e-12)
+
+
+@given(shears, st.floats(1e-3, 1e3))
+def test_what_is_withstood_scales_with_the_moduli_and_lies_between_uniform_ones(shear, factor):
+    found = withstood(shear)
+    np.testing.assert_allclose(withstood(factor * shear), factor * found, rtol=1e-12)
+    assert (found <= withstood(np.full(COUNT, shear.max())) * (1 + 1e-12)).all()
+    assert (found >= withstood(np.full(COUNT, shear.min())) * (1 - 1e-12)).all()

@@ -17,7 +17,8 @@ from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.contact.surface_points import SurfacePoints
-from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness, shear_times_area
+from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
+from us_sim.tissue.elasticity.wall import withstood_force
 from us_sim.tissue.model import TissueModel
 
 __all__ = ["surface_contact"]
@@ -31,7 +32,7 @@ _STIFFENING = 0.2
 """Depth at which a spring pushes twice as much as if it were linear, over the nodes' spacing."""
 
 _GREATEST_PUSH = 25.0
-"""Greatest force of a node's springs, over shear modulus times area there: less than what a crushed
+"""Greatest force of a node's springs, over `withstood_force` there: less than what a crushed
 tetrahedron resists, so that no probe turns one inside out."""
 
 
@@ -48,6 +49,6 @@ def surface_contact(
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
     points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
     firm = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
-    strongest = _GREATEST_PUSH * points.spread(shear_times_area(model.mesh, model.materials))
+    strongest = _GREATEST_PUSH * points.spread(withstood_force(model.mesh, model.materials))
     law = (FlaredProbe(model.collider, spacing), firm, strongest, _STIFFENING * spacing)
     return points, PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)

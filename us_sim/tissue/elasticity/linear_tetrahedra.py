@@ -30,7 +30,6 @@ __all__ = [
     "nodal_shear_stiffness",
     "require_held",
     "shape_gradients",
-    "shear_times_area",
     "stiffness",
 ]
 
@@ -121,15 +120,6 @@ def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
                 f"{np.argmax(mesh.parts == part)} has {len(held)} fixed nodes{line}; fix at least "
                 f"three that are not on one line, such as the face `bottom`"
             )
-
-
-def shear_times_area(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
-    """(N,) N, at each node the sum of its tetrahedra's shear modulus times a third of a face."""
-    shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
-    pulls = (shear * mesh.volumes)[:, None] * np.linalg.norm(shape_gradients(mesh), axis=2)
-    total = np.zeros(len(mesh.nodes))
-    np.add.at(total, mesh.tetrahedra, pulls)
-    return total
 
 
 def nodal_shear_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
