@@ -41,10 +41,10 @@ AT_REST = """import("/us_sim/assets/scene/stage.js").then(({ stage }) => new Pro
   const timer = setInterval(() => {
     if (!stage.pace.isAtRest && performance.now() < latest) return;
     clearInterval(timer);
-    resolve(stage.pace.isAtRest);
+    resolve();
   }, 5);
 }))"""
-"""The 3D scene is drawn finely once it is at rest: whether it came to that in a while."""
+"""Until the 3D scene is drawn finely, as it is at rest; for a while at most."""
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 

@@ -1,13 +1,13 @@
 """Measuring, freezing and keeping the image in a real browser, against a geometry that is known."""
 
 import math
-import time
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from awaiting import until
 
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
@@ -42,7 +42,8 @@ def images(page: Any, simulator: Simulator) -> Images:
     page.goto(page.address)
     page.wait_for_selector(".us-image-bar")
     await_grey(page, 40)
-    _until(page.get_by_role("button", name="Distance", exact=True).is_enabled)  # places are known
+    distance = page.get_by_role("button", name="Distance", exact=True)
+    until(distance.is_enabled, "it is known where the pixels are")
     return images
 
 
@@ -64,7 +65,7 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
     page.goto(served[0].address)
     page.get_by_text("Waiting for the first image").wait_for()
     known = "import('/us_sim/assets/image.js').then(m => m.pixelToMillimetres(0, 0) !== null)"
-    _until(lambda: page.evaluate(known))
+    until(lambda: page.evaluate(known), "the pixels' places are known")
     page.set_viewport_size({"width": 1100, "height": 720})  # which has the scale drawn
     page.wait_for_function("document.querySelector('.us-scale').width > 300")
     drawn = """() => {
@@ -88,8 +89,8 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
     simulator.feeds["image"] = images.feed
     page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
     page.wait_for_function(drawn)
-    _until(button.is_enabled)
-    _until(lambda: all(each.is_enabled() for each in of_an_image))
+    until(button.is_enabled, "distances can be measured")
+    until(lambda: all(each.is_enabled() for each in of_an_image), "there is an image")
     assert "Hold the image" in of_an_image[0].get_attribute("title")
     page.close()
 
@@ -185,7 +186,7 @@ def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
         images.show(grey)
         await_grey(page, grey)
     page.keyboard.press(" ")
-    _until(lambda: not images.feed.is_watched)
+    until(lambda: not images.feed.is_watched, "the page takes no image")
     assert page.locator("#readout").inner_text() == "frozen"
     images.show(99)
     for _ in range(3):
@@ -198,16 +199,9 @@ def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
     page.keyboard.press("c")
     await_grey(page, 50)  # it plays to the end, and again
     page.keyboard.press(" ")
-    _until(lambda: images.feed.is_watched)
+    until(lambda: images.feed.is_watched, "the page takes images again")
     images.show(120)
     await_grey(page, 120)
-
-
-def _until(done: Any) -> None:
-    deadline = time.monotonic() + 10.0
-    while not done():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> None:
@@ -292,7 +286,7 @@ def test_a_picture_of_another_size_is_not_measured_and_says_why(
     button = page.get_by_role("button", name="Distance", exact=True)
     assert button.get_attribute("title") == "Drag from point to point: mm (key D)"
     show_annotated(page, simulator, 80, 60)
-    _until(button.is_disabled)
+    until(button.is_disabled, "distances cannot be measured")
     assert "another size than the B-mode image" in button.get_attribute("title")
     page.keyboard.press("d")
     drag(page, (900, 300), (1000, 300))
