@@ -48,7 +48,7 @@ _RESOLVED = 2.0
 _GRIP = 0.1
 """Length by which the shape continues behind the collider, m, as where a hand holds the probe."""
 
-_REACH = 2.0
+_REACH = 1.0
 """Gap of points that may come to touch, over what is deep and the nodes' spacing together."""
 
 _CLOSE = 1e-6  # m

@@ -115,16 +115,20 @@ class PenaltyContact:
         self._measure(gap)
 
     def release(self, positions: NDArray[np.float64]) -> bool:
-        """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes.
+        """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes, and any
+        that have come near since the probe was put there.
 
         Returns:
             Whether that changes anything.
         """
-        if len(self._planar) == 0:
+        if self._pose is None:
             return False
+        planar, before = len(self._planar), self.push
+        gap, _ = self._probe.distance(self._pose, positions)
         self._planar = self._planar[:0]
+        self.near = np.flatnonzero(gap < self._probe.reach)
         self.look(positions)
-        return True
+        return planar > 0 or not np.array_equal(self.push, before)
 
     def look(self, positions: NDArray[np.float64]) -> None:
         """Measure gaps, normals and pushes at other positions (P, 3) m."""
@@ -139,15 +143,13 @@ class PenaltyContact:
 
     def _measure(self, gap: NDArray[np.float64]) -> None:
         self.gap = gap  # (P,) m, infinite where the probe cannot push
-        self.push = self.push_at(gap)  # (P,) N, along the normal
+        self.push = np.zeros_like(gap)  # (P,) N, along the normal
+        self._energy = _push(self.near, gap, *self._law, self.push)
 
     @property
     def energy(self) -> float:
         """J, of all springs."""
-        depth = np.maximum(-self.gap, 0.0)
-        held = np.minimum(depth, self._deepest)
-        energy = 0.5 * self.stiffness * held**2 * (1 + 0.5 * (held / self._stiffening) ** 2)
-        return float((energy + self._strongest * (depth - held)).sum())
+        return self._energy
 
     def push_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P,) N, pushes at other gaps (P,) m."""
@@ -259,10 +261,16 @@ def _push_of(depth, stiffness, stiffening):
 
 @njit(**_LOOP)
 def _push(near, gap, stiffness, deepest, stiffening, push):
-    """Fills push (P,) of the points that are near."""
+    """Fills push (P,) of the points that are near; returns the springs' energy."""
+    energy = 0.0
     for i in near:
-        depth = min(max(-gap[i], 0.0), deepest[i])
-        push[i] = _push_of(depth, stiffness[i], stiffening)
+        depth = max(-gap[i], 0.0)
+        held = min(depth, deepest[i])
+        push[i] = _push_of(held, stiffness[i], stiffening)
+        ratio = held / stiffening
+        energy += 0.5 * stiffness[i] * held * held * (1.0 + 0.5 * ratio * ratio)
+        energy += push[i] * (depth - held)
+    return energy
 
 
 @njit(**_LOOP)

@@ -106,9 +106,16 @@ def wrench_on_probe(
     Returns:
         force (3,) N and torque (3,) N m on the probe about its origin, in frame ``probe``.
     """
-    arms = points - pose.position
+    moments = (points - pose.position).T @ forces  # (3, 3) N m, each arm's axis by each force's
+    torque = np.array(
+        [
+            moments[1, 2] - moments[2, 1],
+            moments[2, 0] - moments[0, 2],
+            moments[0, 1] - moments[1, 0],
+        ]
+    )
     rotation = pose.rotation
-    return -forces.sum(axis=0) @ rotation, -np.cross(arms, forces).sum(axis=0) @ rotation
+    return -forces.sum(axis=0) @ rotation, -torque @ rotation
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

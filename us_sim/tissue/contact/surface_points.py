@@ -79,7 +79,10 @@ class SurfacePoints:
         areas = (share * corner_area[own], area[parts.triangle])
         self.rest = np.einsum("pk,pkd->pd", self.weights, mesh.nodes[self.nodes])  # (P, 3) m
         self._area = np.concatenate(areas)  # (P,) m2
-        self._count, self._fixed = len(mesh.nodes), model.fixed
+        self._count = len(mesh.nodes)
+        self._own, corner = np.unique(self.nodes, return_inverse=True)  # (S,) nodes of points
+        self._corner = corner.reshape(self.nodes.shape)  # (P, 3), their places in _own
+        self._movable = ~model.fixed[self._own]
         self._all = np.arange(len(self.nodes))
         total = self.at_nodes(self._area)
         self._per_area = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
@@ -113,12 +116,8 @@ class SurfacePoints:
             (N,) m, gaps, infinite where there is no spring; (N, 3), their directions; and (N,)
             m/N, how soft they are.
         """
-        some = np.flatnonzero(stiffness > 0.0)
-        weight = self.weights[some] * stiffness[some, None]
         total = np.zeros((self._count, 5))
-        given = np.column_stack([np.ones(len(some)), gap[some], normal[some]])
-        for k in range(3):
-            np.add.at(total, self.nodes[some, k], weight[:, k, None] * given)
+        _sum_springs(self.nodes, self.weights, stiffness, gap, normal, total)
         sprung = np.flatnonzero(total[:, 0] > 0.0)
         firm, across = total[sprung, :1], total[sprung, 2:]
         gaps, normals = np.full(self._count, np.inf), np.zeros((self._count, 3))
@@ -136,8 +135,17 @@ class SurfacePoints:
         """(P, 3), a field (3, N) at the points; zero where it is not asked for."""
         values = np.zeros((len(self.nodes), 3))
         some = self._all if some is None else some
-        _gather(some, self.nodes, self.weights, field, values)
+        _add_at_points(some, self.nodes, self.weights, field, values)
         return values
+
+    def placed(
+        self, displacement: NDArray[np.float64], some: NDArray[np.integer] | None = None
+    ) -> NDArray[np.float64]:
+        """(P, 3) m, where points are at a displacement (3, N) m; at rest where it is not asked."""
+        places: NDArray[np.float64] = self.rest.copy()
+        some = self._all if some is None else some
+        _add_at_points(some, self.nodes, self.weights, displacement, places)
+        return places
 
     def add(
         self, vectors: NDArray[np.float64], field: NDArray[np.float64], some: NDArray[np.integer]
@@ -164,25 +172,23 @@ class SurfacePoints:
             (S,) nodes that are not fixed, each with all its springs in a row; (S, 3) directions;
             (S,) N/m.
         """
-        tensor = np.zeros((self._count, 6))
-        _lump(active, self.nodes, self.weights, directions, stiffness, tensor)
-        tensor[self._fixed] = 0.0
-        used = np.flatnonzero(tensor[:, 0] + tensor[:, 3] + tensor[:, 5])
+        used, tensor = self._own, np.zeros((len(self._own), 6))
+        _lump(active, self._corner, self.weights, directions, stiffness, tensor)
         nodes = np.empty(3 * len(used), dtype=np.int64)
         along, firm = np.empty((3 * len(used), 3)), np.empty(3 * len(used))
-        count = _split(used, tensor, nodes, along, firm)
+        count = _split(used, tensor, self._movable, nodes, along, firm)
         return nodes[:count], along[:count], firm[:count]
 
 
 @njit(**_LOOP)
-def _gather(some, nodes, weights, field, values):
+def _add_at_points(some, nodes, weights, field, values):
     x, y, z = field[0], field[1], field[2]
     for p in some:
         i, j, k = nodes[p, 0], nodes[p, 1], nodes[p, 2]
         a, b, c = weights[p, 0], weights[p, 1], weights[p, 2]
-        values[p, 0] = a * x[i] + b * x[j] + c * x[k]
-        values[p, 1] = a * y[i] + b * y[j] + c * y[k]
-        values[p, 2] = a * z[i] + b * z[j] + c * z[k]
+        values[p, 0] += a * x[i] + b * x[j] + c * x[k]
+        values[p, 1] += a * y[i] + b * y[j] + c * y[k]
+        values[p, 2] += a * z[i] + b * z[j] + c * z[k]
 
 
 @njit(**_LOOP)
@@ -194,13 +200,27 @@ def _scatter(some, nodes, weights, vectors, field):
 
 
 @njit(**_LOOP)
-def _lump(active, nodes, weights, directions, stiffness, tensor):
-    """Adds to tensor (N, 6), xx, xy, xz, yy, yz, zz, what springs are at each node."""
+def _sum_springs(nodes, weights, stiffness, gap, normal, total):
+    """Adds to total (N, 5) the stiffness of each node's springs, and gaps and normals by that."""
+    for p in range(len(nodes)):
+        if stiffness[p] > 0.0:
+            for k in range(3):
+                share = weights[p, k] * stiffness[p]
+                t = total[nodes[p, k]]
+                t[0] += share
+                t[1] += share * gap[p]
+                for d in range(3):
+                    t[2 + d] += share * normal[p, d]
+
+
+@njit(**_LOOP)
+def _lump(active, corner, weights, directions, stiffness, tensor):
+    """Adds to tensor (S, 6), xx, xy, xz, yy, yz, zz, what springs are at each node of points."""
     for m in range(len(active)):
         x, y, z = directions[m, 0], directions[m, 1], directions[m, 2]
         for k in range(3):
             scale = _SHARE * stiffness[m] * weights[active[m], k]
-            t = tensor[nodes[active[m], k]]
+            t = tensor[corner[active[m], k]]
             t[0] += scale * x * x
             t[1] += scale * x * y
             t[2] += scale * x * z
@@ -210,12 +230,14 @@ def _lump(active, nodes, weights, directions, stiffness, tensor):
 
 
 @njit(**_LOOP)
-def _split(used, tensor, nodes, along, firm):
+def _split(own, tensor, movable, nodes, along, firm):
     """Writes tensors as springs, by Cholesky's method with pivots; returns how many there are."""
     count = 0
     left = np.empty((3, 3))
-    for i in used:
+    for i in range(len(own)):
         t = tensor[i]
+        if not movable[i] or t[0] + t[3] + t[5] == 0.0:
+            continue
         left[0, 0], left[0, 1], left[0, 2] = t[0], t[1], t[2]
         left[1, 0], left[1, 1], left[1, 2] = t[1], t[3], t[4]
         left[2, 0], left[2, 1], left[2, 2] = t[2], t[4], t[5]
@@ -231,7 +253,7 @@ def _split(used, tensor, nodes, along, firm):
             if size <= least:
                 break
             length = math.sqrt(x * x + y * y + z * z)
-            nodes[count], firm[count] = i, size
+            nodes[count], firm[count] = own[i], size
             along[count, 0], along[count, 1], along[count, 2] = x / length, y / length, z / length
             count += 1
             for d in range(3):

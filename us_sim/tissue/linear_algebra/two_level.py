@@ -37,6 +37,7 @@ __all__ = [
     "Solved",
     "TwoLevel",
     "apply_blocks",
+    "clear_nodes",
     "conjugate_gradients",
     "largest_local_eigenvalue",
 ]
@@ -156,7 +157,7 @@ def conjugate_gradients(
         _copy(elastic, whole)
         if add_springs is not None:
             add_springs(search, whole)
-        _clear(whole, fixed)
+        clear_nodes(whole, fixed)
         curvature = _dot(search, whole)
         if not curvature > 0.0:
             return Solved(solution, image, search, iteration + 1, True)
@@ -261,7 +262,8 @@ def _copy(field, out):
 
 
 @njit(**_LOOP)
-def _clear(field, nodes):
+def clear_nodes(field, nodes):
+    """Set a field (3, N) to zero at nodes (K,)."""
     for d in range(3):
         for k in range(len(nodes)):
             field[d, nodes[k]] = 0

@@ -37,6 +37,7 @@ from us_sim.tissue.linear_algebra.two_level import (
     Preconditioner,
     TwoLevel,
     apply_blocks,
+    clear_nodes,
     conjugate_gradients,
     largest_local_eigenvalue,
 )
@@ -128,6 +129,7 @@ class Newton:
     def rest(self) -> None:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
+        self._places = self.points.rest  # (P, 3) m, where the points near the probe are
         self.contact.clear()
         self._carried = 0.0  # N, contact forces of that state, until a step is taken from there
         self._held = self.contact.push  # (P,) N, pushes of the last state that was not just hit
@@ -138,24 +140,20 @@ class Newton:
         self._factors = False  # whether factors have been needed since
         self._weigh()
 
-    @property
-    def _surface(self) -> NDArray[np.float64]:
-        """(P, 3) m, where the points near the probe are."""
-        return self.points.rest + self.points.moved(self.displacement, self.contact.near)
-
     def depth_at_rest(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the undeformed tissue."""
         return self.contact.depth(pose, self.points.rest)
 
     def depth(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the tissue as it is."""
-        return self.contact.depth(pose, self.points.rest + self.points.moved(self.displacement))
+        return self.contact.depth(pose, self.points.placed(self.displacement))
 
     def aim(self, pose: Pose) -> None:
         """Put the probe at a pose, and weigh the forces; nothing moves."""
         self._held = self.contact.push
         self._carried = self.load
-        self.contact.aim(pose, self.points.rest + self.points.moved(self.displacement))
+        self._places = self.points.placed(self.displacement)
+        self.contact.aim(pose, self._places)
         self._damping = _DAMPING
         self.patience = _LEAST_PATIENCE
         self._press()
@@ -176,7 +174,8 @@ class Newton:
     def settle(self) -> float:
         """End a frame with the probe at rest; returns by how much tissue may move for it, m."""
         change = self.contact.settle()
-        if self.contact.release(self._surface):
+        self._places = self.points.placed(self.displacement)
+        if self.contact.release(self._places):
             change = np.inf
         self._press()
         return change
@@ -188,9 +187,14 @@ class Newton:
 
     def put(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
-        self.displacement = displacement
-        self.contact.look(self._surface)
+        self._move(displacement)
         self._weigh()
+
+    def _move(self, displacement: NDArray[np.float64]) -> None:
+        """Let the tissue be there, and measure the gaps to the probe."""
+        self.displacement = displacement
+        self._places = self.points.placed(displacement, self.contact.near)
+        self.contact.look(self._places)
 
     def _weigh(self, energy: float | None = None) -> None:
         """The energy, unless it is known, and its slope at the displacement."""
@@ -204,14 +208,14 @@ class Newton:
         """As `_weigh`, where only the contact has changed."""
         contact = self.contact
         self.energy = self._inner + contact.energy if energy is None else energy
-        self._slope = self._force.copy()
-        self.pushes = np.zeros_like(self._slope)  # (3, N) N, contact forces on the nodes
+        self.pushes = np.zeros_like(self._force)  # (3, N) N, contact forces on the nodes
         self.points.add(contact.force, self.pushes, contact.near)
-        self._slope -= self.pushes
-        self._slope[:, self._fixed] = 0.0
+        self._slope = self._force - self.pushes
+        clear_nodes(self._slope, self._fixed)
         self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
-        free = ~self._model.fixed
-        self.load = float(np.linalg.norm(self.pushes[:, free]))  # N, of the contact forces
+        moving = self.pushes.copy()
+        clear_nodes(moving, self._fixed)
+        self.load = float(np.linalg.norm(moving))  # N, of the contact forces
 
     def _energy(self) -> float:
         """J, of tissue and contact at the displacement."""
@@ -281,7 +285,7 @@ class Newton:
         if (overstress := self.overstress) is not None:
             blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         # Just hit, points are pushed far more than they will be.
-        turned, turn = contact.turns(self._surface, np.minimum(contact.push, self._held))
+        turned, turn = contact.turns(self._places, np.minimum(contact.push, self._held))
         bend = points.nodes[turned], points.weights[turned], -turn
 
         def elastic(change: NDArray, image: NDArray) -> None:
@@ -313,7 +317,7 @@ class Newton:
             moved = points.moved(step, contact.near)
             left = -self._force - image
             points.add(contact.force_after(moved), left, contact.near)
-            left[:, self._fixed] = 0.0
+            clear_nodes(left, self._fixed)
             size = float(np.linalg.norm(left))
             if enough is None:
                 begun = max(size, self.imbalance * (start is None))
@@ -388,8 +392,7 @@ class Newton:
         bound = energy + _ROUNDING * abs(energy)
         length = 1.0
         for _ in range(_BACKTRACKS):
-            self.displacement = start + length * change
-            self.contact.look(self._surface)
+            self._move(start + length * change)
             tried = self._energy()
             if tried <= bound:
                 self._weigh(tried)
