@@ -80,22 +80,26 @@ class NeoHookean:
 
     def energy(self, displacement: NDArray) -> float:
         """J, summed in double precision."""
-        self._require(displacement)
-        energy = self._sums.energy(displacement)
-        if self._averaged:
-            self._sums.volume_changes(displacement, self._nodal)
-            energy += float(
-                np.einsum("i,i,i->", self._nodal, self._nodal, self._inverse, dtype=np.float64) / 2
-            )
-        return energy
+        return self.energy_and_forces(displacement, np.empty(displacement.shape, self.dtype))
 
     def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the energy: what must act on each node to hold it there."""
-        self._require(displacement)
-        out = np.empty_like(displacement) if out is None else out
-        self._require(out)
-        self._sums.forces(displacement, self._mean_change(displacement), out)
+        out = np.empty(displacement.shape, self.dtype) if out is None else out
+        self.energy_and_forces(displacement, out)
         return out
+
+    def energy_and_forces(self, displacement: NDArray, out: NDArray) -> float:
+        """The energy, J, and its slope (3, N) N, which overwrites ``out``."""
+        self._require(displacement)
+        self._require(out)
+        energy = 0.0
+        if self._averaged:
+            self._sums.volume_changes(displacement, self._nodal)
+            energy = float(
+                np.einsum("i,i,i->", self._nodal, self._nodal, self._inverse, dtype=np.float64) / 2
+            )
+            self._nodal *= self._inverse
+        return energy + self._sums.energy_and_forces(displacement, self._nodal, out)
 
     def linearise(self, displacement: NDArray) -> None:
         """Let `tangent_product` and `diagonal_blocks` be those at this displacement."""

@@ -75,6 +75,11 @@ _K, _BULK, _TANGENT = FIELD + 24, FIELD + 29, FIELD + 34
 displacement; and the number of rows."""
 
 
+_ENERGY = OUT + 24
+"""First row of energies, behind those of forces: all but the lumens', then those of each of the
+five tetrahedra's."""
+
+
 class CellSums(NodalSums):
     """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes.
 
@@ -139,39 +144,6 @@ def _tetrahedron_stress(h, shear, element, wall, nodal):
     return stress(h, shear, _pressure(h, element, wall, nodal))
 
 
-@njit(**LOOP)
-def _energy(displacement, grid, constants, lumens, lanes):
-    total = 0.0
-    for chunk in range(len(constants)):
-        rows = constants[chunk]
-        first = chunk * LANES
-        copy_field(displacement, grid, first, rows, lanes)
-        for w in range(LANES):
-            p, q, r, s, t = gradients(lanes, rows, w)
-            shear = five(rows, _SHEAR, w)
-            element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
-            lanes[OUT * LANES + w] = (
-                (
-                    energy_density(p, shear[0], element[0], wall[0])
-                    + energy_density(q, shear[1], element[1], wall[1])
-                )
-                + (
-                    energy_density(r, shear[2], element[2], wall[2])
-                    + energy_density(s, shear[3], element[3], wall[3])
-                )
-                + energy_density(t, shear[4], element[4], wall[4])
-            )
-        entries = 1
-        if lumens[0][chunk] >= 0:
-            entries = 6
-            lanes[(OUT + 1) * LANES : (OUT + 6) * LANES] = 0
-            add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 0, OUT + 1, lanes)
-        for entry in range(OUT, OUT + entries):
-            for w in range(min(LANES, grid[3] - first)):
-                total += lanes[entry * LANES + w]
-    return total
-
-
 @njit(**INLINED)
 def _count(ratio, least, count):
     """The least ratio so far, NaN if any was, and how many were not above zero."""
@@ -227,21 +199,38 @@ def _volume_changes(displacement, grid, constants, lanes, nodal):
 
 
 @njit(**LOOP)
-def _forces(displacement, nodal, grid, constants, lumens, lanes, forces):
+def _energy_and_forces(displacement, nodal, grid, constants, lumens, lanes, forces):
     forces[:, :] = 0
+    total = 0.0
     for chunk in range(len(constants)):
         rows = constants[chunk]
         first = chunk * LANES
         if len(nodal):
             _nodal_pressures(nodal, grid, first, rows, lanes)
         copy_field(displacement, grid, first, rows, lanes)
+        entries = 1
         if lumens[0][chunk] >= 0:
-            add_lumens(lanes, rows, lumens[1][lumens[0][chunk]], 1, PRESSURES, lanes)
+            entries = 6
+            lumen = lumens[1][lumens[0][chunk]]
+            lanes[(_ENERGY + 1) * LANES : (_ENERGY + 6) * LANES] = 0
+            add_lumens(lanes, rows, lumen, 0, _ENERGY + 1, lanes)
+            add_lumens(lanes, rows, lumen, 1, PRESSURES, lanes)
         for w in range(LANES):
             p, q, r, s, t = gradients(lanes, rows, w)
             shear = five(rows, _SHEAR, w)
             element, wall = five(rows, _ELEMENT, w), five(rows, _WALL, w)
             mean = five(lanes, PRESSURES, w)
+            lanes[_ENERGY * LANES + w] = (
+                (
+                    energy_density(p, shear[0], element[0], wall[0])
+                    + energy_density(q, shear[1], element[1], wall[1])
+                )
+                + (
+                    energy_density(r, shear[2], element[2], wall[2])
+                    + energy_density(s, shear[3], element[3], wall[3])
+                )
+                + energy_density(t, shear[4], element[4], wall[4])
+            )
             put_forces(
                 _tetrahedron_stress(p, shear[0], element[0], wall[0], mean[0]),
                 _tetrahedron_stress(q, shear[1], element[1], wall[1], mean[1]),
@@ -255,6 +244,10 @@ def _forces(displacement, nodal, grid, constants, lumens, lanes, forces):
         if lumens[0][chunk] >= 0:
             lanes[PRESSURES * LANES : (PRESSURES + 5) * LANES] = 0
         add_field(lanes, grid, first, rows, forces)
+        for entry in range(_ENERGY, _ENERGY + entries):
+            for w in range(min(LANES, grid[3] - first)):
+                total += lanes[entry * LANES + w]
+    return total
 
 
 @njit(**LOOP)
@@ -388,10 +381,9 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
 
 
 CellSums._kernels = Kernels(
-    _energy,
     _volume_ratios,
     _volume_changes,
-    _forces,
+    _energy_and_forces,
     _linearise,
     _volume_slopes,
     _tangent_product,

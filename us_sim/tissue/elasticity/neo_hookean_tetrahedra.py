@@ -75,6 +75,10 @@ _GRADIENT, _K, _BULK, _TANGENT = np.int64(0), 9, 10, 11
 J; and their number."""
 
 
+_ENERGY = OUT + 12
+"""Row of energies, behind those of forces."""
+
+
 class TetrahedraSums(NodalSums):
     """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
 
@@ -112,26 +116,6 @@ def _pressure(h, lanes, rows, w):
 
 
 @njit(**LOOP)
-def _energy(displacement, nodes, constants, lumens, lanes):
-    total = 0.0
-    for chunk in range(len(nodes)):
-        gather(displacement, nodes[chunk], lanes)
-        rows = constants[chunk]
-        for w in range(LANES):
-            h = gradient(lanes, rows, w)
-            lanes[OUT * LANES + w] = energy_density(
-                h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
-            )
-        if lumens[0][chunk] >= 0:
-            lumen = lumens[1][lumens[0][chunk]]
-            for w in range(LANES):
-                lanes[OUT * LANES + w] += emptied(gradient(lanes, rows, w), lumen, w, _ROW)[0]
-        for w in range(LANES):
-            total += lanes[OUT * LANES + w]
-    return total
-
-
-@njit(**LOOP)
 def _volume_ratios(displacement, nodes, constants, lanes):
     smallest = np.inf
     inverted = 0
@@ -163,25 +147,34 @@ def _volume_changes(displacement, nodes, constants, lanes, nodal):
 
 
 @njit(**LOOP)
-def _forces(displacement, nodal, nodes, constants, lumens, lanes, forces):
+def _energy_and_forces(displacement, nodal, nodes, constants, lumens, lanes, forces):
     forces[:, :] = 0
+    total = 0.0
     for chunk in range(len(nodes)):
         gather(displacement, nodes[chunk], lanes)
         if len(nodal):
             gather_scalar(nodal, nodes[chunk], lanes)
         rows = constants[chunk]
+        for w in range(LANES):
+            h = gradient(lanes, rows, w)
+            lanes[_ENERGY * LANES + w] = energy_density(
+                h, rows[_SHEAR * LANES + w], rows[_ELEMENT * LANES + w], rows[_WALL * LANES + w]
+            )
+            put_forces(
+                stress(h, rows[_SHEAR * LANES + w], _pressure(h, lanes, rows, w)), rows, w, lanes
+            )
         if lumens[0][chunk] >= 0:
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
                 h = gradient(lanes, rows, w)
-                pressure = _pressure(h, lanes, rows, w) + emptied(h, lumen, w, _ROW)[1]
+                energy, slope, _ = emptied(h, lumen, w, _ROW)
+                lanes[_ENERGY * LANES + w] += energy
+                pressure = _pressure(h, lanes, rows, w) + slope
                 put_forces(stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
-        else:
-            for w in range(LANES):
-                h = gradient(lanes, rows, w)
-                shear = rows[_SHEAR * LANES + w]
-                put_forces(stress(h, shear, _pressure(h, lanes, rows, w)), rows, w, lanes)
+        for w in range(LANES):
+            total += lanes[_ENERGY * LANES + w]
         scatter(lanes, nodes[chunk], forces)
+    return total
 
 
 @njit(**LOOP)
@@ -266,10 +259,9 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
 
 
 TetrahedraSums._kernels = Kernels(
-    _energy,
     _volume_ratios,
     _volume_changes,
-    _forces,
+    _energy_and_forces,
     _linearise,
     _volume_slopes,
     _tangent_product,

@@ -25,10 +25,9 @@ _Kernel = Callable[..., Any]
 class Kernels(NamedTuple):
     """The compiled functions behind the methods of `NodalSums`, by the methods' names."""
 
-    energy: _Kernel
     volume_ratios: _Kernel
     volume_changes: _Kernel
-    forces: _Kernel
+    energy_and_forces: _Kernel
     linearise: _Kernel
     volume_slopes: _Kernel
     tangent_product: _Kernel
@@ -49,13 +48,6 @@ class NodalSums:
     _tangent: NDArray[Any]  # what `linearise` stores of each block
     _lanes: NDArray[Any]  # what kernels work in
 
-    def energy(self, displacement: NDArray) -> float:
-        """J, of each tetrahedron by itself, without the nodal part."""
-        energy: float = self._kernels.energy(
-            displacement, self._nodes, self._constants, self._lumens, self._lanes
-        )
-        return energy
-
     def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
         """The smallest volume over rest volume, and how many are not above zero."""
         ratios: tuple[float, int] = self._kernels.volume_ratios(
@@ -67,11 +59,14 @@ class NodalSums:
         """Fill nodal, J: at each node the sum over its tetrahedra of their weight times J - 1."""
         self._kernels.volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
 
-    def forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, the energy's slope, where nodal is the nodes' mean volume change."""
-        self._kernels.forces(
+    def energy_and_forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> float:
+        """J, of each tetrahedron by itself, without the nodal part; and (3, N) N into ``out``, the
+        whole energy's slope, where nodal is the nodes' mean volume change.
+        """
+        energy: float = self._kernels.energy_and_forces(
             displacement, nodal, self._nodes, self._constants, self._lumens, self._lanes, out
         )
+        return energy
 
     def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
         """Store what the slopes at this displacement need; nodal is the nodes' mean change."""

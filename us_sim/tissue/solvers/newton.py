@@ -197,8 +197,7 @@ class Newton:
         self.contact.look(self._places)
 
     def _weigh(self, energy: float | None = None) -> None:
-        """The energy, unless it is known, and its slope at the displacement."""
-        self.tissue.forces(self.displacement, self._force)
+        """The energy, unless `_energy` has just been asked for it, and its slope."""
         self.energy = self._energy() if energy is None else energy  # J
         if self.overstress is not None:
             self.overstress.add_forces(self.displacement, self._force)
@@ -218,8 +217,8 @@ class Newton:
         self.load = float(np.linalg.norm(moving))  # N, of the contact forces
 
     def _energy(self) -> float:
-        """J, of tissue and contact at the displacement."""
-        self._inner = self.tissue.energy(self.displacement)  # of the tissue alone
+        """J, of tissue and contact at the displacement; finds the tissue's forces there too."""
+        self._inner = self.tissue.energy_and_forces(self.displacement, self._force)
         if self.overstress is not None:
             self._inner += self.overstress.energy(self.displacement)
         return self._inner + self.contact.energy
