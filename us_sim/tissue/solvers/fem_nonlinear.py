@@ -74,6 +74,12 @@ _SINKS = 0.5
 _APPROACHING = 0.7
 """Part of a frame's time after which no stride is begun any more."""
 
+_UNHURRIED, _PRESENTABLE = 0.5, 0.01
+"""Part of a frame's time after which a live frame may end with that residual."""
+
+_STEP = 8
+"""What a step costs besides its iterations, in iterations."""
+
 _OVERTIME, _ROUGH = 3.0, 0.03
 """How many times the time that a live simulation leaves a frame may take, and the residual above
 which it may: tissue that is left behind is harder to balance than poses that were missed."""
@@ -93,7 +99,10 @@ class FemNonlinearSettings(SolverSettings):
     section = "fem_nonlinear"
 
     frame_tolerance: float = setting(
-        TOLERANCE, "residual at which a frame with a moving probe ends", default=0.01
+        TOLERANCE,
+        "residual at which a frame with a moving probe ends; live, 0.01 will do once half of its "
+        "time is over",
+        default=0.003,
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
@@ -104,8 +113,9 @@ class FemNonlinearSettings(SolverSettings):
     )
     most_iterations: int = setting(
         COUNT,
-        "conjugate-gradient iterations of a frame at most, twice as many while the probe rests",
-        default=250,
+        "conjugate-gradient iterations of a frame at most, where each step counts as eight more; "
+        "twice as many while the probe rests",
+        default=480,
     )
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
@@ -261,25 +271,26 @@ class FemNonlinear(TissueSolver):
         budget = settings.frame_budget or self.frame_limit
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
-        shifted, start = np.inf, None
+        shifted, start, spent = np.inf, None, 0
         if pose is None:
             newton.lift()
             self._aimed = None
         elif not moved:
             shifted = newton.settle() if self._balanced else np.inf
         elif len(self._surface):
-            self._approach(pose, None if budget is None else began + _APPROACHING * budget)
+            spent = self._approach(pose, None if budget is None else began + _APPROACHING * budget)
             start = self._predicted(pose)
         self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
         newton.may_factor = newton.is_small or not (moved or hurried)
         left = settings.most_iterations if moved else 2 * settings.most_iterations
+        left -= spent
         stuck, actions = False, []
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough, stepping = goal * newton.load if start is None else 0.0, time.perf_counter()
             taken = newton.step(min(left, newton.patience), enough, start)
             stuck = not taken and newton.is_stuck
-            left -= newton.used
+            left -= newton.used + _STEP
             now = time.perf_counter()
             if budget is not None and now - began > budget * self._overtime():
                 if now - stepping > budget and settings.frame_budget is not None:
@@ -288,6 +299,8 @@ class FemNonlinear(TissueSolver):
                         f"{1e3 * (now - stepping):.2g} ms: give it more"
                     )
                 break
+            if moved and budget is not None and now - began > _UNHURRIED * budget:
+                goal = max(goal, _PRESENTABLE)
             start = None
         self._balanced = newton.imbalance <= settings.frame_tolerance * self._reference()
         if stuck:
@@ -311,10 +324,11 @@ class FemNonlinear(TissueSolver):
             return False
         return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
-    def _approach(self, pose: Pose, end: float | None) -> None:
+    def _approach(self, pose: Pose, end: float | None) -> int:
         """Go most of a long way in strides, until a time (s): tissue that is hit or swept aside at
-        once may end elsewhere than if the probe had moved there.
+        once may end elsewhere than if the probe had moved there. Returns the iterations spent.
         """
+        spent = 0
         last = self._aimed if self._newton.load > 0.0 else None
         for nearer in strides(last, pose, self._newton.depth(pose), self._arm):
             if end is not None and time.perf_counter() > end:
@@ -322,8 +336,10 @@ class FemNonlinear(TissueSolver):
             start = self._predicted(nearer)
             for k in range(_STEPS):
                 self._newton.step(self._newton.patience, 0.0, None if k else start)
+                spent += self._newton.used + _STEP
                 if self._newton.imbalance <= _LOOSE * self._newton.load:
                     break
+        return spent
 
     def _predicted(self, pose: Pose) -> NDArray[np.float64]:
         """(3, N) m, aim at a new pose and return the linear answer to it."""
