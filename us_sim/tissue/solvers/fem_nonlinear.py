@@ -71,18 +71,15 @@ the probe can touch, for a tolerance of 1."""
 _SINKS = 0.5
 """Depth of the probe in the tissue, over that spacing, that is worth saying."""
 
-_APPROACHING = 0.7
-"""Part of a frame's time after which no stride is begun any more."""
-
-_UNHURRIED, _PRESENTABLE = 0.5, 0.01
-"""Part of a frame's time after which a live frame may end with that residual."""
+_APPROACHING, _SPENT = 0.7, 0.6
+"""Part of a frame's time, and of its iterations, after which no stride is begun any more."""
 
 _STEP = 8
 """What a step costs besides its iterations, in iterations."""
 
-_OVERTIME, _ROUGH = 3.0, 0.03
-"""How many times the time that a live simulation leaves a frame may take, and the residual above
-which it may: tissue that is left behind is harder to balance than poses that were missed."""
+_OVERTIME = 3.0
+"""How many times the time that a live simulation leaves a frame may take that is not in balance:
+tissue that is left behind is harder to balance than poses that were missed, and shows more."""
 
 _LOOSE, _STEPS = 0.2, 5
 """Residual with which a stride ends, and the most steps that it may take."""
@@ -99,15 +96,12 @@ class FemNonlinearSettings(SolverSettings):
     section = "fem_nonlinear"
 
     frame_tolerance: float = setting(
-        TOLERANCE,
-        "residual at which a frame with a moving probe ends; live, 0.01 will do once half of its "
-        "time is over",
-        default=0.003,
+        TOLERANCE, "residual at which a frame with a moving probe ends", default=0.003
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on; not given: what a "
-        "live simulation leaves, three times that while forces are far from balance, and in "
+        "live simulation leaves, three times that where forces are not yet balanced, and in "
         "lockstep any, lest results depend on the machine",
         default=None,
     )
@@ -299,8 +293,6 @@ class FemNonlinear(TissueSolver):
                         f"{1e3 * (now - stepping):.2g} ms: give it more"
                     )
                 break
-            if moved and budget is not None and now - began > _UNHURRIED * budget:
-                goal = max(goal, _PRESENTABLE)
             start = None
         self._balanced = newton.imbalance <= settings.frame_tolerance * self._reference()
         if stuck:
@@ -314,8 +306,8 @@ class FemNonlinear(TissueSolver):
 
     def _overtime(self) -> float:
         """How many times its time a frame may take as it is now."""
-        rough = self._newton.imbalance > _ROUGH * self._reference()
-        return _OVERTIME if rough and self.settings.frame_budget is None else 1.0
+        balanced = self._newton.imbalance <= self.settings.frame_tolerance * self._reference()
+        return 1.0 if balanced or self.settings.frame_budget is not None else _OVERTIME
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
@@ -326,12 +318,13 @@ class FemNonlinear(TissueSolver):
 
     def _approach(self, pose: Pose, end: float | None) -> int:
         """Go most of a long way in strides, until a time (s): tissue that is hit or swept aside at
-        once may end elsewhere than if the probe had moved there. Returns the iterations spent.
+        once may end elsewhere than if the probe had moved there. Returns the iterations spent, as
+        `most_iterations` counts them.
         """
-        spent = 0
+        spent, most = 0, _SPENT * self.settings.most_iterations
         last = self._aimed if self._newton.load > 0.0 else None
         for nearer in strides(last, pose, self._newton.depth(pose), self._arm):
-            if end is not None and time.perf_counter() > end:
+            if spent > most or (end is not None and time.perf_counter() > end):
                 break
             start = self._predicted(nearer)
             for k in range(_STEPS):
