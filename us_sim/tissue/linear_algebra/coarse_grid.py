@@ -72,7 +72,7 @@ class CoarseGrid:
         order = np.argsort(cell, kind="stable")
         order = order[~fixed[order]]
         starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
-        self._node = order.astype(np.int64)  # (F,) free nodes, those of one grid cell together
+        self._node = order.astype(np.uint32)  # (F,) free nodes, those of one grid cell together
         self._start = np.append(starts, len(order)).astype(np.int64)  # (cells + 1,)
         self._corner = corner[order[starts]].astype(np.int64)  # (cells, 8) grid nodes
         self._place = np.empty(len(cell), np.int64)  # (N,) of each node in _node
@@ -82,6 +82,8 @@ class CoarseGrid:
         self.size = 3 * (int(corner.max()) + 1 if len(order) else 0)
         self._inverse = self._invert(len(cell), product).astype(dtype)
         self._weight = self._weight.astype(dtype)
+        self._across = np.ascontiguousarray(self._weight.T)  # (8, F)
+        self._room = np.empty((3, len(self._node)), dtype)
         self._coarse = np.zeros((2, self.size), dtype)
         self._dtype = dtype
         self.touch(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
@@ -122,6 +124,8 @@ class CoarseGrid:
             self._start,
             self._corner,
             self._weight,
+            self._across,
+            self._room,
             self._touched_corner,
             self._touched_weight,
             self._normal,
@@ -138,10 +142,11 @@ class CoarseGrid:
     ) -> NDArray[np.float64]:
         matrix = np.empty((self.size, self.size))
         unit, field = np.zeros(self.size), np.zeros((3, count))
+        across, room = np.ascontiguousarray(self._weight.T), np.empty((3, len(self._node)))
         for i in range(self.size):
             unit[i] = 1.0
             field[:] = 0.0
-            _prolong(unit, self._node, self._start, self._corner, self._weight, field)
+            _prolong(unit, self._node, self._start, self._corner, across, room, field)
             unit[i] = 0.0
             response = product(field).astype(np.float64)
             _restrict(response, self._node, self._start, self._corner, self._weight, matrix[i])
@@ -188,18 +193,28 @@ def _restrict(field, node, start, corner, weight, coarse):
     """coarse (3G,) = P' field (3, N)."""
     coarse[:] = 0
     sums = np.empty((3, 8), field.dtype)
+    x, y, z = field[0], field[1], field[2]
     for c in range(len(corner)):
         sums[:] = 0
-        for k in range(start[c], start[c + 1]):
+        first, end = start[c], start[c + 1]
+        pairs = first + (end - first) // 2 * 2
+        for k in range(first, pairs, 2):  # two at a time, lest each wait for the sums of the last
+            i, j = node[k], node[k + 1]
+            w, v = weight[k], weight[k + 1]
+            xi, yi, zi = x[i], y[i], z[i]
+            xj, yj, zj = x[j], y[j], z[j]
+            for q in range(8):
+                sums[0, q] += w[q] * xi + v[q] * xj
+                sums[1, q] += w[q] * yi + v[q] * yj
+                sums[2, q] += w[q] * zi + v[q] * zj
+        for k in range(pairs, end):
             i = node[k]
             w = weight[k]
-            x = field[0, i]
-            y = field[1, i]
-            z = field[2, i]
+            xi, yi, zi = x[i], y[i], z[i]
             for q in range(8):
-                sums[0, q] += w[q] * x
-                sums[1, q] += w[q] * y
-                sums[2, q] += w[q] * z
+                sums[0, q] += w[q] * xi
+                sums[1, q] += w[q] * yi
+                sums[2, q] += w[q] * zi
         for q in range(8):
             g = 3 * corner[c, q]
             for d in range(3):
@@ -207,10 +222,11 @@ def _restrict(field, node, start, corner, weight, coarse):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _prolong(coarse, node, start, corner, weight, field):
-    """field (3, N) += P coarse (3G,)."""
+def _prolong(coarse, node, start, corner, across, room, field):
+    """field (3, N) += P coarse (3G,); across (8, F) are P's weights, room (3, F) is for sums."""
     for c in range(len(corner)):
         near = corner[c]
+        first, end = start[c], start[c + 1]
         for d in range(3):
             v0 = coarse[3 * near[0] + d]
             v1 = coarse[3 * near[1] + d]
@@ -220,12 +236,19 @@ def _prolong(coarse, node, start, corner, weight, field):
             v5 = coarse[3 * near[5] + d]
             v6 = coarse[3 * near[6] + d]
             v7 = coarse[3 * near[7] + d]
-            f = field[d]
-            for k in range(start[c], start[c + 1]):
-                w = weight[k]
-                value = (w[0] * v0 + w[1] * v1) + (w[2] * v2 + w[3] * v3)
-                value += (w[4] * v4 + w[5] * v5) + (w[6] * v6 + w[7] * v7)
-                f[node[k]] += value
+            w0, w1 = across[0, first:end], across[1, first:end]
+            w2, w3 = across[2, first:end], across[3, first:end]
+            w4, w5 = across[4, first:end], across[5, first:end]
+            w6, w7 = across[6, first:end], across[7, first:end]
+            total = room[d, first:end]
+            for k in range(end - first):
+                value = (w0[k] * v0 + w1[k] * v1) + (w2[k] * v2 + w3[k] * v3)
+                value += (w4[k] * v4 + w5[k] * v5) + (w6[k] * v6 + w7[k] * v7)
+                total[k] = value
+    for d in range(3):
+        values, total = field[d], room[d]
+        for k in range(len(node)):
+            values[node[k]] += total[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -267,6 +290,8 @@ def _correct(
     start,
     corner,
     weight,
+    across,
+    room,
     touched_corner,
     touched_weight,
     normal,
@@ -319,4 +344,4 @@ def _correct(
         row = response[k]
         for j in range(size):
             solution[j] -= s * row[j]
-    _prolong(solution, node, start, corner, weight, correction)
+    _prolong(solution, node, start, corner, across, room, correction)
