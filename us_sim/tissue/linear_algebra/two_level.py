@@ -36,7 +36,7 @@ __all__ = [
     "Preconditioner",
     "Solved",
     "TwoLevel",
-    "apply_blocks",
+    "add_blocks",
     "clear_nodes",
     "conjugate_gradients",
     "largest_local_eigenvalue",
@@ -151,14 +151,12 @@ def conjugate_gradients(
     slope = 0.0
     for iteration in range(iterations):
         preconditioner.apply(residual, conditioned)
-        before, slope = slope, _dot(residual, conditioned)
-        _renew(conditioned, slope / before if iteration else 0.0, search)
+        slope = _turn(residual, conditioned, slope, search)
         product(search, elastic)
         _copy(elastic, whole)
         if add_springs is not None:
             add_springs(search, whole)
-        clear_nodes(whole, fixed)
-        curvature = _dot(search, whole)
+        curvature = _curvature(search, whole, fixed)
         if not curvature > 0.0:
             return Solved(solution, image, search, iteration + 1, True)
         left = _advance(slope / curvature, search, elastic, whole, solution, image, residual)
@@ -185,13 +183,6 @@ def largest_local_eigenvalue(
         image[:, fixed] = 0.0
         local.apply(image, vector)
     return largest
-
-
-def apply_blocks(blocks: NDArray[np.floating], field: NDArray[np.floating]) -> NDArray:
-    """(3, N): symmetric 3x3 blocks (6, N) times a field (3, N)."""
-    out = np.empty_like(field)
-    _apply_blocks(blocks, field, out)
-    return out
 
 
 @njit(**_LOOP)
@@ -253,6 +244,19 @@ def _apply_blocks(blocks, field, out):
 
 
 @njit(**_LOOP)
+def add_blocks(blocks, scale, field, out):
+    """Add scale times symmetric 3x3 blocks (6, N) times a field (3, N) to ``out``."""
+    s = field.dtype.type(scale)
+    for i in range(field.shape[1]):
+        x = s * field[0, i]
+        y = s * field[1, i]
+        z = s * field[2, i]
+        out[0, i] += blocks[0, i] * x + blocks[1, i] * y + blocks[2, i] * z
+        out[1, i] += blocks[1, i] * x + blocks[3, i] * y + blocks[4, i] * z
+        out[2, i] += blocks[2, i] * x + blocks[4, i] * y + blocks[5, i] * z
+
+
+@njit(**_LOOP)
 def _copy(field, out):
     for d in range(3):
         a = field[d]
@@ -283,13 +287,28 @@ def _dot(a, b):
 
 
 @njit(**_LOOP)
-def _renew(conditioned, beta, search):
-    s = search.dtype.type(beta)
+def _turn(residual, conditioned, before, search):
+    """Turn the search to what is left, conditioned; returns the slope along that.
+
+    It was ``before`` along the search before; without one, that is zero.
+    """
+    slope = _dot(residual, conditioned)
+    s = search.dtype.type(slope / before if before != 0.0 else 0.0)
     for d in range(3):
         z = conditioned[d]
         p = search[d]
         for i in range(len(z)):
             p[i] = z[i] + s * p[i]
+    return slope
+
+
+@njit(**_LOOP)
+def _curvature(search, whole, fixed):
+    """The product along the search direction, with the fixed nodes' rows left out."""
+    for d in range(3):
+        for k in range(len(fixed)):
+            whole[d, fixed[k]] = 0
+    return _dot(search, whole)
 
 
 @njit(**_LOOP)

@@ -36,7 +36,7 @@ from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
     Preconditioner,
     TwoLevel,
-    apply_blocks,
+    add_blocks,
     clear_nodes,
     conjugate_gradients,
     largest_local_eigenvalue,
@@ -277,10 +277,9 @@ class Newton:
         contact, points, tangent = self.contact, self.points, self._tangent
         tangent.linearise(self.displacement.astype(self._dtype))
         blocks = tangent.diagonal_blocks()
-        damped = None
-        if self._damping > 0.0:
-            damped = self._dtype(self._damping) * self._rest_blocks
-            blocks += damped
+        damping = self._damping
+        if damping > 0.0:
+            blocks += self._dtype(damping) * self._rest_blocks
         if (overstress := self.overstress) is not None:
             blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         # Just hit, points are pushed far more than they will be.
@@ -290,8 +289,8 @@ class Newton:
         def elastic(change: NDArray, image: NDArray) -> None:
             """The tangent without springs, of which there are more or fewer as nodes touch."""
             tangent.tangent_product(change, image)
-            if damped is not None:
-                image += apply_blocks(damped, change)
+            if damping > 0.0:
+                add_blocks(self._rest_blocks, damping, change, image)
             if overstress is not None:
                 overstress.add_product(change, image)
             if len(turned):
