@@ -27,6 +27,7 @@ from us_sim.evaluation.independent_forces import (
 )
 from us_sim.evaluation.push_directions import flared_distance, push_directions
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import interpolate
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import fitted_springs, springs_of
@@ -49,6 +50,13 @@ _PARTS = 12
 """Parts of a triangle's sides, between which it is looked where a surface is pushed."""
 
 _ALIKE = 7  # decimals in which directions of pushes differ that are not the same
+
+_WAY = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+"""Parts of a probe's way from pose to pose at which it is looked how deep it was."""
+
+_DEEP = 0.35
+"""Depth, over half the probe's smallest width, from which it may push in other directions than its
+own. A solver may take it to be so from half of that, with tissue that has moved on the way."""
 
 _SETTLED = 1e-5  # residual
 
@@ -143,10 +151,15 @@ class IndependentResidual:
             self._swept = False
         elif not same_pose(pose, before):
             box = self._model.collider.offset_box
-            deep = 0.5 * float(box[:2].min() + box[3])
+            deep = _DEEP * float(box[:2].min() + box[3])
             places = _places(nodes, self._surface).reshape(-1, 3)
-            gap, _ = flared_distance(self._model.collider, pose, places, self._spacing)
-            self._swept = bool(gap.min(initial=np.inf) < -deep)
+            # A solver may have gone a long way in strides, and come down on one of them.
+            way = [interpolate(before, pose, part) for part in _WAY] if before else []
+            for there in [*way, pose]:
+                gap, _ = flared_distance(self._model.collider, there, places, self._spacing)
+                self._swept = bool(gap.min(initial=np.inf) < -deep)
+                if self._swept:
+                    break
         elif self._settled:
             self._swept = False
         self._settled = deformation.residual <= _SETTLED

@@ -74,6 +74,9 @@ _SINKS = 0.5
 _APPROACHING, _SPENT = 0.7, 0.6
 """Part of a frame's time, and of its iterations, after which no stride is begun any more."""
 
+_ANEW = 6
+"""How many times the iterations of other frames one may take that is begun anew from rest."""
+
 _STEP = 8
 """What a step costs besides its iterations, in iterations."""
 
@@ -241,6 +244,7 @@ class FemNonlinear(TissueSolver):
         self._still = 0  # frames in a row with the probe at rest
         self._balanced = False  # whether the last frame's forces were
         self._inverted = 0  # frames in a row that ended inside out
+        self._anew = False  # whether the tissue is begun anew, after such frames
         if state.displacement.any():
             displacement = np.ascontiguousarray(state.displacement.T)
             # The way out of tissue inside out may end in a minimum where it is folded over.
@@ -265,6 +269,7 @@ class FemNonlinear(TissueSolver):
         budget = settings.frame_budget or self.frame_limit
         moved = not same_pose(pose, self._aimed)
         goal = settings.frame_tolerance if moved else settings.tolerance
+        self._still = 0 if moved else self._still + 1
         shifted, start, spent = np.inf, None, 0
         if pose is None:
             newton.lift()
@@ -274,11 +279,9 @@ class FemNonlinear(TissueSolver):
         elif len(self._surface):
             spent = self._approach(pose, None if budget is None else began + _APPROACHING * budget)
             start = self._predicted(pose)
-        self._still = 0 if moved else self._still + 1
         hurried = budget is not None and self._still < _RESTING
         newton.may_factor = newton.is_small or not (moved or hurried)
-        left = settings.most_iterations if moved else 2 * settings.most_iterations
-        left -= spent
+        left = self._allowed() - spent
         stuck, actions = False, []
         while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
             enough, stepping = goal * newton.load if start is None else 0.0, time.perf_counter()
@@ -298,7 +301,12 @@ class FemNonlinear(TissueSolver):
         if stuck:
             actions.append(f"no step led any further: {self._obstacle()}")
         self._settled = stuck
+        self._anew = False
         return self._outcome(pose, shifted, actions, 0 if hurried else _PATIENCE)
+
+    def _allowed(self) -> int:
+        """Iterations that this frame may take, as `most_iterations` counts them."""
+        return self.settings.most_iterations * (_ANEW if self._anew else 2 if self._still else 1)
 
     def _reference(self) -> float:
         """N, what unbalanced forces are measured by."""
@@ -321,7 +329,7 @@ class FemNonlinear(TissueSolver):
         once may end elsewhere than if the probe had moved there. Returns the iterations spent, as
         `most_iterations` counts them.
         """
-        spent, most = 0, _SPENT * self.settings.most_iterations
+        spent, most = 0, _SPENT * self._allowed()
         last = self._aimed if self._newton.load > 0.0 else None
         for nearer in strides(last, pose, self._newton.depth(pose), self._arm):
             if spent > most or (end is not None and time.perf_counter() > end):
@@ -401,6 +409,7 @@ class FemNonlinear(TissueSolver):
         elif self._inverted > patience:
             actions.append("begun anew from rest")
             self._restore(TissueState.at_rest(len(nodes)))
+            self._anew = True
         else:
             newton.put(reached)
         return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))
