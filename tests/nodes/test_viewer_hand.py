@@ -136,14 +136,29 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
     assert moved[0] is not None
 
 
-def test_pages_are_told_which_of_them_moves_the_probe_until_it_rests(bench, page, tracked):
+def test_the_page_that_moved_the_probe_last_holds_it_until_another_does_or_it_goes(
+    bench, page, tracked
+):
+    simulator = page._holder.simulator
+
+    def told(holder, *, is_moving):
+        return (page.state["holder"], page.state["is_moving"]) == (holder, is_moving)
+
     page.open()
     page.await_leader("hand")
     bench.spin_until(lambda: len(tracked) >= 1)
-    assert page.state["mover"] == ""
+    assert told("", is_moving=False)
     page(by={"press": 0.001})
-    bench.spin_until(lambda: page.state["mover"] == "page")
-    bench.spin_until(lambda: page.state["mover"] == "")
+    bench.spin_until(lambda: told("page", is_moving=True))
+    bench.spin_until(lambda: told("page", is_moving=False))
+    simulator.commands["hand"]({"source": "other", "sequence": 1, "by": {"press": 0.001}}, 2)
+    bench.spin_until(lambda: told("other", is_moving=True))
+    for leave in simulator.leaving:
+        leave(1)  # which was not the holder
+    bench.spin_until(lambda: told("other", is_moving=False))
+    for leave in simulator.leaving:
+        leave(2)
+    bench.spin_until(lambda: told("", is_moving=False))
 
 
 def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):
@@ -219,11 +234,11 @@ def test_a_replay_is_ended_on_request_and_nothing_else_is(bench, page):
     take = holder.simulator.commands["take"]
     page.open()
     page.await_leader("hand")
-    assert take(True, 1) is None
+    assert take("page", 1) is None
     board.tell_state(SessionState(is_there=True, replay="/somewhere/press.mcap"))
     driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
     page.await_leader("bench")
-    assert "bench moves the probe" in take(True, 1)
+    assert "bench moves the probe" in take("page", 1)
     assert not page.state["can_take"]
     assert asked == []
     bench.peer.destroy_publisher(driver)
@@ -232,8 +247,9 @@ def test_a_replay_is_ended_on_request_and_nothing_else_is(bench, page):
     page.await_leader("path_player")
     assert page.state["can_take"]
     assert "the replay of press.mcap moves the probe" in page.state["obstacle"]
-    assert take(True, 1) is None
+    assert take("page", 1) is None
     assert asked == [{"replay": ""}]
+    bench.spin_until(lambda: page.state["holder"] == "page")
 
 
 def test_no_tracker_that_listens_is_said(bench, page):

@@ -23,7 +23,7 @@ class FakeHand:
         simulator.add(self.image, self.geometry, self.state)
         simulator.commands["hand"] = self._take
         simulator.commands["take"] = self._take_over
-        self.takes = 0  # how often the probe was to be taken
+        self.takes: list[Any] = []  # pages that were to take the probe
         matrix = {"matrix": MATRIX}
         self.geometry.offer(lambda n: Packet("image_geometry", n, matrix, b""))
         self.say()
@@ -33,11 +33,12 @@ class FakeHand:
         self.asked.append(value)
         return "the hand cannot" if value.get("go") == "lift" else None
 
-    def _take_over(self, _: Any, __: int) -> None:
-        self.takes += 1
+    def _take_over(self, source: Any, _: int) -> None:
+        self.takes.append(source)
 
     def say(self, **changes: Any) -> None:
-        header = {"leader": "hand", "mover": "", "obstacle": "", "warning": "", "can_take": False}
+        header = {"leader": "hand", "holder": "", "is_moving": False, "can_take": False}
+        header |= {"obstacle": "", "warning": ""}
         header["range"] = RANGES
         header |= {"stance": STANCE, "goal": STANCE, **changes}
         self.state.offer(lambda n: Packet("hand", n, header, b""))

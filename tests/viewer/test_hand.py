@@ -299,10 +299,11 @@ def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(
     button.wait_for()
     assert not centre.is_enabled()
     button.click()
-    viewer.until(lambda: viewer.takes == 1)
-    viewer.say()
+    viewer.until(lambda: len(viewer.takes) == 1)
+    viewer.say(holder=viewer.takes[0])
     button.wait_for(state="hidden")
     assert centre.is_enabled()
+    assert page.locator(".us-said").inner_text() == "You hold the probe"
 
 
 def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
@@ -318,14 +319,19 @@ def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
     assert told.inner_text() == "You hold the probe"
 
 
-def test_it_says_when_another_page_moves_the_probe(page: Any, viewer: FakeHand) -> None:
+def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
+    page: Any, viewer: FakeHand
+) -> None:
     said = "text => document.querySelector('.us-said').textContent === text"
-    viewer.say(mover="another")
+    viewer.say(holder="another", is_moving=True)
     page.wait_for_function(said, arg="Another page moves the probe")
+    viewer.say(holder="another")
+    page.wait_for_function(said, arg="Another page held the probe last")
     page.keyboard.press("s")
     viewer.until(lambda: viewer.asked)  # it may be moved here, too
-    viewer.say(mover=viewer.asked[-1]["source"])
-    page.wait_for_function(said, arg="You hold the probe")
+    for is_moving in (True, False):
+        viewer.say(holder=viewer.asked[-1]["source"], is_moving=is_moving)
+        page.wait_for_function(said, arg="You hold the probe")
 
 
 @pytest.mark.parametrize("width", [768, 1024, 1280])

@@ -25,7 +25,7 @@ from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import Stance
 from us_sim.viewer.asked_poses import AskedPoses
 from us_sim.viewer.feed import Feed
-from us_sim.viewer.hand_command import HOME_PRESS, HandCommand
+from us_sim.viewer.hand_command import HOME_PRESS, HandCommand, is_source
 from us_sim.viewer.hand_state import hand_state
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.simulator import Simulator
@@ -76,6 +76,7 @@ class ViewerHand:
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
         simulator.commands["take"] = self._ask_for_probe
+        simulator.leaving.append(lambda page: post(lambda: self.asked.left(page)))
         self._session = simulator.session
         self._lead = Lead("nobody", "the viewer looks who moves the probe")
         self._surface: ViewerSurface | None = None
@@ -94,7 +95,7 @@ class ViewerHand:
         self._moving_timer.cancel()
         self._resting_timer.cancel()
 
-    def _command(self, value: Any, _: int) -> str | None:
+    def _command(self, value: Any, page: int) -> str | None:
         """What a page sent, in its thread; why it is not done, or None."""
         try:
             asked = HandCommand.read(value)
@@ -102,7 +103,7 @@ class ViewerHand:
             return str(error)
         if self._lead.obstacle:
             return self._lead.obstacle
-        self._post(lambda: self._obey(asked))
+        self._post(lambda: self._obey(asked, page))
         return None
 
     def _watched(self, _: bool) -> None:
@@ -193,11 +194,13 @@ class ViewerHand:
         if self._motion is not None:
             self._motion.rest_at(self._motion.stance)
 
-    def _ask_for_probe(self, _: Any, __: int) -> str | None:
-        """End what is replayed, so that the hand may go on from there; in a page's thread."""
+    def _ask_for_probe(self, value: Any, page: int) -> str | None:
+        """End what is replayed, so that the page's hand may go on; in the page's thread."""
         if not self._lead.can_take:
             return self._lead.obstacle or None
         self._session.ask(replay="")
+        if is_source(value):
+            self._post(lambda: self.asked.hold(value, page))
         return None
 
     def _find(self, pose: Pose | None, stamp: int) -> None:
@@ -229,12 +232,12 @@ class ViewerHand:
                     f"frame"
                 )
 
-    def _obey(self, asked: HandCommand) -> None:
+    def _obey(self, asked: HandCommand, page: int) -> None:
         """Aim where a page wants the probe, and set out at once."""
         if self._publisher is None or self._motion is None or self._standing is None:
             return  # somebody else has taken it meanwhile
         self._motion.aim(asked.stance(self._motion.goal, self._standing))
-        self.asked.ask(asked.source, asked.sequence)
+        self.asked.ask(asked.source, asked.sequence, page)
         rested = self._moving_timer.is_canceled()
         if rested:
             self._moving_timer.reset()
@@ -282,7 +285,8 @@ class ViewerHand:
             stance = goal = Stance.of(self._elsewhere, surface)
         header = {
             "leader": self._lead.who,
-            "mover": self.asked.mover,
+            "holder": self.asked.holder,
+            "is_moving": self.asked.is_moving,
             "obstacle": self._lead.obstacle,
             "can_take": self._lead.can_take,
             "warning": self._warning,

@@ -23,7 +23,7 @@ from us_sim.errors import MessageError
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import Stance
 
-__all__ = ["HOME_PRESS", "LIFTED", "HandCommand"]
+__all__ = ["HOME_PRESS", "LIFTED", "HandCommand", "is_source"]
 
 HOME_PRESS = 1e-3
 """m: where the probe begins it touches, so that there is an image."""
@@ -62,7 +62,7 @@ class HandCommand:
         if unknown:
             raise MessageError(f"a command to the hand has no {_shown(min(unknown))}")
         source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
-        if not isinstance(source, str) or not 0 < len(source) <= _LONGEST_SOURCE:
+        if not is_source(source):
             raise MessageError(
                 f"the hand's source is a text of 1 to {_LONGEST_SOURCE} characters, not "
                 f"{_shown(source)}"
@@ -97,6 +97,11 @@ class HandCommand:
             goal = goal.slid(surface, *self.by["slide"])
         changed = {n: getattr(goal, n) + self.by[n][0] for n in _SINGLE if n in self.by}
         return _with(goal, changed).within_reach()
+
+
+def is_source(value: Any) -> bool:
+    """Whether it can be the name that a page has given itself."""
+    return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
 
 
 def _with(stance: Stance, numbers: dict[str, Any]) -> Stance:

@@ -21,7 +21,7 @@ let isDue = false;
 const handlers = [];
 
 export const hand = {
-  /** The newest of the viewer: {leader, mover, obstacle, warning, stance, goal, range}, or null. */
+  /** The newest of the viewer: {leader, holder, is_moving, obstacle, warning, stance, goal, range}, or null. */
   state: null,
 
   /** Have `handler(state)` called with each newer state. */
@@ -34,9 +34,14 @@ export const hand = {
     return this.state?.leader === "hand";
   },
 
-  /** Whether another page moves the probe. */
-  get isMovedElsewhere() {
-    return this.leads && Boolean(this.state.mover) && this.state.mover !== source;
+  /** Whether another page acted last. */
+  get isHeldElsewhere() {
+    return this.leads && Boolean(this.state.holder) && this.state.holder !== source;
+  },
+
+  /** End what is replayed, and hold the probe from there on. */
+  take() {
+    stream.send({ take: source });
   },
 
   /**

@@ -1,7 +1,6 @@
 /** Sliders with numbers, buttons, and the line that says who holds the probe. */
 
 import { element, events } from "../events.js";
-import { stream } from "../stream.js";
 import { hand } from "./hand.js";
 import { help } from "./help.js";
 import { latency } from "./latency.js";
@@ -39,7 +38,7 @@ said.setAttribute("role", "status");
 const take = make("button", { type: "button", textContent: "Take the probe", hidden: true });
 take.className = "us-on";
 take.title = "End the replay; the probe stays where it is, and you hold it";
-take.onclick = () => stream.send({ take: true });
+take.onclick = () => hand.take();
 const moves = []; // buttons that need the probe
 const pace = make("span", { className: "us-pace" });
 pace.title = "From the pointer to the changed image: median of the last movements";
@@ -142,7 +141,8 @@ function show() {
   led = hand.leads;
   const isProblem = performance.now() < problemEnds;
   said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
-  const holder = hand.isMovedElsewhere ? "Another page moves the probe" : "You hold the probe";
+  const other = state.is_moving ? "Another page moves the probe" : "Another page held the probe last";
+  const holder = hand.isHeldElsewhere ? other : "You hold the probe";
   const words = isProblem ? problem : state.warning || state.obstacle || holder;
   put(said, "textContent", words);
   put(said, "title", words);
