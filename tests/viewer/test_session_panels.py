@@ -2,6 +2,7 @@
 
 import dataclasses
 from concurrent.futures import Future
+from datetime import datetime
 
 import cv2
 import numpy as np
@@ -109,6 +110,22 @@ def test_a_session_is_recorded_and_replayed(page, session):
     assert asked[-1]["replay_time"] == pytest.approx(6.0, abs=0.5)
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
+
+
+def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session):
+    _, asked = session
+    opened(page, "Session")
+    file = page.get_by_label("file")
+    until(lambda: file.input_value().startswith("session_"), "a name is proposed", 30.0)
+    page.wait_for_timeout(2100)
+    pressed = f"session_{datetime.now():%Y%m%d_%H%M%S}.mcap"
+    page.get_by_role("button", name="Record", exact=True).click()
+    until(lambda: asked, "it is asked for", 30.0)
+    assert asked[0]["record"] >= pressed
+    until(lambda: file.input_value() == asked[0]["record"], "the field says so", 30.0)
+    file.fill("mine.mcap")
+    page.get_by_role("button", name="Record", exact=True).click()
+    until(lambda: asked[-1] == {"record": "mine.mcap"}, "a name of one's own stays", 30.0)
 
 
 def test_it_is_said_what_is_lost_when_all_is_replayed_as_recorded(page, session):

@@ -46,6 +46,7 @@ class _Session:
         self._touched = 0.0  # s, monotonic: when a person last asked for something
         self._is_following = False  # while controls are set to what is so
         self._shown_record = ""  # the recording whose name the field shows
+        self._proposed = _proposed()
         with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
             self._absent = ui.label(NOT_THERE).classes("us-quiet")
             with ui.column().classes("us-session") as self._all:
@@ -57,9 +58,12 @@ class _Session:
     def _recording(self) -> None:
         ui.label("Record").classes("us-cases-title")
         self._file = (
-            ui.input("file", value=_proposed()).props("dense outlined").classes("us-wide-field")
+            ui.input("file", value=self._proposed).props("dense outlined").classes("us-wide-field")
         )
-        self._file.tooltip("MCAP file to write, in the folder that us-sim runs in")
+        self._file.tooltip(
+            "MCAP file to write, in the folder that us-sim runs in; a name that you leave as it "
+            "is gets the time at which Record is pressed"
+        )
         with ui.row().classes("us-session-row"):
             self._record = ui.button("Record", icon="fiber_manual_record", on_click=self._begin)
             self._record.props("no-caps dense").tooltip("Record all topics to the file")
@@ -99,7 +103,10 @@ class _Session:
         self._problem.set_visibility(bool(state.problem))
         if state.record != self._shown_record:
             self._shown_record = state.record
-            self._file.set_value(PurePath(state.record).name if state.record else _proposed())
+            if state.record:
+                self._file.set_value(PurePath(state.record).name)
+            else:
+                self._propose()
         self._file.set_enabled(not state.record)
         self._record.set_enabled(not state.record and state.replay_as == "path")
         self._stop.set_enabled(bool(state.record))
@@ -138,7 +145,14 @@ class _Session:
         finally:
             self._is_following = False
 
+    def _propose(self) -> None:
+        """Name the next recording by the present time."""
+        self._proposed = _proposed()
+        self._file.set_value(self._proposed)
+
     async def _begin(self) -> None:
+        if self._file.value == self._proposed:
+            self._propose()
         await self._ask(record=self._file.value.strip())
 
     async def _end(self) -> None:
