@@ -91,6 +91,7 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     control.tell_thumbnail("/arm.yaml", b"jpeg")
     control.tell_bags({"a.mcap": "/a.mcap"})
     values = {"scene": "arm", "replay_rate": "0.5", "replay_loop": "true", "fraction": "0.40"}
+    values["record_note"] = "it lies beside another"
     control.tell("starting: 2 of 5 nodes", values, "nothing came")
     bench.spin_until(
         lambda: board.state.scene == "arm" and board.bags and board.thumbnail("/arm.yaml")
@@ -102,6 +103,7 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     ]
     assert (board.state.rate, board.state.loop, board.state.is_busy) == (0.5, True, True)
     assert board.state.problem == "nothing came"
+    assert board.state.record_note == "it lies beside another"
     bench.spin_until(lambda: session._client.services_are_ready())
     taken, refused = board.ask(record="b.mcap"), board.ask(scene="nowhere")
     bench.spin_until(lambda: taken.done() and refused.done())

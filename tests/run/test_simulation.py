@@ -88,6 +88,10 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder"}
     simulation.look()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
+    assert control.told[-1][1]["record_note"] == ""
+    simulation._monitor.node.reports["session_recorder"] = {"note": "it lies beside another"}
+    simulation.look()
+    assert control.told[-1][1]["record_note"] == "it lies beside another"
     ask(simulation, control, replay=PATH, replay_rate=0.5)
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}
     player = supervisor.plan.processes[-1].all_parameters

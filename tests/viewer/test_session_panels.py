@@ -85,11 +85,18 @@ def test_a_session_is_recorded_and_replayed(page, session):
     board.tell_state(dataclasses.replace(RUNNING, record="/home/a/mine.mcap"))
     page.get_by_text("recording to /home/a/mine.mcap").wait_for()
     page.get_by_text("recording mine.mcap").wait_for()
+    note = "metadata.yaml in this folder belongs to another recording"
+    assert not page.get_by_text(note).is_visible()
+    board.tell_state(
+        dataclasses.replace(RUNNING, record="/home/a/mine.mcap", record_note=f"{note}, so …")
+    )
+    page.get_by_text(note).wait_for()
     until(lambda: file.input_value() == "mine.mcap", "the field names what is written", 30.0)
     page.get_by_role("button", name="Stop", exact=True).click()
     until(lambda: asked[-1] == {"record": ""}, "it is ended", 30.0)
     page.get_by_text("recorded to /home/a/mine.mcap").wait_for()
     board.tell_state(RUNNING)
+    page.get_by_text(note).wait_for(state="hidden")
     until(lambda: file.input_value().startswith("session_"), "another is proposed", 30.0)
     assert file.input_value() >= proposed
     page.get_by_label("recording or path").click()

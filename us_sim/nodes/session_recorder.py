@@ -36,6 +36,10 @@ __all__ = ["SessionRecorder", "main"]
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
 MARKERS = "session/marker"
 """What is said there marks a moment."""
+_WITHOUT_METADATA = (
+    "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
+    "be read and played without"
+)
 
 
 class SessionRecorder(GuardedNode):
@@ -137,11 +141,9 @@ class SessionRecorder(GuardedNode):
         settings = self._settings
         beside = Path(file).parent / "metadata.yaml"
         taken = file.endswith(".mcap") and os.path.exists(beside)
-        if taken and not further:
-            self.get_logger().info(
-                "metadata.yaml in this folder belongs to another recording, so none is written; "
-                "the file can be read and played without"
-            )
+        note = _WITHOUT_METADATA if taken and not further else ""
+        if note:
+            self.get_logger().info(note)
         compression: Any = settings.compression
         bag = BagWriter(
             file,
@@ -162,6 +164,7 @@ class SessionRecorder(GuardedNode):
             self._bag.attach(name, media_type, data, now)
         for topic in self._topics.values():
             self._bag.add_topic(topic.name, self._types[topic.name], topic.offered)
+        self.health.values = {"note": note} if note else {}
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
 

@@ -157,6 +157,7 @@ def _state_of(status: DiagnosticStatus) -> SessionState:
         fraction=number("fraction", 1.0),
         problem=status.message if status.level != DiagnosticStatus.OK else "",
         record=said.get("record", ""),
+        record_note=said.get("record_note", ""),
         replay=said.get("replay", ""),
         replay_as=said.get("replay_as", "path"),
         replay_state=said.get("replay_state", ""),

@@ -253,6 +253,7 @@ class Simulation:
         playing: dict[str, str] = {
             key: player[key] for key in ("position", "duration") if request.path and key in player
         }
+        recorder = self._monitor.node.reports.get(RECORDER, {})
         values = {
             "scene": request.scene.name,
             "origin": request.scene.origin,
@@ -260,6 +261,7 @@ class Simulation:
             "loading": self._asked[0] if self._making is not None else "",
             "fraction": f"{fraction:.2f}",
             "record": str(request.record.resolve()) if request.record else "",
+            "record_note": recorder.get("note", "") if request.record else "",
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
             "replay_state": player.get("state", "starting") if request.path else "",

@@ -47,6 +47,7 @@ class SessionState:
     fraction: float = 1.0  # of loading or starting that is done
     problem: str = ""  # why the last thing that was asked for came to nothing
     record: str = ""  # file that is recorded to, with its folder
+    record_note: str = ""  # what is to be known of that file
     replay: str = ""  # bag that is played
     replay_as: str = "path"
     replay_state: str = ""

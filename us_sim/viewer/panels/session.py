@@ -70,6 +70,7 @@ class _Session:
             self._stop = ui.button("Stop", icon="stop", on_click=self._end)
             self._stop.props("no-caps dense").tooltip("End the recording; it is complete then")
             self._recorded = ui.label().classes("us-quiet").props('role="status"')
+        self._note = ui.label().classes("us-quiet").props('role="status"')
 
     def _replaying(self) -> None:
         ui.label("Replay").classes("us-cases-title")
@@ -111,6 +112,8 @@ class _Session:
         self._record.set_enabled(not state.record and state.replay_as == "path")
         self._stop.set_enabled(bool(state.record))
         self._recorded.set_text(f"recording to {state.record}" if state.record else "")
+        self._note.set_text(state.record_note)
+        self._note.set_visibility(bool(state.record_note))
         if dict(board.bags) != self._bags:
             self._bags = dict(board.bags)
             self._bag.set_options({file: name for name, file in self._bags.items()})
