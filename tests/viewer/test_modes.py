@@ -80,6 +80,36 @@ def test_a_mode_is_asked_for_shown_and_left(
 
 
 @pytest.mark.usefixtures("asked")
+def test_a_mode_that_is_chosen_while_the_image_is_frozen_is_announced_and_comes_with_the_next(
+    page: Any, simulator: Simulator
+) -> None:
+    plain = Feed("image")
+    pixels = np.full((32, 32), 90, np.uint8).tobytes()
+    header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "mono8"}
+    plain.offer(lambda sequence: Packet("image", sequence, header, pixels))
+    simulator.add(plain)
+    coloured(simulator, "annotated", (0, 0, 200))
+    page.goto(page.address)
+    image = PIXEL.format(".us-image")
+    page.get_by_role("button", name="Strain", exact=True).click()
+    page.wait_for_function(f"({image})()?.[1] === 0")
+    page.get_by_role("button", name="Freeze").click()
+    announced = page.get_by_text("The image is frozen: Go on shows B-mode")
+    page.wait_for_timeout(300)
+    assert not announced.is_visible()
+    page.get_by_role("button", name="B-mode").click()
+    announced.wait_for()
+    assert page.evaluate(f"({image})()")[1] == 0  # it is still the one that was frozen
+    page.get_by_role("button", name="Strain", exact=True).click()
+    announced.wait_for(state="hidden")
+    page.get_by_role("button", name="B-mode").click()
+    announced.wait_for()
+    page.get_by_role("button", name="Go on").click()
+    page.wait_for_function(f"({image})()?.[1] === 90")
+    announced.wait_for(state="hidden")
+
+
+@pytest.mark.usefixtures("asked")
 def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simulator) -> None:
     annotated = coloured(simulator, "annotated", (0, 0, 200))
     page.goto(page.address)

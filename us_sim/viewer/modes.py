@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import Any
 
 from nicegui import ui
@@ -59,7 +60,8 @@ class _Modes:
     def _show(self, mode: str) -> None:
         self._mode = mode
         kind = "b-mode" if mode == "b-mode" else "annotated"
-        ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => m.setMode('{kind}'))")
+        shown = f"m.setMode('{kind}', {json.dumps(MODES[mode][0])})"
+        ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {shown})")
         self._mark()
 
     def _toggle(self, kind: str) -> None:
@@ -75,8 +77,7 @@ class _Modes:
         parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
-            self._mode = known
-            self._mark()
+            self._show(known)
 
     def _mark(self) -> None:
         for name, button in self._buttons.items():

@@ -83,26 +83,43 @@ export async function drawImage(header, payload) {
 
 let live = true;
 let shown = KIND;
+let label = "B-mode"; // of the mode that is chosen
+let held = ""; // and of the one that was chosen as the image was frozen
 let arrived = 0;
 
 /** Images of a probe at rest come five times a second; without any the last one is marked. */
 const STALE_MS = 1000;
 
-setInterval(() => {
+/** What is to be known of the image, or nothing. */
+function remark() {
+  if (!live) return label === held ? "" : `The image is frozen: Go on shows ${label}`;
   const age = arrived ? performance.now() - arrived : 0;
-  badge.hidden = !live || document.hidden || age < STALE_MS;
-  if (!badge.hidden) badge.textContent = `No new image for ${Math.floor(age / 1000)} s`;
-}, 250);
+  return document.hidden || age < STALE_MS ? "" : `No new image for ${Math.floor(age / 1000)} s`;
+}
+
+function showRemark() {
+  const words = remark();
+  badge.hidden = !words;
+  if (words && badge.textContent !== words) badge.textContent = words;
+}
+setInterval(showRemark, 250);
 
 /** Whether images come and are drawn: not while one is frozen. */
 export function setLive(on) {
   live = on;
+  held = label;
   arrived = 0;
   stream.watch(shown, on);
 }
 
-/** Show the plain image ("b-mode"), or the one with outlines and colours ("annotated"). */
-export function setMode(mode) {
+/**
+ * Show the plain image ("b-mode"), or the one with outlines and colours ("annotated").
+ *
+ * `name` is what the mode is called on the page. While an image is frozen it stays as it is.
+ */
+export function setMode(mode, name) {
+  label = name;
+  showRemark();
   const wanted = mode === "annotated" ? "annotated" : KIND;
   if (wanted === shown) return;
   stream.watch(shown, false);
