@@ -10,11 +10,14 @@ import pytest
 from bench import pose_at
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
 from us_sim.errors import MeshError, SettingsError
 from us_sim.nodes.annotated_image import AnnotatedImage
+from us_sim.nodes.probe_lead import is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.building import probe_of
 from us_sim.slicing.drawing.overlay import ColourScale, Overlay
@@ -240,6 +243,23 @@ def test_diagnostics_warn_for_as_long_as_poses_stay_away(bench, show):
     node.annotated.pose_came(node.stamp())
     bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
     assert node.health.warning == ""
+
+
+def test_an_image_that_no_page_moves_is_no_fault_of_a_tracker(bench, show):
+    node = show(stale_after=1.0, lost_after=60.0)
+    viewer, tracker = (
+        bench.add(Node(name, context=bench.context)) for name in ("viewer", "probe_tracker")
+    )
+    tracker.create_subscription(PoseStamped, "tracker/pose", print, 10)
+    bench.spin_until(lambda: is_left_by_pages(node))
+    node.annotated.pose_came(node.stamp())
+    bench.spin_until(lambda: node.health.warning.startswith("no page moves the probe"))
+    assert node.health.problems("pose age") == 0
+    driver = viewer.create_publisher(PoseStamped, "tracker/pose", 10)
+    bench.spin_until(lambda: not is_left_by_pages(node))
+    node.annotated.pose_came(node.stamp())
+    bench.spin_until(lambda: node.health.problems("pose age") == 1)
+    viewer.destroy_publisher(driver)
 
 
 def words(report):

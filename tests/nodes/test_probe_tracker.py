@@ -6,6 +6,7 @@ import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
@@ -146,3 +147,19 @@ def test_the_transducer_is_there_for_who_comes_later(bench, tracker):
     assert width == pytest.approx(image.aperture)
     assert max(point.z for point in outline.points) == pytest.approx(image.depth)
     assert max(point.z for part in parts for point in part.points) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_closing_the_last_page_is_no_fault_of_a_tracker(bench, small_scene):
+    tracker = bench.make(ProbeTracker, scene=str(small_scene))
+    viewer = bench.add(Node("viewer", context=bench.context))
+    hand = viewer.create_publisher(PoseStamped, "tracker/pose", 10)
+    bench.spin_until(lambda: hand.get_subscription_count() > 0)
+    now = tracker.get_clock().now().to_msg()
+    hand.publish(pose_at(0.001, now.sec))
+    bench.spin_until(lambda: tracker.health.state == "lost")
+    assert tracker.health.warning == "the probe is lost"  # it publishes, but nothing comes
+    hand.publish(pose_at(0.001, now.sec + 1))
+    bench.spin_until(lambda: tracker.health.state == "tracked")
+    viewer.destroy_publisher(hand)
+    bench.spin_until(lambda: tracker.health.state == "lost")
+    assert tracker.health.warning.startswith("no page moves the probe")

@@ -15,6 +15,7 @@ from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.image_settings import AnnotatedImageSettings
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.pose_age import PoseAge
+from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
@@ -131,7 +132,12 @@ class AnnotatedImage:
         node, state = self._node, self.state
         node.health.values["probe_pose"] = state
         missing = state in ("stale", "lost")
-        if missing and not self._missing and self._age is not None:
+        warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
+        if missing and is_left_by_pages(node):
+            warning = f"{NO_PAGE}: the image is frozen"
+            if not self._missing:
+                node.get_logger().info(f"{warning} until somebody does")
+        elif missing and not self._missing and self._age is not None:
             node.health.problem(
                 "pose age",
                 f"the newest probe pose is {self._age.pose:.1f} s old: the image is frozen; look "
@@ -140,7 +146,7 @@ class AnnotatedImage:
         elif self._missing and state == "live":
             node.get_logger().info("probe poses come again")
         self._missing = missing
-        node.health.warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
+        node.health.warning = warning
 
     def _badge(self) -> Badge | None:
         """What marks an image that is not live."""

@@ -8,11 +8,13 @@ from pathlib import PurePath
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.session import SessionState
 
-__all__ = ["LEAD_TOPIC", "Lead", "probe_lead"]
+__all__ = ["LEAD_TOPIC", "NO_PAGE", "Lead", "is_left_by_pages", "probe_lead"]
 
 LEAD_TOPIC = "tracker/pose"
 PLAYERS = ("path_player", "session_player")
 """Nodes that `session_control` starts and ends."""
+VIEWER = "viewer"
+NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
 
 
 @dataclass(frozen=True)
@@ -55,3 +57,15 @@ def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool)
             "probe_tracker.source=pose, to take it yourself",
         )
     return Lead("nobody", "no simulator with a probe runs yet")
+
+
+def is_left_by_pages(node: GuardedNode) -> bool:
+    """Whether poses stay away because no page is open, where pages could move the probe."""
+    name = node.resolve_topic_name(LEAD_TOPIC)
+    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    viewer = (VIEWER, node.get_namespace())
+    return (
+        "probe_tracker" in hearers
+        and not node.count_publishers(name)
+        and viewer in node.get_node_names_and_namespaces()
+    )

@@ -30,6 +30,7 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
@@ -272,13 +273,17 @@ class ProbeTracker(SceneNode):
         state = self._tracking.state(self.now())
         if state is self._state:
             return
-        if state is TrackingState.LOST:
+        lost = "the probe is lost" if state is TrackingState.LOST else ""
+        if lost and is_left_by_pages(self):
+            lost = NO_PAGE
+            self.get_logger().info(f"{NO_PAGE}: it stays where it is")
+        elif lost:
             self.get_logger().warning("the probe is lost: no pose of it can be used any more")
         elif state is TrackingState.TRACKED and self._state is not TrackingState.COASTING:
             self.get_logger().info("the probe is tracked")
         self._state = state
         self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
-        self.health.warning = "the probe is lost" if state is TrackingState.LOST else ""
+        self.health.warning = lost
         self._say_status()
 
     def _say_status(self) -> None:
