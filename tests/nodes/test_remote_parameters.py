@@ -13,6 +13,8 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.remote_parameters import RemoteParameters
+from us_sim.nodes.settings import TissueDeformerSettings
+from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.flow.colour_settings import ColourSettings
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.viewer.parameters import Kind, State
@@ -66,6 +68,15 @@ def test_a_node_of_ours_says_units_ranges_choices_and_meanings(bench, remote):
         "cm/s",
     )
     assert known["colour.steering"].unit == "deg"
+
+
+def test_a_node_says_what_each_method_is_good_for(bench, remote):
+    node = bench.add(Node("tissue", context=bench.context))
+    LiveSettings(node, {"own": Group(TissueDeformerSettings())})
+    known = looked_at(bench, remote, "tissue")
+    assert known["solver"].choices == SOLVERS.names
+    assert known["solver"].meanings == SOLVERS.in_short
+    assert known["compare_with"].meanings == SOLVERS.in_short
 
 
 def test_a_value_is_set_in_the_unit_that_is_shown(bench, remote):

@@ -300,9 +300,10 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
     page: Any, simulator: Simulator, node: Node
 ) -> None:
     methods = ("fem", "msds")
+    meanings = {"fem": "for light presses", "msds": "springs, for comparison"}
     tissue = "tissue_deformer"
     parameters = [
-        Parameter(tissue, "solver", Kind.TEXT, "fem", choices=methods),
+        Parameter(tissue, "solver", Kind.TEXT, "fem", choices=methods, meanings=meanings),
         Parameter(tissue, "compare_with", Kind.TEXT, "", choices=methods, may_be_nothing=True),
         Parameter(tissue, "fem.friction", Kind.NUMBER, 0.3, limits=(0.1, 1.0)),
         Parameter(tissue, "msds.steps", Kind.WHOLE, 20, limits=(1, 100)),
@@ -320,6 +321,14 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
 
         until(is_said, text)
 
+    choice = page.locator(f'[data-parameter="{tissue}.solver"]')
+    until(lambda: "for light presses" in choice.inner_text(), "what the method is good for")
+    choice.locator("input").click()
+    option = page.get_by_role("option", name="msds", exact=True)
+    option.wait_for()
+    words, box = option.get_by_text("springs").bounding_box(), option.bounding_box()
+    assert words["width"] > 0.8 * (box["width"] - 32)  # all of the menu but its margins
+    page.keyboard.press("Escape")
     says("preparing msds: the tissue goes on", state="fem, preparing msds")
     apart = {"compared_with": "msds", "difference_max_mm": "0.4123", "difference_rms_mm": "0.05"}
     says("msds is 0.412 mm away at most, 0.05 mm root mean square", **apart)

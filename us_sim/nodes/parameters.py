@@ -194,6 +194,10 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
     names = rule.choice.names if rule.choice else rule.choices
     if names:
         constraints.insert(0, f"one of {', '.join(names)}")
+    if rule.choice:
+        constraints += [
+            f"{each}: {text.replace(';', ',')}" for each, text in rule.choice.in_short.items()
+        ]
     if _may_be_none(kind):
         is_text = str in get_args(kind)
         none = "''" if is_text else "0"

@@ -86,6 +86,7 @@ class Choice:
         group: entry points under which other packages add theirs; they may not replace ours.
         error: raised for a name that there is not.
         needs: whether options have settings without which they cannot be.
+        described: whether an option's class may say in ``in_short`` what it is good for.
         options: by name, where each is.
     """
 
@@ -97,9 +98,11 @@ class Choice:
         group: str | None = None,
         error: type[UsSimError] = SettingsError,
         needs: bool = False,
+        described: bool = False,
         **options: str | Option,
     ) -> None:
         self.what, self.key, self.group, self.needs = what, key, group, needs
+        self._described = described
         self._error = error
         self._broken: set[Option] = set()
         self._own = {
@@ -165,6 +168,14 @@ class Choice:
             SettingsError: see `option`.
         """
         return self.option(name).load_settings()
+
+    @property
+    def in_short(self) -> dict[str, str]:
+        """What options that can be imported say of themselves, by name; imports all of them."""
+        if not self._described:
+            return {}
+        said = {name: getattr(self.load(name), "in_short", "") for name in self.importable}
+        return {name: text for name, text in said.items() if text}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)

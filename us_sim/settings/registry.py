@@ -25,6 +25,7 @@ SOLVERS = Choice(
     key="solver",
     group="us_sim.solvers",
     error=SolverError,
+    described=True,
     fem="us_sim.tissue.solvers.fem:Fem",
     fem_nonlinear="us_sim.tissue.solvers.fem_nonlinear:FemNonlinear",
     fem_cg="us_sim.tissue.solvers.fem_cg:FemCg",

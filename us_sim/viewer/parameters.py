@@ -71,6 +71,7 @@ class Parameter:
     size: float = 1.0  # SI units in one of ``unit``
     limits: tuple[float, float] | None = None  # in SI units
     choices: tuple[str, ...] = ()  # the only texts that will do
+    meanings: Mapping[str, str] = field(default_factory=dict)  # of choices, as far as told
     may_be_nothing: bool = False  # and is where ``raw`` is 0, empty, or a list of those
     description: str = ""
     is_live: bool = True  # may change while the node runs

@@ -28,6 +28,12 @@ def settled(solver, pose, frames=400):
     return deformation
 
 
+def test_every_method_says_what_it_is_good_for():
+    said = SOLVERS.in_short
+    assert list(said) == list(SOLVERS)
+    assert all(0 < len(text) <= 100 for text in said.values())
+
+
 def test_a_fresh_solver_is_at_rest(solver):
     deformation = solver.deform(None)
     np.testing.assert_array_equal(deformation.nodes, solver.model.mesh.nodes)

@@ -2,7 +2,8 @@
 
 The nodes of this package say more in a descriptor than ROS has fields for, in sentences that
 `ros2 param describe` shows: the unit behind the description, and constraints such as
-``one of fem, msds; 0 for none; may change while running; shown in mm``. Others need not.
+``one of fem, msds; 0 for none; may change while running; shown in mm; fem: linear elasticity``.
+Others need not.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ def parameter_from(
     if reads not in units_of(unit):
         dimension = _DIMENSIONS.get(unit)
         reads = dial_unit(Quantity(dimension)) if dimension and kind is Kind.NUMBER else unit
-    choices = next((each[len(_ONE_OF) :] for each in said if each.startswith(_ONE_OF)), "")
+    listed = next((each[len(_ONE_OF) :] for each in said if each.startswith(_ONE_OF)), "")
+    choices = tuple(each.strip() for each in listed.split(",") if each.strip())
+    told = (each.partition(": ") for each in said)
     return Parameter(
         node,
         name,
@@ -64,7 +67,8 @@ def parameter_from(
         unit=reads,
         size=units_of(unit).get(reads, 1.0),
         limits=limits,
-        choices=tuple(each.strip() for each in choices.split(",") if each.strip()),
+        choices=choices,
+        meanings={name: text for name, _, text in told if name in choices and text},
         may_be_nothing=any(each in _NOTHING for each in said),
         description=description,
         is_live=not descriptor.read_only and kind is not Kind.OTHER,

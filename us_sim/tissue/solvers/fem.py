@@ -85,6 +85,9 @@ class Fem(TissueSolver):
     """
 
     name: ClassVar[str] = "fem"
+    in_short: ClassVar[str] = (
+        "linear elasticity, fastest: for light presses, too stiff or too soft for deep ones"
+    )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 

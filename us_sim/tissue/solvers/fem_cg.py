@@ -79,6 +79,9 @@ class FemCg(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_cg"
+    in_short: ClassVar[str] = (
+        "linear elasticity as in the paper, nearly solved in each frame: for comparison"
+    )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 

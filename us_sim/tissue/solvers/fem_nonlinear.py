@@ -163,6 +163,9 @@ class FemNonlinear(TissueSolver):
     """
 
     name: ClassVar[str] = "fem_nonlinear"
+    in_short: ClassVar[str] = (
+        "large deformation of nearly incompressible tissue, slowest: for deep presses"
+    )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 

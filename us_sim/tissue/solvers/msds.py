@@ -81,6 +81,7 @@ class Msds(TissueSolver):
     """
 
     name: ClassVar[str] = "msds"
+    in_short: ClassVar[str] = "springs as in the paper, forces not calibrated: for comparison"
 
     Settings = MsdsSettings
 

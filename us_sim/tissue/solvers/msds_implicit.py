@@ -109,6 +109,7 @@ class MsdsImplicit(TissueSolver):
     """
 
     name: ClassVar[str] = "msds_implicit"
+    in_short: ClassVar[str] = "springs fitted to the tissue, stable however stiff: for comparison"
 
     Settings = MsdsImplicitSettings
 

@@ -62,6 +62,8 @@ class TissueSolver(ABC):
     """
 
     name: ClassVar[str]
+    in_short: ClassVar[str] = ""
+    """For whom chooses the method: what it is, and what it is good for."""
     Settings: ClassVar[type[SolverSettings]] = SolverSettings
     """The class of this method's settings. A solver is made with the model, its settings, and a
     callback that is told the fraction done and what is being made, or None."""

@@ -27,7 +27,17 @@ export default {
         :aria-label="label" :aria-description="tip" @update:model-value="set($event)" />
       <q-select v-else-if="choices.length" class="us-wide" dense outlined options-dense
         :for="field" :model-value="shown" :options="options" emit-value map-options
-        :aria-description="tip" @update:model-value="set($event)" />
+        :aria-description="tip" @update:model-value="set($event)">
+        <template #option="{ itemProps, opt }">
+          <q-item v-bind="itemProps" class="us-option" :aria-label="opt.label"
+            :aria-description="meanings[opt.value]">
+            <q-item-section>
+              <q-item-label>{{ opt.label }}</q-item-label>
+              <q-item-label v-if="meanings[opt.value]" caption>{{ meanings[opt.value] }}</q-item-label>
+            </q-item-section>
+          </q-item>
+        </template>
+      </q-select>
       <template v-else>
         <q-slider v-if="span" class="us-slider" :min="sliderLow" :max="sliderHigh"
           :step="sliderStep" :model-value="position" :aria-label="label"
@@ -39,6 +49,7 @@ export default {
           :inputmode="isNumber ? 'decimal' : 'text'" autocomplete="off" spellcheck="false"
           @update:model-value="typed = $event" @keydown="key" @blur="take" />
       </template>
+      <div v-if="meanings[shown]" class="us-meaning">{{ meanings[shown] }}</div>
       <div v-if="refusal" class="us-reason" role="alert">{{ refusal }}</div>
     </div>`,
   props: {
@@ -48,6 +59,7 @@ export default {
     unit: { type: String, default: "" },
     span: { type: Object, default: null }, // low, high, step, isLogarithmic
     choices: { type: Array, default: () => [] },
+    meanings: { type: Object, default: () => ({}) }, // of choices, in words
     optional: Boolean, // nothing is a value, too: null
     live: Boolean,
     tip: { type: String, default: "" },

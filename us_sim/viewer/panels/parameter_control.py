@@ -90,6 +90,7 @@ class ParameterControl(Element, component="parameter_control.js"):
                 "value": list(value) if isinstance(value, tuple) else value,
                 "unit": parameter.unit,
                 "choices": list(parameter.choices),
+                "meanings": dict(parameter.meanings),
                 "optional": parameter.may_be_nothing,
                 "live": parameter.is_live,
                 "tip": tip_of(parameter),
