@@ -13,17 +13,26 @@ from tqdm import tqdm
 __all__ = ["Progress", "end_late_bars", "late_progress"]
 
 _PATIENCE = 1.0  # s, for which work goes on without a bar
+_UNMEASURED = "{desc}{postfix}, {elapsed}"
 _late: list[Progress] = []  # bars that are drawn and not at their end
 
 
 class Progress:
     """A bar on stderr from 0 to ``total``; without a total, only the text.
 
-    Where stderr is no terminal it writes a line every few seconds instead.
+    Where stderr is no terminal it writes a line every few seconds instead. A bar that is not
+    ``measured`` yet has no percentage before `update` says one.
     """
 
-    def __init__(self, description: str, total: float | None = None, unit: str = "") -> None:
-        layout = (
+    def __init__(
+        self,
+        description: str,
+        total: float | None = None,
+        unit: str = "",
+        *,
+        measured: bool = True,
+    ) -> None:
+        self._layout = (
             "{desc}{postfix}"
             if total is None
             else (
@@ -35,7 +44,7 @@ class Progress:
         self._bar = tqdm(
             desc=description,
             total=total,
-            bar_format=layout,
+            bar_format=self._layout if measured else _UNMEASURED,
             mininterval=0.1 if sys.stderr.isatty() else 3.0,
             ascii=not sys.stderr.isatty(),
             miniters=0,
@@ -47,8 +56,15 @@ class Progress:
         """Show that ``done`` of the total is done."""
         if self._bar.total is not None:
             done = min(done, self._bar.total)
+        self._bar.bar_format = self._layout
         self._bar.set_postfix_str(text, refresh=False)
         self._bar.update(done - self._bar.n)
+
+    def tell(self, text: str) -> None:
+        """Show what is being done where nobody knows how much of it there is."""
+        self._bar.bar_format = _UNMEASURED
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update(0)
 
     def __enter__(self) -> Progress:
         return self
@@ -65,8 +81,9 @@ class Progress:
 def late_progress(description: str) -> Callable[[float, str], None]:
     """A callback for work that is mostly short: it draws a bar once a second has passed.
 
-    It takes the fraction done and what is being done; at 1 the bar is finished, and the next call
-    begins another.
+    It takes the fraction done and what is being done; 0 shows no percentage, since of what has
+    just begun, or is compiled, nobody knows it. At 1 the bar is finished, and the next call begins
+    another.
     """
     begun: float | None = None
     bar: Progress | None = None
@@ -75,10 +92,12 @@ def late_progress(description: str) -> Callable[[float, str], None]:
         nonlocal begun, bar
         begun = time.monotonic() if begun is None else begun
         if bar is None and fraction < 1.0 and time.monotonic() - begun > _PATIENCE:
-            bar = Progress(description, 100, "%")
+            bar = Progress(description, 100, "%", measured=fraction > 0.0)
             _late.append(bar)
-        if bar is not None:
+        if bar is not None and fraction > 0.0:
             bar.update(100 * fraction, text)
+        elif bar is not None:
+            bar.tell(text)
         if fraction >= 1.0:
             if bar is not None:
                 bar.__exit__(None, None, None)
