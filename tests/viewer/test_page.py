@@ -13,6 +13,7 @@ from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.viewer.feed import Feed
+from us_sim.viewer.listening import listening
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.simulator import Simulator
@@ -106,17 +107,15 @@ def test_a_foreign_host_is_refused(served: Any) -> None:
 
 
 def test_a_taken_port_is_said(served: Any) -> None:
-    from us_sim.viewer.server import _listening
-
     server, _ = served
     with pytest.raises(UsSimError, match=f"port {server.port} of 127.0.0.1 is taken"):
-        _listening("127.0.0.1", server.port)
+        listening("127.0.0.1", server.port)
     with pytest.raises(UsSimError, match=r"--host no\.such\.host\.invalid"):
-        _listening("no.such.host.invalid", 0)
+        listening("no.such.host.invalid", 0)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))  # bound, and not listened at
         with pytest.raises(UsSimError, match="is taken"):
-            _listening("127.0.0.1", free.getsockname()[1])
+            listening("127.0.0.1", free.getsockname()[1])
 
 
 def test_what_the_page_says_wrongly_is_answered(page: Any, simulator: Simulator) -> None:

@@ -111,7 +111,7 @@ def run(
     keep_on_this_host(network=network)
     request = Request(scene, parameters, record, path, duration=duration, view=view)
     request = replace(request, by_hand=by_hand, playing=playing or {})
-    plan = plan_of(request)
+    plan = plan_of(request).with_free_port()
     prepare_volume(scene, path)
     outcome = follow(plan, None, supervision, request, forks)
     for file in outcome.files:
@@ -170,7 +170,7 @@ def demo(
         video = _prepared_video(scene, file) if source == "camera" else None
         played = file if video is None else None
         request = Request(scene, parameters, recording, played, video=video, view=view)
-        plan = plan_of(request)
+        plan = plan_of(request).with_free_port()
         prepare_volume(scene, played)
     started = time.monotonic()
     outcome = follow(plan, out / "nodes.log", supervision, request, forks)
@@ -222,7 +222,7 @@ def view_running(
             f"--param {others[0]}: --attach starts the viewer alone; set parameters of what runs "
             f"already with `ros2 param set`, or in the page"
         )
-    _require_nothing_lost(follow(Plan([viewer]), None, supervision))
+    _require_nothing_lost(follow(Plan([viewer]).with_free_port(), None, supervision))
     return 0
 
 

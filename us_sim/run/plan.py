@@ -18,6 +18,7 @@ from us_sim.run.graph import (
 )
 from us_sim.run.request import Request
 from us_sim.scene.building import path_of
+from us_sim.viewer.listening import require_free
 
 __all__ = ["PLAYERS", "Plan", "goes_on", "plan_of"]
 
@@ -45,6 +46,18 @@ class Plan:
     @property
     def nodes(self) -> list[str]:
         return [process.node for process in self.processes]
+
+    def with_free_port(self) -> Plan:
+        """The same plan, whose page can be served: seen before anything is made for it.
+
+        Raises:
+            UsSimError: the page's address or port cannot be listened at.
+        """
+        for process in self.processes:
+            if process.node == VIEWER:
+                parameters = process.all_parameters
+                require_free(str(parameters["host"]), int(str(parameters["port"])))
+        return self
 
 
 def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:

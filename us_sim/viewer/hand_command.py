@@ -15,7 +15,7 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -99,7 +99,7 @@ class HandCommand:
         return _with(goal, changed).within_reach()
 
 
-def is_source(value: Any) -> bool:
+def is_source(value: Any) -> TypeGuard[str]:
     """Whether it can be the name that a page has given itself."""
     return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import os
 import re
 import secrets
@@ -14,13 +12,13 @@ from typing import Any
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import Access, is_loopback
+from us_sim.viewer.listening import listening
 from us_sim.viewer.simulator import Simulator
 
 __all__ = ["WebServer"]
 
 _STARTED_S = 30.0
 _STOPPED_S = 3.0
-_QUEUE = 64
 
 
 class WebServer:
@@ -42,7 +40,7 @@ class WebServer:
     ) -> None:
         self.token = "" if is_loopback(host) else _checked(token) or secrets.token_urlsafe(16)
         self._uvicorn, application = _made(simulator)
-        self._socket = _listening(host, port)
+        self._socket = listening(host, port)
         self.host, self.port = host, int(self._socket.getsockname()[1])
         config = self._uvicorn.Config(
             Access(application, self.token),
@@ -132,37 +130,3 @@ def _checked(token: str) -> str:
             "US_SIM_VIEWER_TOKEN to another, or not at all"
         )
     return token
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens there.
-
-    Raises:
-        UsSimError: it cannot.
-    """
-    try:
-        family, kind, protocol, _, where = socket.getaddrinfo(
-            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listening = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise UsSimError(
-            f"--host {host}: {error.strerror or error}; give an address of this computer"
-        ) from error
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind(where)
-        listening.listen(_QUEUE)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            listening.close()
-        if error.errno == errno.EADDRINUSE:
-            raise UsSimError(
-                f"port {port} of {host} is taken: choose another with --port, or 0 for any that "
-                f"is free"
-            ) from error
-        raise UsSimError(
-            f"{host}:{port} cannot be listened at: {error.strerror}; choose another --host or "
-            f"--port"
-        ) from error
-    return listening

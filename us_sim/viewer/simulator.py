@@ -26,7 +26,7 @@ class Simulator:
     nodes: ParameterBoard = field(default_factory=ParameterBoard)  # what can be set of them
     status: StatusBoard = field(default_factory=StatusBoard)  # how they are
     session: SessionBoard = field(default_factory=SessionBoard)  # what is loaded and played
-    leaving: list[Callable[[int], None]] = field(default_factory=list)
+    leaving: list[Callable[[int], object]] = field(default_factory=list)
     """Called with a page's number when it has gone."""
 
     def add(self, *feeds: Feed) -> None:
