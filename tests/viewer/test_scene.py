@@ -78,21 +78,26 @@ class Patient:
             "image_geometry", lambda n: Packet("image_geometry", n, {"matrix": matrix}, b"")
         )
         self.show(200)
-        pose = {"stamp": "0", "position": [0, 0.04, 0], "quaternion": [0, 0, 0, 1]}
-        pushed = pose | {"force": [0.0, 0.0, -2.5], "torque": [0.0, 0.0, 0.0]}
-        self._offer("probe", lambda n: Packet("probe", n, pushed, b""))
+        self.push()
         self.move(np.zeros(3))
 
-    def move(self, shift: np.ndarray) -> None:
+    def push(self, stamp: int = 0, force_stamp: int = 0) -> None:
+        """The probe with the force on it, of stamps in ns."""
+        pose = {"stamp": str(stamp), "position": [0, 0.04, 0], "quaternion": [0, 0, 0, 1]}
+        pushed = pose | {"force": [0.0, 0.0, -2.5], "torque": [0.0, 0.0, 0.0]}
+        pushed["force_stamp"] = str(force_stamp)
+        self._offer("probe", lambda n: Packet("probe", n, pushed, b""))
+
+    def move(self, shift: np.ndarray, stamp: int = 0) -> None:
         """All tissue from rest, m."""
         moved = MESH.nodes + shift
         self._offer(
-            "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=0)
+            "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=stamp)
         )
 
-    def show(self, grey: int) -> None:
+    def show(self, grey: int, stamp: int = 0) -> None:
         """An image all in one grey, 0 to 255."""
-        header = {"stamp": "0", "rows": 48, "columns": 64, "encoding": "mono8"}
+        header = {"stamp": str(stamp), "rows": 48, "columns": 64, "encoding": "mono8"}
         self._offer("image", lambda n: Packet("image", n, header, bytes([grey]) * (48 * 64)))
 
     def _offer(self, kind: str, pack: Callable[[int], Packet]) -> None:
@@ -387,3 +392,29 @@ def test_nothing_is_drawn_while_nothing_changes(scene):
     assert scene.ask("return scene.stage.pace.drawn") == drawn
     scene.patient.show(200)
     scene.until(f"scene.stage.pace.drawn > {drawn}")
+
+
+def test_what_is_older_than_the_image_is_marked_until_it_is_not(
+    page: Any, scene: SimpleNamespace
+) -> None:
+    patient, old = scene.patient, page.locator(".us-scene-old")
+    force = page.locator(".us-force")
+    noon = 1_790_000_000_000_000_000
+    patient.show(90, noon)
+    patient.push(noon, noon)
+    patient.move(np.zeros(3), noon)
+    page.wait_for_timeout(1000)
+    assert not old.is_visible()
+    patient.show(95, noon + 400_000_000)
+    page.wait_for_timeout(600)
+    assert not old.is_visible()
+    later = noon + 1_300_000_000
+    patient.show(99, later)
+    page.get_by_text("The 3D view is 1.3 s older than the image").wait_for()
+    patient.move(np.zeros(3), later)
+    patient.push(later, noon)
+    page.get_by_text("The force is 1.3 s older than the image").wait_for()
+    assert "us-old" in (force.get_attribute("class") or "")
+    patient.push(later, later)
+    old.wait_for(state="hidden")
+    assert "us-old" not in (force.get_attribute("class") or "")

@@ -93,4 +93,8 @@ def _posed(message: PoseStamped) -> dict[str, Any]:
 
 def _pushed(message: WrenchStamped) -> dict[str, Any]:
     wrench = wrench_from(message, "probe")
-    return {"force": wrench[:3].tolist(), "torque": wrench[3:].tolist()}
+    return {
+        "force": wrench[:3].tolist(),
+        "torque": wrench[3:].tolist(),
+        "force_stamp": str(nanoseconds_of(message.header.stamp)),  # the pose may be newer
+    }

@@ -222,6 +222,16 @@ export const probe = {
     return last;
   },
 
+  /** Whether the force is shown where there is one. */
+  get isForceShown() {
+    return shown.force;
+  },
+
+  /** Mark the force as older than the image, or no longer. */
+  markForce(on) {
+    label.classList.toggle("us-old", on);
+  },
+
   /** Show or hide "probe", "image" or "force". */
   setVisible(name, on) {
     shown[name] = on;

@@ -1,6 +1,7 @@
 /** The 3D scene of the page, in frame `patient`, metres; and what others may ask of it. */
 
 import { probe } from "./probe.js";
+import "./age.js";
 import "./measures.js";
 
 const style = document.createElement("link");

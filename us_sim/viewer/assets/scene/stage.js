@@ -62,6 +62,7 @@ controls.update();
 
 const preparations = [];
 const followers = [];
+const witnesses = [];
 let isDirty = true;
 let isDrawing = false;
 let isFine = false;
@@ -130,6 +131,7 @@ function finish(fence, begun, fine, done) {
   }
   gl.deleteSync(fence);
   if (!gl.isContextLost()) readback?.show();
+  for (const witness of witnesses) witness();
   const end = performance.now();
   const took = end - begun;
   isDrawing = false;
@@ -198,6 +200,16 @@ export const stage = {
   /** Have `follow()` called after each drawing: labels follow what they name. */
   afterDrawing(follow) {
     followers.push(follow);
+  },
+
+  /** Have `witness()` called when a drawing is seen, which may be long after it was begun. */
+  afterShowing(witness) {
+    witnesses.push(witness);
+  },
+
+  /** Whether something has changed that is not seen yet. */
+  get isPending() {
+    return isDirty || isDrawing;
   },
 
   /** CSS pixels in the scene of a point (m), and whether it is before the camera. */
