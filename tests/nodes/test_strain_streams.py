@@ -131,6 +131,14 @@ def test_a_gap_begins_anew(bench, pressed):
     assert [message.header.stamp.sec for message in images] == [2, 4]
 
 
+def test_the_colour_bar_follows_the_strain_unless_its_end_is_given(pressed):
+    node = pressed()
+    stream = next(s for s in node.node._streams if s.overlay_name == "strain")
+    assert stream.overlay(node.frame(2)).scale.high == 0.05  # the press compresses by 4 %
+    node.node.set_parameters([Parameter("strain.colours", value=0.15)])
+    assert stream.overlay(node.frame(2)).scale.high == 0.15
+
+
 def test_strain_is_laid_over_the_annotated_image_with_what_the_press_is_like(bench, pressed):
     node = pressed(overlay="strain", **{"strain.colours": 0.04})
     pictures = bench.collect(Image, "ultrasound/image_annotated")

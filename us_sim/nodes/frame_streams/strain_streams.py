@@ -18,7 +18,7 @@ from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.colours import strain_scale
+from us_sim.slicing.strain.colours import FollowingEnd, strain_scale
 from us_sim.slicing.strain.compression import compression
 from us_sim.slicing.strain.earlier import Earlier
 from us_sim.slicing.strain.estimate import Estimate, estimate_strain, require_short_windows
@@ -46,6 +46,7 @@ class _StrainImages(FrameStream):
     def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
         super().__init__(node)
         self._parameters = parameters
+        self._end = FollowingEnd()
         self._latest: tuple[Frame, Strain, NDArray[np.float32] | None] | None = None
 
     @property
@@ -62,7 +63,8 @@ class _StrainImages(FrameStream):
         values = self._of(frame)
         if values is None:
             return None
-        scale = strain_scale(self.overlay_name, self._settings.colours)
+        most = self._settings.colours or self._end.of(values)
+        scale = strain_scale(self.overlay_name, most)
         return Overlay(values, scale, note=self._note(values))
 
     def _of(self, frame: Frame) -> NDArray[np.float32] | None:

@@ -51,10 +51,10 @@ class Strain(Settings):
         description="of the tissue's own strain between two labels: averaged like all else, or not "
         "averaged, which is truer near borders, and shows the tetrahedra there",
     )
-    colours: float = setting(
+    colours: float | None = setting(
         Quantity("number", 1e-4, 1.0),
-        "strain at the ends of the colour bar",
-        default=0.1,
+        "strain at the ends of the colour bar; not given: a round value that follows the images",
+        default=None,
     )
     window: float = setting(
         _LENGTH,
