@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -33,9 +32,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from us_sim.geometry.pose import Pose
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import setting
-from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.penetration import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.prediction import predict_forces
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
@@ -46,14 +42,9 @@ from us_sim.tissue.elasticity.overstress import PronyBranch
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.fem_nonlinear_settings import FemNonlinearSettings
 from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.solvers.solver import (
-    COUNT,
-    TOLERANCE,
-    SolverSettings,
-    TissueSolver,
-    same_pose,
-)
+from us_sim.tissue.solvers.solver import TissueSolver, same_pose
 from us_sim.tissue.solvers.strides import strides
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
@@ -90,61 +81,6 @@ _LOOSE, _STEPS = 0.2, 5
 _PATIENCE = 10
 """Frames in a row that may end inside out before the tissue is begun anew from rest. None where
 time is short and the probe moves on: what is shown would stay behind ever farther."""
-
-
-@dataclass(frozen=True)
-class FemNonlinearSettings(SolverSettings):
-    """The settings of the solver ``fem_nonlinear``."""
-
-    section = "fem_nonlinear"
-
-    frame_tolerance: float = setting(
-        TOLERANCE, "residual at which a frame with a moving probe ends", default=0.003
-    )
-    frame_budget: float | None = setting(
-        Quantity("time", 0.0005, 10.0),
-        "time after which a frame ends with what it has, and the next goes on; not given: what a "
-        "live simulation leaves, three times that where forces are not yet balanced, and in "
-        "lockstep any, lest results depend on the machine",
-        default=None,
-    )
-    most_iterations: int = setting(
-        COUNT,
-        "conjugate-gradient iterations of a frame at most, where each step counts as eight more; "
-        "twice as many while the probe rests",
-        default=480,
-    )
-    tolerance: float = setting(
-        TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
-    )
-    contact: str = setting(
-        choices=CONTACTS,
-        default="frictionless",
-        description="what holds between probe and tissue; sticking: a touched node keeps its place "
-        "on the probe until it is let go",
-    )
-    friction: float = setting(
-        COEFFICIENT,
-        "Coulomb's coefficient, where contact is coulomb; the default is a choice, meant for gel",
-        default=0.07,
-    )
-    viscosity: float = setting(
-        Quantity("number", 0.0, 10.0),
-        "stiffness that relaxes while a deformation lasts, over the one that stays: tissue gives "
-        "way slowly and creeps back when it is let go; 0: none",
-        default=0.0,
-    )
-    relaxation_time: float = setting(
-        Quantity("time", 1e-3, 1e3),
-        "time in which that falls to 37 percent (1/e)",
-        default=0.5,
-    )
-    frame_interval: float = setting(
-        Quantity("time", 1e-4, 10.0),
-        "time that is taken to pass from one frame to the next, for viscous tissue; a frame is "
-        "one pose of the probe",
-        default=0.0167,
-    )
 
 
 class FemNonlinear(TissueSolver):

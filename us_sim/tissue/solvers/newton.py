@@ -121,9 +121,8 @@ class Newton:
         most = largest_local_eigenvalue(rest, self.tissue.tangent_product, self._fixed)
         self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / most)
         self.points, self.contact = surface_contact(model, friction)
-        shape = (3, len(mesh.nodes))
-        self.displacement = np.zeros(shape)  # m
-        self._force = np.zeros(shape)  # N, the slope of the tissue's energy
+        self.displacement = np.zeros((3, len(mesh.nodes)))  # m
+        self._force = np.zeros_like(self.displacement)  # N, the slope of the tissue's energy
         self.rest()
 
     def rest(self) -> None:
