@@ -48,6 +48,9 @@ _TOLERANCE = 1e-5  # unbalanced force over contact force at the last pose
 _APPROACHING = 1e-2  # the same at the poses before
 _NEWTON_STEPS = 60
 _SHORTEST_STEP = 2.0**-12
+_STIFFENED = (0.0, 1e-3, 1e-2, 0.1, 1.0)
+"""Parts of the tangent's diagonal that are added to it, until it is definite (K. Levenberg, 1944).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +171,7 @@ class _Search:
                 self._progress(self.done, f"imbalance {residual / (load or 1.0):.1e}")
             if residual <= tolerance * load or residual < 1e-12:
                 return
-            system = TwoLevel(self._tangent(pose), self._prolongation)
-            step = system(-unbalanced.ravel(), 1e-3).reshape(-1, 3)
+            step = self._step(pose, unbalanced)
             slope = float((unbalanced * step).sum())
             before, whole = self.displacement, energy
             length = 1.0
@@ -186,6 +188,17 @@ class _Search:
             f"the reference solution found no equilibrium at {pose.position.tolist()} m: approach "
             f"the pose in smaller steps or on a finer mesh"
         )
+
+    def _step(self, pose: Pose, unbalanced: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
+        tangent = self._tangent(pose)
+        for part in _STIFFENED:
+            diagonal = bsr_array(diags_array(part * tangent.diagonal()), blocksize=(3, 3))
+            system = TwoLevel(tangent + diagonal if part else tangent, self._prolongation)
+            step = system(-unbalanced.ravel(), 1e-3).reshape(-1, 3)
+            if system.is_definite:
+                break
+        return step
 
     def _energy(self, pose: Pose) -> float:
         if not self.block.smallest_volume_ratio(self.displacement) > 0.0:

@@ -52,9 +52,10 @@ class TwoLevel:
     def __call__(self, right: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
         """(3N,) solution with a residual below ``tolerance`` times the right-hand side's norm.
 
-        Where the matrix turns out not to be positive definite, the search ends at what was found
-        before, which still descends.
+        Where the matrix turns out not to be positive definite, which ``is_definite`` says then, the
+        search ends at what was found before, which still descends.
         """
+        self.is_definite = True
         solution = np.zeros_like(right)
         residual = right.copy()
         direction = preconditioned = self._cycle(residual)
@@ -64,6 +65,7 @@ class TwoLevel:
             product = self._matrix @ direction
             curvature = direction @ product
             if curvature <= 0.0:
+                self.is_definite = False
                 return solution if iteration else direction
             step = slope / curvature
             solution += step * direction
