@@ -37,7 +37,7 @@ class FemNonlinearSettings(SolverSettings):
         COUNT,
         "conjugate-gradient iterations of a frame at most, where each step counts as eight more; "
         "twice as many while the probe rests",
-        default=480,
+        default=440,
     )
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
