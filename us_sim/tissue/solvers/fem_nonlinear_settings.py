@@ -24,19 +24,21 @@ class FemNonlinearSettings(SolverSettings):
     section = "fem_nonlinear"
 
     frame_tolerance: float = setting(
-        TOLERANCE, "residual at which a frame with a moving probe ends", default=0.003
+        TOLERANCE,
+        "residual, unbalanced over contact forces, at which a frame with a moving probe ends",
+        default=0.003,
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
-        "time after which a frame ends with what it has, and the next goes on; not given: what a "
-        "live simulation leaves, three times that where forces are not yet balanced, and in "
-        "lockstep any, lest results depend on the machine",
+        "time after which a frame ends with what it has, and the next goes on. Not given: live, "
+        "what the rate leaves, and up to three times that until the forces are balanced; in "
+        "lockstep no limit, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(
         COUNT,
-        "conjugate-gradient iterations of a frame at most, where each step counts as eight more; "
-        "twice as many while the probe rests",
+        "conjugate-gradient iterations of a frame at most, each step of Newton's method counting "
+        "as eight more; twice as many while the probe rests",
         default=440,
     )
     tolerance: float = setting(
