@@ -257,6 +257,8 @@ def test_how_tissue_is_pushed_is_not_known_where_a_probe_came_down_deep():
     assert rounding(1e-6, pose) == np.inf  # settled on planes
     assert rounding(1e-3, pose) < 1e-9  # these are gone now
     assert rounding(1e-3, Pose([0.0, 0.0, 0.022])) < 1e-9  # 2 mm more
+    assert rounding(1e-3, Pose([-0.3, 0.0, 0.04])) < 1e-9  # beside the tissue
+    assert rounding(1e-3, Pose([0.3, 0.0, 0.04])) == np.inf  # beyond it, having gone through
 
 
 def surface_check(model):

@@ -273,3 +273,16 @@ def test_where_no_probe_is_nothing_is_pushed():
     assert contact.release(positions) is False
     assert contact.expect(np.ones(1)) is False
     assert contact.settle() == 0.0
+
+
+def test_tissue_that_comes_back_to_a_probe_at_rest_is_pushed_again():
+    plate = FlaredProbe(RoundedBox(0.04, 0.04, 0.03, 0.001), 0.005)
+    contact, there = contact_of(plate, 1), np.array([[0.0, 0.0, -0.001]])
+    away = there + np.array([0.0, 0.0, 2 * plate.reach])
+    contact.aim(Pose(), away)
+    assert not contact.release(away)
+    contact.look(there)
+    assert not contact.push.any()  # it was too far to be looked at
+    assert contact.release(there)
+    assert contact.push[0] > 0.0
+    assert contact.energy > 0.0

@@ -305,9 +305,7 @@ def _turn(residual, conditioned, before, search):
 @njit(**_LOOP)
 def _curvature(search, whole, fixed):
     """The product along the search direction, with the fixed nodes' rows left out."""
-    for d in range(3):
-        for k in range(len(fixed)):
-            whole[d, fixed[k]] = 0
+    clear_nodes(whole, fixed)
     return _dot(search, whole)
 
 
