@@ -19,6 +19,7 @@ from us_sim.errors import BagError
 from us_sim.nodes.conversions import image_message, stamp_message
 from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.session_player import SessionPlayer
+from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.recording.path import ProbePath, read_path, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
@@ -122,6 +123,23 @@ def test_nothing_is_played_before_what_is_awaited_is_there(bench, path):
     assert not poses
     bench.peer.create_publisher(Image, "ultrasound/image", 1)
     bench.spin_until(lambda: len(poses) == 10)
+
+
+def test_what_is_waited_for_is_said_and_is_what_the_recorder_records(bench, path, tmp_path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    images = bench.peer.create_publisher(Image, "ultrasound/image", 1)
+    recorder = bench.make(
+        SessionRecorder, file=str(tmp_path / "a.mcap"), topics=["/ultrasound/image"]
+    )
+    bench.spin_until(images.get_subscription_count)
+    bench.make(PathPlayer, path=str(path), await_recorded=["ultrasound/image"])
+    bench.spin_until(lambda: len(poses) == 10)
+    assert not recorder.count_subscribers("/probe/pose")
+    other = bench.make(PathPlayer, path=str(path), await_recorded=["probe/pose"])
+    other._awaited._since = 1e-9  # it waits for long
+    bench.spin_until(lambda: "awaited" in other.health.values)
+    assert "/probe/pose" in other.health.values["awaited"]
+    assert len(poses) == 10
 
 
 def test_a_path_that_cannot_be_read_is_one_sentence(bench, tmp_path):

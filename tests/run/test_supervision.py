@@ -1,14 +1,18 @@
 """What the supervisor does with nodes that end, without any process."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from us_sim.errors import UsSimError
 from us_sim.run.graph import INTERRUPTED, NodeProcess
-from us_sim.run.plan import Plan, goes_on
+from us_sim.run.plan import Plan, goes_on, plan_of
+from us_sim.run.request import Request
 from us_sim.run.supervision import Supervisor
 from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.scene.reading import load_scene
+from us_sim.share import find_bag
 
 
 class Group:
@@ -100,6 +104,33 @@ def test_a_player_at_its_end_is_no_loss(session):
     assert supervisor.finished
     assert not supervisor.losses
     assert supervisor.outcome(1.0).sentence() == ""
+
+
+@pytest.mark.parametrize(
+    ("settings", "lost"),
+    [
+        ({}, True),
+        ({"exclude": ["/ultrasound/image"]}, False),
+        ({"exclude": ["/probe/pose"]}, True),
+        ({"topics": ["/probe/pose"]}, False),
+        ({"topics": ["/ultrasound/image"]}, True),
+        ({"start_paused": True}, False),
+        ({"snapshot_mode": True}, False),
+    ],
+)
+def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lost):
+    group = Group()
+    recorder = NodeProcess("session_recorder", {"file": str(tmp_path / "a.mcap")}, settings)
+    plan = Plan([recorder, NodeProcess("slice_interpolator")])
+    supervisor = Supervisor(plan, group, Monitor(group), SupervisionSettings())
+    (tmp_path / "a.mcap").touch()
+    assert bool(supervisor.outcome(1.0).sentence()) is lost
+
+
+def test_a_path_that_was_never_played_is_a_loss(session):
+    supervisor, _, monitor = session
+    monitor.node.reports["path_player"] = {"awaited": "the end of days"}
+    assert "the end of days" in supervisor.outcome(1.0).sentence()
 
 
 @pytest.mark.parametrize("status", [0, 1, 3, -15, -9, INTERRUPTED])
@@ -247,3 +278,27 @@ def test_what_takes_another_process(node, name, stays):
     assert goes_on(before, after) is stays
     assert goes_on(before, before)
     assert not goes_on(before, None)
+
+
+@pytest.mark.parametrize(
+    ("given", "awaited"),
+    [
+        ({}, {"tracker/pose", "probe/pose", "ultrasound/image", "tissue/nodes", "skin/nodes"}),
+        ({"topics": "[/probe/pose, /ultrasound/labels]"}, {"probe/pose"}),
+        (
+            {"exclude": "[/ultrasound/image, /tissue/nodes, /diagnostics]"},
+            {"tracker/pose", "probe/pose", "skin/nodes"},
+        ),
+    ],
+)
+def test_a_player_waits_for_the_recorder_to_record_what_it_is_to_record(tmp_path, given, awaited):
+    parameters = {"session_recorder": given}
+    path = find_bag("press_and_slide.mcap")
+    request = Request(load_scene("upper_arm"), parameters, tmp_path / "a.mcap", path)
+    for asked, expected in (
+        (request, awaited),
+        (replace(request, record=None, parameters={}), set()),
+    ):
+        player = plan_of(asked).processes[-1]
+        assert player.node == "path_player"
+        assert set(player.parameters["await_recorded"]) == expected

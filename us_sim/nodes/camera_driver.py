@@ -15,7 +15,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError
-from us_sim.nodes.awaited import Awaited
+from us_sim.nodes.awaited import CHECK_S, Awaited
 from us_sim.nodes.conversions import bgr_image_message, image_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
@@ -33,11 +33,6 @@ RETRY_S = 1.0
 """How long a camera that is not there is left alone."""
 PATIENCE_S = 1.0
 """How long an image that is awaited may hold up the node's end."""
-CHECK_S, CHECKS = 0.05, 6
-"""How often, and how often in a row, somebody must listen before a file begins.
-
-A best-effort subscriber may find this publisher a little later than it is found itself.
-"""
 
 
 class CameraDriver(GuardedNode):
@@ -54,7 +49,6 @@ class CameraDriver(GuardedNode):
         settings = declared(self, CameraDriverSettings())
         source, info = settings.source, settings.camera_info
         self._frame, self._loop = settings.frame_id, settings.loop
-        self._awaited = Awaited(self)
         self._grey = settings.encoding == "mono8"
         self._latency = round(1e9 * settings.latency)
         self._begun = round(1e9 * settings.begun)  # ns, when a file's first image was due
@@ -64,6 +58,7 @@ class CameraDriver(GuardedNode):
         self.finished = Future()
         self.health = Health(self, source)
         self._images = self._publisher(Image, "camera/image_raw")
+        self._awaited = Awaited(self, self._images)
         self._descriptions = self._publisher(CameraInfo, "camera/camera_info")
         if self._camera is None:
             self.get_logger().warning(
@@ -130,12 +125,9 @@ class CameraDriver(GuardedNode):
     def _play(self) -> None:
         """A file, as fast as it was recorded."""
         self._tell("waiting for a subscriber")
-        checks = 0
-        while checks < CHECKS:
+        while not self._awaited.has_come():
             if self._closing.wait(CHECK_S):
                 return
-            there = self._images.get_subscription_count() and self._awaited.are_there()
-            checks = checks + 1 if there else 0
         there, number = self.get_clock().now().nanoseconds, 0
         begun = self._begun if 0 < self._begun < there else there
         shown = True

@@ -15,7 +15,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
-from us_sim.nodes.awaited import Awaited
+from us_sim.nodes.awaited import CHECK_S, Awaited
 from us_sim.nodes.conversions import nanoseconds_of, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
@@ -29,8 +29,6 @@ from us_sim.recording.path import ProbePath, read_path
 
 __all__ = ["PathPlayer", "main"]
 
-CHECK_S, CHECKS = 0.05, 6
-"""How often, and how often in a row, everything awaited must be there before the first pose."""
 HELD = 5.0
 """Poses a second of a probe that is held still; images are called stale after half a second."""
 
@@ -46,7 +44,6 @@ class PathPlayer(GuardedNode):
         self._live = LiveSettings(self, {"player": Group(PathPlayerSettings())}, use=self._use)
         settings = self._settings
         path = settings.path
-        self._awaited = Awaited(self)
         if not path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
@@ -55,7 +52,6 @@ class PathPlayer(GuardedNode):
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next = 0
         self._begun = round(1e9 * settings.begun)  # ns
-        self._checks = 0
         self._ticking: Timer | None = None
         self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
@@ -68,6 +64,7 @@ class PathPlayer(GuardedNode):
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
+        self._awaited = Awaited(self, self._poses)
         self.health.state = "waiting for the simulation"
         self._starting = self.create_timer(CHECK_S, self._begin)
         self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
@@ -87,13 +84,8 @@ class PathPlayer(GuardedNode):
         return settings
 
     def _begin(self) -> None:
-        """Start once somebody listens and the awaited topics have been there for a while.
-
-        A best-effort subscriber may find this publisher a little later than it is found itself.
-        """
-        there = self._poses.get_subscription_count() and self._awaited.are_there()
-        self._checks = self._checks + 1 if there else 0
-        if self._checks < CHECKS:
+        """Start once somebody listens and what is awaited is there."""
+        if not self._awaited.has_come():
             return
         self._starting.cancel()
         self.health.state = "playing"

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from rclpy.node import Node
 
 from us_sim.nodes.rosbag2_service import offer_service
+from us_sim.nodes.session_settings import LOST
 from us_sim.recording.losses import Loss
 
 __all__ = ["Controlled", "RecorderEvents", "offer_services"]
@@ -76,8 +77,6 @@ class RecorderEvents:
     """Publishes rosbag2's events, as far as ``rosbag2_interfaces`` has their types."""
 
     SPLIT = "events/write_split"
-    LOST = "events/rosbag2_messages_lost"
-    """Its type is newer than Jazzy."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -90,8 +89,8 @@ class RecorderEvents:
             return
         self._msg = msg
         self._split = node.create_publisher(msg.WriteSplitEvent, self.SPLIT, 1)
-        if hasattr(msg, "MessagesLostEvent"):
-            self._lost = node.create_publisher(msg.MessagesLostEvent, self.LOST, 10)
+        if hasattr(msg, "MessagesLostEvent"):  # newer than Jazzy
+            self._lost = node.create_publisher(msg.MessagesLostEvent, LOST, 10)
 
     def split(self, closed: str, opened: str) -> None:
         """A file was closed, and another one begun; none when the recording ended."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 from collections import deque
@@ -24,7 +25,6 @@ from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.recorder_services import RecorderEvents, offer_services
 from us_sim.nodes.session_attachments import session_attachments
 from us_sim.nodes.session_settings import SessionRecorderSettings
-from us_sim.nodes.topics import ON_DEMAND
 from us_sim.recording.losses import Loss, news
 from us_sim.recording.pre_roll import PreRoll
 from us_sim.recording.topic import MARKER
@@ -33,7 +33,6 @@ from us_sim.recording.writer import BagWriter
 
 __all__ = ["SessionRecorder", "main"]
 
-NOT_THE_SESSION = ("/rosout", "/parameter_events")
 MARKERS = "session/marker"
 """What is said there marks a moment."""
 _WITHOUT_METADATA = (
@@ -56,11 +55,9 @@ class SessionRecorder(GuardedNode):
         super().__init__("session_recorder", **kwargs)
         self._settings = declared(self, SessionRecorderSettings())
         settings = self._settings
-        named = {*settings.topics, *settings.also}
-        self._chosen = named if settings.topics else set()
-        self._excluded = {*settings.exclude, *NOT_THE_SESSION}
-        self._excluded.add(self.resolve_topic_name(RecorderEvents.LOST))  # it is in the metadata
-        self._excluded |= {self.resolve_topic_name(name) for name in ON_DEMAND} - named
+        self._is_wanted = functools.cache(
+            lambda topic: settings.records(topic, self.get_namespace())
+        )
         self._marker_topic = self.resolve_topic_name(MARKERS)
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
@@ -172,7 +169,7 @@ class SessionRecorder(GuardedNode):
         """Subscribe to what has appeared."""
         self._tell_splits()
         for topic, types in self.get_topic_names_and_types():
-            if topic in self._excluded or (self._chosen and topic not in self._chosen):
+            if not self._is_wanted(topic):
                 continue
             for type_name in types:
                 if type_name == self._types.get(topic) or (topic, type_name) in self._refused:

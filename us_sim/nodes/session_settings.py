@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import posixpath
 from dataclasses import dataclass
 
+from us_sim.nodes.topics import ON_DEMAND
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
@@ -21,6 +23,9 @@ BEGUN = Quantity("time", 0.0, 1e10)
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
+LOST = "events/rosbag2_messages_lost"
+NOT_THE_SESSION = ("/rosout", "/parameter_events", LOST)
+"""Topics that are not recorded; losses are in the recording's metadata."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +35,8 @@ class AwaitedSettings(Settings):
     await_topics: tuple[str, ...] = setting(
         description="begin when each of these has a publisher", default=()
     )
-    await_subscriber: str | None = setting(
-        description="and this node subscribes to each", default=None
+    await_recorded: tuple[str, ...] = setting(
+        description="and session_recorder subscribes to each of these", default=()
     )
 
 
@@ -138,6 +143,22 @@ class SessionRecorderSettings(Settings):
         description="those of all nodes, as YAML: attached as parameters.yaml", default=""
     )
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
+
+    def records(self, topic: str, namespace: str = "/") -> bool:
+        """Whether a recorder in this namespace records a topic, given by its full name."""
+
+        def among(*names: str) -> bool:
+            return topic in {posixpath.join(namespace, name) for name in names}
+
+        if among(*self.exclude, *NOT_THE_SESSION):
+            return False
+        named = among(*self.topics, *self.also)
+        return named if self.topics else named or not among(*ON_DEMAND)
+
+    @property
+    def at_once(self) -> bool:
+        """Whether it records from its start on what it records, and not when it is told to."""
+        return not (self.start_paused or self.snapshot_mode)
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,10 @@ def _status(plan: Plan, monitor: Monitored) -> str:
     count = monitor.node.count(IMAGER, IMAGES)
     if not count:
         heard = slicer.get("received", "0") != "0"
-        return again + ("nobody subscribes to ultrasound/image" if heard else "waiting for poses")
+        poses = monitor.node.reports.get(plan.player, {}).get("awaited", "poses")
+        return again + (
+            "nobody subscribes to ultrasound/image" if heard else f"waiting for {poses}"
+        )
     return (
         f"{again}{count} images, {slicer.get('rate_hz', '?')}/s, "
         f"p99 {slicer.get('latency_p99_ms', '?')} ms"

@@ -11,17 +11,19 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import yaml
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.nodes.settings import checked_parameters
 from us_sim.run.deferred_signals import deferred_signals
 from us_sim.run.forking import ForkServer
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
+from us_sim.settings.setting import rules_of
 from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = [
@@ -32,6 +34,7 @@ __all__ = [
     "keep_on_this_host",
     "parameters_file",
     "player_settings",
+    "recorder_of",
     "scene_settings",
     "simulation_nodes",
     "video_settings",
@@ -112,24 +115,42 @@ def parameters_file(processes: Sequence[NodeProcess]) -> str:
     return text
 
 
-def player_settings(scene: Scene, path: Path, *, recorded: bool) -> dict[str, object]:
+def player_settings(
+    scene: Scene, path: Path, recorder: SessionRecorderSettings | None
+) -> dict[str, object]:
     """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
     return {
         "path": str(path.expanduser().resolve()),
         "topic": (scene.tracker.body or "") if scene.tracker.source.name == "path" else "",
-        "await_topics": ["tracker/pose", *scene.ready_topics],
-        "await_subscriber": "session_recorder" if recorded else "",
+        **_awaited(["tracker/pose", *scene.ready_topics], recorder),
     }
 
 
-def video_settings(scene: Scene, video: Path, info: Path, *, recorded: bool) -> dict[str, object]:
+def video_settings(
+    scene: Scene, video: Path, info: Path, recorder: SessionRecorderSettings | None
+) -> dict[str, object]:
     """Parameters of a ``camera_driver`` that begins when all of the scene's nodes are ready."""
     return {
         "source": str(video),
         "camera_info": str(info),
-        "await_topics": ["camera/camera_info", *scene.ready_topics],
-        "await_subscriber": "session_recorder" if recorded else "",
+        **_awaited(["camera/camera_info", *scene.ready_topics], recorder),
     }
+
+
+def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
+    """Parameters that have a player wait for these topics, and for a recorder to record them."""
+    recorded = [topic for topic in topics if recorder and recorder.records(f"/{topic}")]
+    return {"await_topics": topics, "await_recorded": recorded}
+
+
+def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
+    """The settings of the recorder among them."""
+    for process in processes:
+        if process.node == RECORDER:
+            known = rules_of(SessionRecorderSettings).keys() & process.all_parameters
+            values: Any = {name: process.all_parameters[name] for name in known}
+            return SessionRecorderSettings(**values)
+    return None
 
 
 def keep_on_this_host(*, network: bool) -> None:

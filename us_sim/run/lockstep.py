@@ -13,10 +13,12 @@ from threadpoolctl import threadpool_limits
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.graph import (
+    NodeProcess,
     Parameters,
     keep_on_this_host,
     parameters_file,
     player_settings,
+    recorder_of,
     scene_settings,
     simulation_nodes,
 )
@@ -161,9 +163,10 @@ def _nodes(
         **scene_settings(scene),
         "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
     }
-    player = player_settings(scene, path, recorded=True) | {"lockstep": True}
+    recording = NodeProcess("session_recorder", recorder)
+    player = player_settings(scene, path, recorder_of([recording])) | {"lockstep": True}
     return [
-        ("session_recorder", recorder),
+        (recording.node, recorder),
         ("image_writer", {"folder": str(out / "images"), **writer}),
         *(
             (process.node, {**common, **process.all_parameters})

@@ -62,10 +62,13 @@ class Outcome:
     made: int  # images, that the node which makes them has reported
     recorded: int  # of them
     poses: int | None  # that there were to play, or images of a video
+    awaited: str = ""  # why nothing was played
 
     def sentence(self) -> str:
         """What was lost, for a person; empty when nothing was."""
         told = [str(loss) for loss in self.losses[:TOLD]]
+        if self.awaited:
+            told.append(f"nothing was played: it waited for {self.awaited}")
         if len(self.losses) > TOLD:
             told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
         if self.files and (self.losses or self.recorded < self.made):
@@ -75,7 +78,7 @@ class Outcome:
             told.append(f"{self.recorded} images were recorded{of}")
         if self.files:
             told.append(f"the recording is in {_listed([file.name for file in self.files])}")
-        return "; ".join(told) if self.losses or self._lacks_images else ""
+        return "; ".join(told) if self.losses or self.awaited or self._lacks_images else ""
 
     @property
     def _lacks_images(self) -> bool:

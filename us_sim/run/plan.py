@@ -11,6 +11,7 @@ from us_sim.run.graph import (
     NodeProcess,
     parameters_file,
     player_settings,
+    recorder_of,
     scene_settings,
     simulation_nodes,
     video_settings,
@@ -100,17 +101,17 @@ def plan_of(request: Request) -> Plan:
     for process in processes:
         if process.node == RECORDER:
             process.parameters["parameters"] = parameters_file(processes)
-    recorded = request.record is not None
+    awaited = recorder_of(processes)
     if request.video is not None:
         video = request.video
-        settings = video_settings(scene, video.file, video.camera_info, recorded=recorded)
+        settings = video_settings(scene, video.file, video.camera_info, awaited)
         processes.append(NodeProcess("camera_driver", settings, driver))
         loops = bool(driver.get("loop"))
         return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
     if request.path is None:
         return Plan(processes, duration=request.duration)
     count = len(path_of(scene, request.path, str(player.get("topic") or "") or None))
-    settings = player_settings(scene, request.path, recorded=recorded) | dict(request.playing)
+    settings = player_settings(scene, request.path, awaited) | dict(request.playing)
     processes.append(NodeProcess("path_player", settings, player))
     ends = not settings.get("stay")
     loops = bool(processes[-1].all_parameters.get("loop"))

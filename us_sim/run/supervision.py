@@ -9,7 +9,14 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
-from us_sim.run.graph import INTERRUPTED, RECORDER, NodeProcess, ProcessGroup, ending
+from us_sim.run.graph import (
+    INTERRUPTED,
+    RECORDER,
+    NodeProcess,
+    ProcessGroup,
+    ending,
+    recorder_of,
+)
 from us_sim.run.losses import Loss, Outcome, images_in
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import Plan, goes_on
@@ -164,10 +171,14 @@ class Supervisor:
         """How it went, once all has ended."""
         files = self._recordings.files()
         recorded = images_in(files)
-        # How many images there were while something was recorded is only known of a whole run.
-        made = self._monitor.node.count(IMAGER, IMAGES) if self._changes == 1 else recorded
+        # How many images were to be recorded is only known where all that were made were.
+        recorder = recorder_of(self._plan.processes)
+        all_were = recorder and recorder.at_once and recorder.records(f"/{IMAGES}")
+        is_known = all_were and self._changes == 1
+        made = self._monitor.node.count(IMAGER, IMAGES) if is_known else recorded
         poses = None if self._plan.loops else self._plan.poses
-        return Outcome(startup, self.losses, files, made, recorded, poses)
+        awaited = self._monitor.node.reports.get(self._plan.player, {}).get("awaited", "")
+        return Outcome(startup, self.losses, files, made, recorded, poses, awaited)
 
     def _running(self) -> Mapping[str, int]:
         group = self._group

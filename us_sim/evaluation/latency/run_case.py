@@ -23,7 +23,13 @@ from us_sim.evaluation.latency.usage import UsageOverTime, usage_of
 from us_sim.evaluation.own_process import start_module
 from us_sim.evaluation.timed_cases import Tell
 from us_sim.recording.reader import read_bag
-from us_sim.run.graph import NodeProcess, ProcessGroup, player_settings, simulation_nodes
+from us_sim.run.graph import (
+    NodeProcess,
+    ProcessGroup,
+    player_settings,
+    recorder_of,
+    simulation_nodes,
+)
 from us_sim.run.lockstep import render
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -80,10 +86,10 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
         replace(process, given={"realtime": case.realtime})
         for process in simulation_nodes(scene, played=True)
     ]
-    player = player_settings(scene, _path(scene), recorded=case.recorder) | {"loop": True}
-    processes.append(NodeProcess("path_player", player))
     if case.recorder:
         processes.insert(0, NodeProcess("session_recorder", {"file": str(file)}))
+    player = player_settings(scene, _path(scene), recorder_of(processes)) | {"loop": True}
+    processes.append(NodeProcess("path_player", player))
     with listening(viewer=case.viewer) as arrivals, _started(case, processes, folder) as running:
         _await_images(arrivals, running, tell)
         usage: dict[str, UsageOverTime] = {node: UsageOverTime() for node in running.pids}
