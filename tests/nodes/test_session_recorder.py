@@ -5,6 +5,7 @@ import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
@@ -13,6 +14,7 @@ from std_msgs.msg import String
 from us_sim.errors import BagError
 from us_sim.nodes.conversions import image_message
 from us_sim.nodes.session_recorder import SessionRecorder
+from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.recording.reader import read_bag
 
 
@@ -83,6 +85,49 @@ def test_what_is_made_on_demand_is_recorded_beside_all_others(bench, tmp_path):
     )
     bench.spin_for(30)
     assert annotated.get_subscription_count() == 0
+
+
+def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_scene):
+    def start(kind, space, **parameters):
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = kind(namespace=space, context=bench.context, parameter_overrides=overrides)
+        return bench.add(node)
+
+    scene = tmp_path / "bare.yaml"  # an image for every pose, and others on demand
+    scene.write_text(small_scene.read_text().partition("tissue:")[0])
+    images, files, recorders, poses = [], {}, {}, {}
+    more = {"/a": {"also": ["ultrasound/labels", "/b/probe/pose"]}, "/b": {}, "/": {}}
+    for space, extra in more.items():
+        slicer = start(SliceInterpolator, space, scene=str(scene))
+        images += [each for each in slicer.publishers if each.msg_type is Image]
+        files[space] = tmp_path / f"of_{space[1:]}" / "session.mcap"
+        files[space].parent.mkdir()
+        file = str(files[space])
+        recorders[space] = start(SessionRecorder, space, file=file, **extra)
+        name = slicer.resolve_topic_name("probe/pose")
+        poses[space] = bench.peer.create_publisher(PoseStamped, name, 10)
+    foreign = [bench.peer.create_publisher(String, name, 10) for name in ("/tf", "/driver/state")]
+    # slicer and recorder; of /b that of /a, too
+    bench.spin_until(lambda: [poses[each].get_subscription_count() for each in more] == [2, 3, 2])
+    bench.spin_until(lambda: [each.get_subscription_count() for each in foreign] == [3, 1])
+    for publisher in poses.values():
+        publisher.publish(pose_at(0.001, 1))
+    bench.spin_until(lambda: all(read_bag(each).message_count > 3 for each in files.values()))
+    heard = {each.topic_name for each in images if each.get_subscription_count() > 0}
+    recorded = {}
+    for space, recorder in recorders.items():
+        bench.executor.remove_node(recorder)
+        recorder.destroy_node()
+        topics = {topic.name for topic in read_bag(files[space]).topics}
+        recorded[space] = {name for name in topics if "/events/" not in name}
+    own = ("diagnostics", "probe/pose", "ultrasound/image", "ultrasound/image_to_probe")
+    assert recorded == {
+        "/a": {f"/a/{name}" for name in (*own, "ultrasound/labels")} | {"/b/probe/pose", "/tf"},
+        "/b": {f"/b/{name}" for name in own} | {"/tf"},
+        "/": {f"/{name}" for name in own} | {"/tf", "/driver/state"},
+    }
+    ordered = "/a/ultrasound/labels"
+    assert heard == {ordered} | {f"{space}/ultrasound/image" for space in ("", "/a", "/b")}
 
 
 def test_a_recording_is_not_overwritten(bench, tmp_path):

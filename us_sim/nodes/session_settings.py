@@ -5,7 +5,7 @@ from __future__ import annotations
 import posixpath
 from dataclasses import dataclass
 
-from us_sim.nodes.topics import ON_DEMAND
+from us_sim.nodes.topics import TOPICS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
@@ -26,6 +26,10 @@ _BYTES = Quantity("number", 0, 2**53)
 LOST = "events/rosbag2_messages_lost"
 NOT_THE_SESSION = ("/rosout", "/parameter_events", LOST)
 """Topics that are not recorded; losses are in the recording's metadata."""
+SHARED = ("/tf", "/tf_static")
+"""Topics that a recorder takes outside its namespace, too: frames may be common to all."""
+OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.from_drivers)
+"""How the names of topics end that only a simulator publishes, in whichever namespace it is."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +112,17 @@ class SessionRecorderSettings(Settings):
     compression: str = setting(
         description="of the file's chunks", choices=("none", "zstd"), default="none"
     )
-    topics: tuple[str, ...] = setting(description="full names; none: all", default=())
-    also: tuple[str, ...] = setting(
-        description="full names of topics made on demand, such as /tissue/structures, that are "
-        "recorded beside the others",
+    topics: tuple[str, ...] = setting(
+        description="names, in this node's namespace or from `/` on; none: all of the namespace, "
+        "but no other simulator's and none made on demand",
         default=(),
     )
-    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+    also: tuple[str, ...] = setting(
+        description="names of topics that are recorded beside these: made on demand, such as "
+        "tissue/structures, or outside the namespace",
+        default=(),
+    )
+    exclude: tuple[str, ...] = setting(description="names to leave out", default=())
     max_cache_size: int = setting(
         _BYTES,
         "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
@@ -145,15 +153,21 @@ class SessionRecorderSettings(Settings):
     attach: tuple[str, ...] = setting(description="more files to attach", default=())
 
     def records(self, topic: str, namespace: str = "/") -> bool:
-        """Whether a recorder in this namespace records a topic, given by its full name."""
+        """Whether a recorder in this namespace records a topic, given by its full name.
+
+        Topics of another simulator, and those made on demand, it records only by name.
+        """
 
         def among(*names: str) -> bool:
             return topic in {posixpath.join(namespace, name) for name in names}
 
         if among(*self.exclude, *NOT_THE_SESSION):
             return False
-        named = among(*self.topics, *self.also)
-        return named if self.topics else named or not among(*ON_DEMAND)
+        if self.topics or among(*self.also):
+            return among(*self.topics, *self.also)
+        if topic.endswith(OF_SIMULATORS):
+            return among(*(each.name for each in TOPICS if not each.on_demand), *SHARED)
+        return topic.startswith(posixpath.join(namespace, "")) or topic in SHARED
 
     @property
     def at_once(self) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["ON_DEMAND", "TOPICS", "Topic"]
+__all__ = ["TOPICS", "Topic"]
 
 
 @dataclass(frozen=True)
@@ -351,6 +351,3 @@ TOPICS = (
         subscribers=("session_monitor",),
     ),
 )
-
-ON_DEMAND = tuple(topic.name for topic in TOPICS if topic.on_demand)
-"""What is not computed either where only a recorder would want it."""
