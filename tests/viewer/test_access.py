@@ -20,6 +20,8 @@ def asked(
     origin: str = "",
     query: str = "",
     cookie: str = "",
+    path: str = "/",
+    app: Any = None,
 ) -> Any:
     """What is answered: "passed", or the messages of the refusal."""
     headers = [(b"host", host.encode())]
@@ -29,15 +31,15 @@ def asked(
         headers.append((b"cookie", cookie.encode()))
     scope = {
         "type": kind,
-        "path": "/",
+        "path": path,
         "headers": headers,
         "query_string": query.encode(),
         "server": ("127.0.0.1", 8080),
     }
     sent: list[Any] = []
 
-    async def app(_: Any, __: Any, send: Any) -> None:
-        await send("passed")
+    async def passed(_: Any, __: Any, send: Any) -> None:
+        await send({"type": "passed"})
 
     async def receive() -> Any:
         return {"type": "websocket.connect"}
@@ -47,11 +49,11 @@ def asked(
 
     # In a thread of its own: in this one a browser of other tests may have its loop.
     answering = threading.Thread(
-        target=lambda: asyncio.run(Access(app, token)(scope, receive, send))
+        target=lambda: asyncio.run(Access(app or passed, token)(scope, receive, send))
     )
     answering.start()
     answering.join()
-    return sent[0] if sent == ["passed"] else sent
+    return "passed" if sent == [{"type": "passed"}] else sent
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:9000", "[::1]:8080", "127.1.2.3"])
@@ -106,6 +108,42 @@ def test_beyond_this_computer_a_token_is_needed() -> None:
         "secret", host=host, cookie=pair, kind="websocket", origin="http://evil.example"
     )
     assert foreign[0]["type"] == "websocket.close"
+
+
+@pytest.mark.parametrize(
+    "path", ["//evil.example/", "/\\evil.example", "/\r\nset-cookie: a=b", "/us_sim/é\0", "/"]
+)
+def test_the_token_leads_to_the_page_and_nowhere_else(path: str) -> None:
+    welcome = asked("secret", host="lab.example", path=path, query="token=secret&b=%0d%0a&a=//c")
+    headers = dict(welcome[0]["headers"])
+    assert headers[b"location"] == b"/?b=%0D%0A&a=%2F%2Fc"
+
+
+@pytest.mark.parametrize(
+    ("token", "what"),
+    [("", {}), ("", {"host": "evil.example"}), ("secret", {"query": "token=secret"})],
+)
+def test_every_answer_keeps_the_page_out_of_others(token: str, what: dict[str, Any]) -> None:
+    async def app(_: Any, __: Any, send: Any) -> None:
+        headers = [(b"content-type", b"text/html"), (b"content-length", b"27")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        for body, more in ((b"<scr", True), (b"ipt>1</script><b>", False)):
+            await send({"type": "http.response.body", "body": body, "more_body": more})
+
+    start, body = asked(token, app=app, **what)
+    headers = dict(start["headers"])
+    assert headers[b"x-frame-options"] == b"DENY"
+    assert headers[b"x-content-type-options"] == b"nosniff"
+    policy = dict(
+        each.split(" ", 1) for each in headers[b"content-security-policy"].decode().split("; ")
+    )
+    assert policy["frame-ancestors"] == policy["default-src"] == "'none'"
+    assert "'unsafe-inline'" not in policy["script-src"]
+    if start["status"] == 200:
+        number = policy["script-src"].partition("'nonce-")[2].partition("'")[0]
+        assert body["body"] == f'<script nonce="{number}">1</script><b>'.encode()
+        assert headers[b"content-length"] == b"%d" % len(body["body"])
+        assert number not in str(asked(token, app=app, **what))
 
 
 def test_loopback_is_told_from_other_addresses() -> None:

@@ -97,6 +97,31 @@ def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> N
     page.close()
 
 
+def test_no_other_page_can_frame_it_and_no_markup_runs_script(browser: Any, served: Any) -> None:
+    page = browser.new_page()
+    page.set_content(f'<iframe src="{served[0].address}"></iframe>')
+    frame = until(lambda: page.frames[1:] and page.frames[1], "there is a frame")
+    until(lambda: frame.url.startswith("chrome-error:"), "the browser refuses to fill it")
+    page.goto(served[0].address)
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.evaluate("document.body.insertAdjacentHTML('beforeend', '<b onclick=\"XSS = 1\">b</b>')")
+    page.locator("b", has_text="b").last.dispatch_event("click")
+    until(lambda: any("Content Security Policy" in text for text in said), "it is refused")
+    assert page.evaluate("window.XSS") is None
+    page.close()
+
+
+@pytest.mark.parametrize("path", ["/%1b[31m%0d%0a", "/_nicegui/%1b[31m", "/us_sim/assets/%00"])
+def test_a_path_that_is_not_there_leaves_nothing_in_the_log(
+    served: Any, caplog: Any, path: str
+) -> None:
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(served[0].address + path[1:])
+    assert refused.value.code == 404
+    assert not caplog.records
+
+
 def test_a_foreign_host_is_refused(served: Any) -> None:
     server, _ = served
     request = urllib.request.Request(server.address, headers={"Host": "evil.example"})

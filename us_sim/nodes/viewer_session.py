@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import CompressedImage
 
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 from us_sim.viewer.session import NOT_THERE, LoadableScene, SessionBoard, SessionState
 
@@ -86,7 +86,7 @@ class ViewerSession:
         self.board.tell_thumbnail(message.header.frame_id, bytes(message.data))
 
     def _offer(self, message: DiagnosticArray) -> None:
-        self.board.tell_bags({status.name: status.hardware_id for status in message.status})
+        self.board.tell_bags({shown(status.name): status.hardware_id for status in message.status})
 
     def _check(self) -> None:
         """Notice when nobody answers for the simulation any more."""
@@ -125,17 +125,18 @@ def _tell(told: Future[str], answer: Any) -> None:
 
 
 def _scene_of(status: DiagnosticStatus) -> LoadableScene:
-    about = {each.key: each.value for each in status.values}
+    about = {each.key: shown(each.value) for each in status.values}
     is_wrong = status.level != DiagnosticStatus.OK
+    said = shown(status.message)
     return LoadableScene(
-        status.name,
+        shown(status.name),
         status.hardware_id,
         about.get("kind", "scene"),
-        "" if is_wrong else status.message,
+        "" if is_wrong else said,
         about.get("region", ""),
         about.get("structures", ""),
         about.get("tracker", ""),
-        status.message if is_wrong else "",
+        said if is_wrong else "",
     )
 
 

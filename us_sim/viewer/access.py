@@ -5,12 +5,18 @@ says it comes from another origin is refused, websockets among them, for which b
 rule of their own. A name that a stranger's server lets point to this computer (DNS rebinding) is
 refused by the request's host. Beyond this computer a token is needed: it is in the address that a
 person opens, and then in a cookie (OWASP, Cross-Site WebSocket Hijacking; RFC 6454).
+
+No other page may frame this one, and scripts run only from files of the server, or where the page
+itself bears a number that is used once (W3C, Content Security Policy Level 3): a text that became
+an element of the page could not run anything.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
+import secrets
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
@@ -20,6 +26,29 @@ __all__ = ["Access", "is_loopback"]
 COOKIE = "us_sim_viewer_{port}"
 """Cookies of two servers of one computer would be one, since they do not tell ports apart."""
 _FORBIDDEN, _CLOSED = 403, 1008
+_SAFETY = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"same-origin"),
+)
+_POLICY = (
+    "default-src 'none'",
+    # Vue compiles the templates of NiceGUI's elements and ours in the browser, and NiceGUI's
+    # server calls methods of elements by `eval`.
+    "script-src 'self' 'nonce-{number}' 'unsafe-eval'",
+    # Vue and Quasar write style attributes, and the page's template has style elements.
+    "style-src 'self' 'unsafe-inline'",
+    "img-src 'self' data: blob:",  # thumbnails, and pictures that the page itself has made
+    "media-src 'self' blob:",
+    "font-src 'self'",
+    "connect-src 'self'{sockets}",
+    "worker-src 'self' blob:",
+    "base-uri 'none'",
+    "form-action 'none'",
+    "frame-ancestors 'none'",
+)
+_SCRIPT = b"<script"
+"""As NiceGUI's page has it; texts from elsewhere are in it with ``<`` escaped."""
 
 
 def is_loopback(host: str) -> bool:
@@ -48,6 +77,8 @@ class Access:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
+        if scope["type"] == "http":
+            send = _safely(scope, send)
         wrong = self._wrong(scope)
         if wrong:
             await _refuse(scope, receive, send, wrong)
@@ -85,11 +116,11 @@ class Access:
         return hmac.compare_digest(value.encode(), self._token.encode())
 
     async def _welcome(self, scope: Any, send: Any) -> None:
-        """Put the token into a cookie, and show the address without it."""
+        """Put the token into a cookie, and show the one page there is, without it."""
         query = parse_qs(scope["query_string"].decode("latin-1"))
         query.pop("token")
         rest = urlencode(query, doseq=True)
-        where = scope["path"] + (f"?{rest}" if rest else "")
+        where = f"/?{rest}" if rest else "/"
         cookie = f"{_cookie(scope)}={self._token}; Path=/; HttpOnly; SameSite=Strict"
         headers = [(b"location", where.encode()), (b"set-cookie", cookie.encode())]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
@@ -102,6 +133,40 @@ def _name(host: str) -> str:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return ""
+
+
+def _safely(scope: Any, send: Any) -> Any:
+    """What sends an answer with the headers that keep it from misuse.
+
+    Of a page, which comes whole, the scripts get the number that lets them run.
+    """
+    number = secrets.token_urlsafe(16)
+    host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
+    # Older browsers do not take websockets for part of 'self'.
+    sockets = f" ws://{host} wss://{host}" if re.fullmatch(r"[\w.:\[\]-]+", host) else ""
+    policy = "; ".join(_POLICY).format(number=number, sockets=sockets)
+    begun: dict[str, Any] = {}
+    page: list[bytes] = []
+
+    async def answer(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            headers = [*message["headers"], *_SAFETY]
+            headers.append((b"content-security-policy", policy.encode("latin-1")))
+            message = {**message, "headers": headers}
+            if dict(headers).get(b"content-type", b"").startswith(b"text/html"):
+                begun.update(message)
+                return
+        elif begun and message["type"] == "http.response.body":
+            page.append(message.get("body", b""))
+            if message.get("more_body"):
+                return
+            body = b"".join(page).replace(_SCRIPT, _SCRIPT + f' nonce="{number}"'.encode())
+            kept = [each for each in begun["headers"] if each[0] != b"content-length"]
+            await send({**begun, "headers": [*kept, (b"content-length", b"%d" % len(body))]})
+            message = {**message, "body": body}
+        await send(message)
+
+    return answer
 
 
 def _cookie(scope: Any) -> str:

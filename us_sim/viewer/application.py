@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ ASSETS = Path(__file__).parent / "assets"
 
 def application(simulator: Simulator) -> Any:
     """The ASGI application of one viewer; a process has one."""
+    # It warns of every path that is not there, as it was sent, with what a terminal obeys.
+    logging.getLogger("nicegui").setLevel(logging.ERROR)
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     app.mount("/us_sim/assets", StaticFiles(directory=ASSETS))
 

@@ -82,7 +82,7 @@ class _Modes:
     def _mark(self) -> None:
         for name, button in self._buttons.items():
             pressed = self._strips.get(name, name == self._mode)
-            button.props(f'aria-pressed="{str(pressed).lower()}"')
+            button.props["aria-pressed"] = str(pressed).lower()
 
 
 def _button(label: str, tooltip: str, on_click: Any) -> ui.button:

@@ -72,7 +72,7 @@ def build_page(simulator: Simulator) -> None:
 
 def _block(name: str) -> None:
     """An element that a module of the page fills."""
-    ui.element("div").props(f'id="{name}"')
+    ui.element("div").props["id"] = name
 
 
 def _drawer(simulator: Simulator) -> ui.right_drawer:

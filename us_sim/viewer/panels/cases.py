@@ -81,7 +81,7 @@ class _Cases:
                 card.classes("us-case-loaded")
             with ui.row().classes("us-case-row"):
                 picture = ui.image().classes("us-case-picture").props('fit="contain" no-spinner')
-                picture.props(f'alt="{scene.name}: what the probe sees"')
+                picture.props["alt"] = f"{scene.name}: what the probe sees"
                 self._pictures[scene.origin] = picture
                 with ui.column().classes("us-case-text"):
                     ui.label(scene.name.replace("_", " ")).classes("us-case-name")
@@ -95,7 +95,7 @@ class _Cases:
                 button = ui.button(
                     "Load again" if is_loaded else "Load", on_click=lambda: self._load(scene)
                 ).props("flat dense no-caps")
-                button.props(f'aria-label="Load {scene.name}"')
+                button.props["aria-label"] = f"Load {scene.name}"
                 button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
                 button.tooltip(f"Ends the scene that runs, and starts {scene.name}")
 

@@ -66,7 +66,7 @@ class ParameterControl(Element, component="parameter_control.js"):
         self._span: SliderSpan | None = None
         self.props["reason"], self.props["seen"] = "", 0
         self._show()
-        self.props(f'data-parameter="{parameter.node}.{parameter.name}"')
+        self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self.on("change", self._changed)
 
     def show(self, parameter: Parameter) -> None:

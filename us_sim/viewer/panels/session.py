@@ -123,13 +123,14 @@ class _Session:
         """Show the replay as it is, also if it was changed elsewhere."""
         plays = bool(state.replay)
         is_running = plays and state.replay_state == "playing"
-        self._play.props(f"icon={'pause' if is_running else 'play_arrow'}")
+        self._play.set_icon("pause" if is_running else "play_arrow")
         for control in (self._close, self._time):
             control.set_enabled(plays)
         self._kind.set_enabled(not plays)
         self._kind_told.set_text(KINDS_FIXED if plays else KINDS_TOLD)
-        if state.duration > 0.0:
-            self._time.props(f"max={state.duration:.2f}")
+        end = round(state.duration, 2)
+        if end not in (0.0, self._time.props["max"]):
+            self._time.props["max"] = end
         if not self._is_dragging:
             self._time.set_value(min(state.position, state.duration) if plays else 0.0)
         told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}"

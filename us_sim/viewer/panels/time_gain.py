@@ -35,7 +35,7 @@ class TimeGain(Element, component="time_gain.js"):
         self.props.update(
             {"label": label or parameter.label, "tip": tip_of(parameter), "reason": "", "seen": 0}
         )
-        self.props(f'data-parameter="{parameter.node}.{parameter.name}"')
+        self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self._name_depths(None)
         self._show()
         self.on("change", self._changed)
