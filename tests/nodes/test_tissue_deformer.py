@@ -81,6 +81,33 @@ def test_the_solver_is_switched_while_running_without_a_jump(bench, deformer):
     assert node.health.state == "msds"
 
 
+def test_a_force_out_of_balance_is_counted_and_not_sent_until_it_balances(bench, small_scene):
+    file = small_scene.with_name("haptic.yaml")
+    file.write_text(f"{small_scene.read_text()}tracker: {{source: haptic}}\n")
+    starved = {"solver": "fem_nonlinear", "fem_nonlinear.most_iterations": 1}
+    node = bench.make(TissueDeformer, scene=str(file), lockstep=True, **starved)
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    wrenches = bench.collect(WrenchStamped, "probe/wrench")
+    models = bench.collect(Float64MultiArray, "tissue/contact_model")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    for topic in ("tissue/nodes", "tissue/contact_model"):
+        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
+    press(bench, publisher, nodes, 0.012, 1)
+    assert float(node.health.values["residual"]) > 0.1
+    assert node.health.values["unbalanced"] == "1"
+    assert node.health.warning
+    relaxed = [Parameter("fem_nonlinear.most_iterations", value=440)]
+    assert node.set_parameters(relaxed)[0].successful
+    second = 2
+    while not (wrenches and models):
+        press(bench, publisher, nodes, 0.012, second)
+        second += 1
+    first = wrenches[0].header.stamp.sec
+    assert first > 1
+    assert contact_model_from(models[0]).stamp == first * 10**9
+    assert node.health.warning == ""
+
+
 def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is_in_use(
     bench, small_scene, monkeypatch
 ):

@@ -239,3 +239,7 @@ def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     packet = graph.newest("probe", lambda packet: "force" in packet.header)
     assert packet.header["force"] == [0.0, 0.5, -3.0]
     assert packet.header["stamp"] == str(9 * 10**9)
+    assert packet.header["force_age"] == 0.0
+    poses.publish(pose_at(0.012, second=11))  # without a force
+    packet = graph.newest("probe", lambda packet: packet.header["stamp"] == str(11 * 10**9))
+    assert packet.header["force_age"] == 2.0

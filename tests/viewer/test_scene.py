@@ -81,11 +81,11 @@ class Patient:
         self.push()
         self.move(np.zeros(3))
 
-    def push(self, stamp: int = 0, force_stamp: int = 0) -> None:
+    def push(self, stamp: int = 0, force_stamp: int = 0, age: float = 0.0) -> None:
         """The probe with the force on it, of stamps in ns."""
         pose = {"stamp": str(stamp), "position": [0, 0.04, 0], "quaternion": [0, 0, 0, 1]}
         pushed = pose | {"force": [0.0, 0.0, -2.5], "torque": [0.0, 0.0, 0.0]}
-        pushed["force_stamp"] = str(force_stamp)
+        pushed |= {"force_stamp": str(force_stamp), "force_age": age}
         self._offer("probe", lambda n: Packet("probe", n, pushed, b""))
 
     def move(self, shift: np.ndarray, stamp: int = 0) -> None:
@@ -414,6 +414,9 @@ def test_what_is_older_than_the_image_is_marked_until_it_is_not(
     patient.move(np.zeros(3), later)
     patient.push(later, noon)
     page.get_by_text("The force is 1.3 s older than the image").wait_for()
+    assert "us-old" in (force.get_attribute("class") or "")
+    patient.push(later, noon, age=1.3)
+    page.get_by_text("No force for 1.3 s: the tissue is not in balance").wait_for()
     assert "us-old" in (force.get_attribute("class") or "")
     patient.push(later, later)
     old.wait_for(state="hidden")

@@ -45,6 +45,10 @@ class TissueDeformer(SceneNode):
     ``tissue/contact_model`` too where a haptic arm needs it, see `ContactModelPublisher`, and
     ``tissue/structures`` where the scene has structures, see `StructureMarkers`.
 
+    Of a frame whose forces are not in balance, as on a computer with too little time, no wrench is
+    sent, nor a contact model: it would be several times what the tissue exerts. Diagnostics count
+    such frames (``unbalanced``).
+
     The method, the settings of every method and the materials are parameters that may change while
     running, see `LiveTissue`; the state is carried over. With ``compare_with`` another method runs
     on the same poses, and diagnostics say how far its nodes are from those published.
@@ -80,6 +84,8 @@ class TissueDeformer(SceneNode):
             self._structures = StructureMarkers(self, mesh)
         self._last: PoseStamped | None = None
         self._sent = mesh.nodes  # (N, 3) m
+        self._is_balanced = True  # the last frame
+        self._unbalanced = 0  # frames
         self._came = 0  # poses since `_go_on` was last called
         self.newest(PoseStamped, "probe/pose", self._deform)
         self.health.state = f"ready with {self._live.tissue.name}"
@@ -108,18 +114,21 @@ class TissueDeformer(SceneNode):
         pose = pose_from(message, "patient")
         deformation = self._live.deform(pose)
         self._describe(deformation)
-        if again and np.abs(deformation.nodes - self._sent).max() < VISIBLE_M:
+        is_felt_anew = deformation.is_balanced and not self._is_balanced
+        self._is_balanced = deformation.is_balanced
+        is_still = bool(np.abs(deformation.nodes - self._sent).max() < VISIBLE_M)
+        if again and is_still and not is_felt_anew:
             return
         self._sent = deformation.nodes
         if wanted:
             self._nodes.publish(self._cloud(deformation.nodes, stamp))
             self.health.published("tissue/nodes", stamp)
-        if felt:
+        if felt and deformation.is_balanced:
             self._wrench.publish(
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
-        if self._contact is not None and touched:
+        if self._contact is not None and touched and deformation.is_balanced:
             self._contact.publish(self._live.tissue, pose, deformation, stamp)
         if self._structures is not None and shown:
             self._structures.publish(deformation.nodes, stamp)
@@ -128,9 +137,17 @@ class TissueDeformer(SceneNode):
         """What diagnostics say of a frame."""
         if deformation.inverted:
             self.health.problem("inside out", _inside_out(deformation, self._live.tissue.name))
+        self.health.warning = ""
+        if not deformation.is_balanced:
+            self._unbalanced += 1
+            self.health.warning = (
+                f"the tissue's forces are not in balance (residual {deformation.residual:.2g}), so "
+                f"no force is sent: move the probe more slowly, or give the frames more time"
+            )
         self.health.state = self._live.state
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
+            "unbalanced": str(self._unbalanced),
             "contact_nodes": str(len(deformation.contact_nodes)),
             "action": deformation.action,
             **self._comparison(),

@@ -503,6 +503,23 @@ def test_a_live_frame_that_is_not_balanced_may_take_three_times_its_time(
     assert rest <= nearly_incompressible.settings.frame_tolerance
 
 
+def test_a_starved_solver_says_which_forces_are_not_in_balance(nearly_incompressible):
+    """A force that is not marked is right within a tenth, however little a frame may compute."""
+    poses = [at(x=0.001 * k, z=0.0025 * min(k, 8 - k)) for k in range(9)]
+    solver = made_anew(nearly_incompressible)
+    solver.frame_limit = None
+    settled = [settle(solver, pose).force[2] for pose in poses]
+    solver = made_anew(solver, most_iterations=1)
+    starved = [solver.deform(pose) for pose in poses]
+    unbalanced = [each.force[2] / most for each, most in zip(starved, settled) if most]
+    assert max(unbalanced) > 3  # it is several times the tissue's
+    for each, expected in zip(starved, settled, strict=True):
+        if each.is_balanced:
+            assert each.force[2] == pytest.approx(expected, rel=0.1, abs=0.1)
+    assert not all(each.is_balanced for each in starved)
+    assert held(solver, poses[4], 100).is_balanced
+
+
 def test_each_step_counts_as_eight_iterations_of_a_frame(nearly_incompressible, monkeypatch):
     steps = partial(steps_of_a_frame, nearly_incompressible, monkeypatch, live=None)
     unhurried, _ = steps()

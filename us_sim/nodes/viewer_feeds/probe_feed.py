@@ -74,7 +74,10 @@ class ProbeFeeds:
         if header is None:
             return None
         pushed = wrench and made_of(self._node, WrenchStamped, _WRENCH, wrench, _pushed)
-        return Packet("probe", sequence, header | (pushed or {}), b"")
+        if pushed:
+            age = 1e-9 * (int(header["stamp"]) - int(pushed["force_stamp"]))
+            header |= pushed | {"force_age": round(age, 3)}
+        return Packet("probe", sequence, header, b"")
 
 
 def _tell(message: MarkerArray, sequence: int) -> Packet:
@@ -96,5 +99,5 @@ def _pushed(message: WrenchStamped) -> dict[str, Any]:
     return {
         "force": wrench[:3].tolist(),
         "torque": wrench[3:].tolist(),
-        "force_stamp": str(nanoseconds_of(message.header.stamp)),  # the pose may be newer
+        "force_stamp": str(nanoseconds_of(message.header.stamp)),
     }

@@ -12,6 +12,7 @@ True
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -71,6 +72,9 @@ class TissueSolver(ABC):
     """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
+    most_unbalanced: ClassVar[float] = math.inf
+    """Residual beyond which the contact forces are no longer those of the pose. Infinite where
+    inertia holds the rest, as in a dynamic method."""
 
     def __init__(
         self,
@@ -103,6 +107,8 @@ class TissueSolver(ABC):
         if self._is_plausible(deformation):
             self._pose = probe_pose
             self._failures = 0
+            if deformation.residual > self.most_unbalanced:
+                deformation = replace(deformation, is_balanced=False)
         else:
             deformation = self._recovered(good)
         self._last = deformation
@@ -125,7 +131,7 @@ class TissueSolver(ABC):
                 f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
             )
         self._settled = False
-        return replace(self._last, action=action)
+        return replace(self._last, action=action, is_balanced=False)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""

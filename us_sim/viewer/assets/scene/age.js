@@ -73,7 +73,11 @@ setInterval(() => {
   probe.markForce(found.has("force"));
   badge.hidden = !found.size;
   if (badge.hidden) return;
-  const what = found.size === 1 && found.has("force") ? "The force" : "The 3D view";
-  const words = `${what} is ${(Math.max(...found.values()) / 1000).toFixed(1)} s older than the image`;
+  const seconds = (Math.max(...found.values()) / 1000).toFixed(1);
+  const isForce = found.size === 1 && found.has("force");
+  // Poses came since, and none with a force: it is not that this page is slow.
+  const words = isForce && probe.pose?.force_age > OLD_MS / 1000
+    ? `No force for ${seconds} s: the tissue is not in balance`
+    : `${isForce ? "The force" : "The 3D view"} is ${seconds} s older than the image`;
   if (badge.textContent !== words) badge.textContent = words;
 }, LOOK_MS);

@@ -217,7 +217,7 @@ export const probe = {
   body,
   image,
 
-  /** The newest {position, quaternion, force, torque, stamp}, or null. */
+  /** The newest {position, quaternion, stamp, force, torque, force_stamp, force_age}, or null; s. */
   get pose() {
     return last;
   },
