@@ -19,6 +19,8 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.skin.surface import bent_surface
+from us_sim.viewer.feed import Feed
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
 from us_sim.viewer.session import SessionBoard, SessionState
 from us_sim.viewer.simulator import Simulator
 
@@ -102,6 +104,25 @@ def test_it_begins_on_the_skin_and_repeats_the_pose_at_rest(bench, page, tracked
     gaps = np.diff([nanoseconds_of(pose.header.stamp) for pose in tracked]) * 1e-9
     assert 0.15 < np.median(gaps) < 0.45  # images are stale after 0.5 s
     assert {pose.header.frame_id for pose in tracked} == {"patient"}
+
+
+def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_moved(
+    bench, page, tracked
+):
+    page.open()
+    bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
+    simulator = page._holder.simulator
+    overlay = Parameter("slice_interpolator", "overlay", Kind.TEXT, "velocity")
+    simulator.nodes.tell(NodeParameters("slice_interpolator", State.THERE, {"overlay": overlay}))
+    for kind in ("m_mode", "spectrum", "annotated"):
+        simulator.add(Feed(kind))
+        simulator.feeds[kind].watch(page.nothing)
+        bench.spin_until(lambda: not page.state["is_resting"])
+        count, began = len(tracked), time.monotonic()
+        bench.spin_until(lambda count=count: len(tracked) > count + 15)
+        assert time.monotonic() - began < 2.0  # at rest it takes three seconds
+        simulator.feeds[kind].unwatch(page.nothing)
+        bench.spin_until(lambda: page.state["is_resting"])
 
 
 def test_a_press_sets_out_at_once_and_ends_where_it_was_wanted(bench, page, tracked):

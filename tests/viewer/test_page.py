@@ -76,10 +76,16 @@ def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
 
 
 def test_the_header_says_why_few_images_come_at_rest(page: Any, simulator: Simulator) -> None:
-    feeds_of(simulator)
+    image, _ = feeds_of(simulator)
+    hand = Feed("hand")
+    simulator.add(hand)
+    state = {"leader": "hand", "is_resting": True}
+    hand.offer(lambda sequence: Packet("hand", sequence, state, b""))
     page.goto(page.address)
     page.locator("#readout").get_by_text("0 images/s").wait_for()
-    assert "a few a second while nothing moves" in page.locator("#readout").get_attribute("title")
+    assert "while nothing moves, a few a second" in page.locator("#readout").get_attribute("title")
+    offer(image, np.zeros((1, 1), np.uint8))
+    page.locator("#readout").get_by_text("at rest", exact=True).wait_for()
 
 
 def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> None:

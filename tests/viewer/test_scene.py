@@ -95,6 +95,11 @@ class Patient:
             "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=stamp)
         )
 
+    def strain(self, values: np.ndarray) -> None:
+        """Of each node."""
+        header = {"stamp": "0", "mesh": self.tissue.number, "points": len(values)}
+        self._offer("strain", lambda n: Packet("strain", n, header, values.tobytes()))
+
     def show(self, grey: int, stamp: int = 0) -> None:
         """An image all in one grey, 0 to 255."""
         header = {"stamp": str(stamp), "rows": 48, "columns": 64, "encoding": "mono8"}
@@ -299,6 +304,14 @@ def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_on
             break
         scene.page.wait_for_timeout(50)
     assert feeds["strain"].is_watched
+    # One crushed node of the surface does not make all others look unstrained.
+    strains = np.linspace(0.0, 0.04, len(MESH.nodes), dtype=np.float32)
+    strains[0] = 0.9
+    scene.patient.strain(strains)
+    scene.page.wait_for_function(
+        "() => document.querySelector('.us-colour-bar').innerText.trim().endsWith('5')",
+        timeout=LIMIT_MS,
+    )
     scene.page.click("[data-tissue=off]")
     bar.wait_for(state="hidden", timeout=LIMIT_MS)
 

@@ -149,8 +149,8 @@ TOPICS = (
     Topic(
         "probe/wrench",
         "geometry_msgs/WrenchStamped",
-        "the tissue's force and torque on the probe, in frame `probe`; none for a pose at which the "
-        "tissue's forces are not in balance",
+        "the tissue's force and torque on the probe, in frame `probe`; none for a pose at which "
+        "the tissue's forces are not in balance",
         publishers=("tissue_deformer",),
         subscribers=("viewer",),
     ),

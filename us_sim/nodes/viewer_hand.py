@@ -59,7 +59,8 @@ class ViewerHand:
 
     It publishes only while a page watches and nobody else does: a driver or a player leads as long
     as it has a publisher, and the hand goes on from where that has left the probe. Poses come as
-    soon as a page asks, `MOVING` times a second while the probe moves, `RESTING` while it rests.
+    soon as a page asks, `MOVING` times a second while the probe moves or a page watches what goes
+    on by itself, such as blood, and `RESTING` else.
 
     Args:
         node: that publishes.
@@ -73,6 +74,7 @@ class ViewerHand:
     ) -> None:
         self._node, self._post, self._rest = node, post, rest
         self.feed = Feed("hand", self._watched, STATE_RATE)
+        self._simulator = simulator
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
         simulator.commands["take"] = self._ask_for_probe
@@ -157,6 +159,8 @@ class ViewerHand:
             self._take()
         if self._moving_timer.is_canceled():
             self._publish()
+            if self._simulator.is_changing_by_itself:
+                self._moving_timer.reset()
 
     def _lead_now(self) -> Lead:
         """Who moves the probe; the hand, if there is also somewhere to begin."""
@@ -219,7 +223,7 @@ class ViewerHand:
         if self._publisher is None or self._motion is None or self._standing is None:
             self._elsewhere, self._is_found = pose, True
         elif (
-            self._moving_timer.is_canceled()
+            self._motion.is_at_rest
             and time.monotonic() - self._rests_since > SETTLED
             and not self._warning
         ):
@@ -256,12 +260,14 @@ class ViewerHand:
         if self._publisher is None or self._motion is None:
             self._moving_timer.cancel()
             return
-        self._motion.advance(min(time.monotonic() - self._sent_at, longest))
+        if not self._motion.is_at_rest:
+            self._motion.advance(min(time.monotonic() - self._sent_at, longest))
+            self._rests_since = time.monotonic()
         self._publish()
-        if self._motion.is_at_rest:
+        if self._motion.is_at_rest and not self._simulator.is_changing_by_itself:
             self._moving_timer.cancel()
             self._resting_timer.reset()
-            self._rests_since = time.monotonic()
+            self._tell()
 
     def _publish(self) -> None:
         """Where the probe is held."""
@@ -287,6 +293,7 @@ class ViewerHand:
             "leader": self._lead.who,
             "holder": self.asked.holder,
             "is_moving": self.asked.is_moving,
+            "is_resting": self._publisher is not None and self._moving_timer.is_canceled(),
             "obstacle": self._lead.obstacle,
             "can_take": self._lead.can_take,
             "warning": self._warning,

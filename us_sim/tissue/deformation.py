@@ -28,7 +28,7 @@ class Deformation:
     residual: float  # unbalanced force over contact force, of the solver's own equations
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
-    is_balanced: bool = True  # False: force and torque are an unfinished frame's, or an older pose's
+    is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
 
 
 @dataclass(frozen=True, eq=False)

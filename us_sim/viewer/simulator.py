@@ -29,6 +29,17 @@ class Simulator:
     leaving: list[Callable[[int], object]] = field(default_factory=list)
     """Called with a page's number when it has gone."""
 
+    @property
+    def is_changing_by_itself(self) -> bool:
+        """Whether a page watches what goes on while the probe rests: blood, or a strip of time."""
+
+        def watched(kind: str) -> bool:
+            return kind in self.feeds and self.feeds[kind].is_watched
+
+        overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
+        colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
+        return colours or watched("m_mode") or watched("spectrum")
+
     def add(self, *feeds: Feed) -> None:
         """Let pages watch these."""
         self.feeds |= {feed.kind: feed for feed in feeds}

@@ -1,22 +1,25 @@
 /** The header: whether the viewer answers, and how many images come. */
 
 import { element, events } from "./events.js";
+import { stream } from "./stream.js";
 
 const WINDOW_MS = 2000;
 const times = [];
 
 const readout = await element("readout");
 readout.setAttribute("role", "status");
-readout.title = "Ultrasound images drawn in this page: only a few a second while nothing moves";
+readout.title = "Ultrasound images drawn in this page; at rest, while nothing moves, a few a second";
 
 let connected = false;
 let frozen = false;
+let resting = false; // fewer images are sent on purpose
 
 function show() {
   const now = performance.now();
   while (times.length && now - times[0] > WINDOW_MS) times.shift();
   const rate = (1000 * times.length) / WINDOW_MS;
-  const rated = frozen ? "frozen" : `${rate.toFixed(0)} images/s`;
+  const live = resting && times.length ? "at rest" : `${rate.toFixed(0)} images/s`;
+  const rated = frozen ? "frozen" : live;
   const words = connected ? rated : "the viewer does not answer";
   if (readout.textContent !== words) readout.textContent = words;
   readout.classList.toggle("us-wrong", !connected);
@@ -28,6 +31,10 @@ events.on("connection", (open) => {
 });
 events.on("image-frozen", (on) => {
   frozen = on;
+  show();
+});
+stream.on("hand", ({ is_resting: is }) => {
+  resting = is;
   show();
 });
 let drawn = 0;

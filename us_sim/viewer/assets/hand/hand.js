@@ -21,7 +21,7 @@ let isDue = false;
 const handlers = [];
 
 export const hand = {
-  /** The newest of the viewer: {leader, holder, is_moving, obstacle, warning, stance, goal, range}, or null. */
+  /** The newest of the viewer: {leader, holder, is_moving, is_resting, obstacle, warning, stance, goal, range}, or null. */
   state: null,
 
   /** Have `handler(state)` called with each newer state. */

@@ -17,7 +17,9 @@ const VISIBLE = 2e-5;
 const PLAIN = [0.36, 0.42, 0.47];
 /** The largest values that a colour bar may end at, over a power of ten. */
 const ROUND = [1, 2, 3, 5, 10];
-const LEAST = { displacement: 2, strain: 10 };
+const LEAST = { displacement: 2, strain: 1 };
+/** Part of the nodes that are drawn whose strain lies within the bar: a few corners need not. */
+const HELD = 0.95;
 
 const lines = new THREE.LineSegments(
   new THREE.BufferGeometry(),
@@ -95,10 +97,12 @@ function values() {
   return lengths;
 }
 
-/** The bar's end: a round number that holds all, and does not go down at each breath. */
+/** The bar's end: a round number that holds what is drawn, and does not go down at each breath. */
 function endOf(found) {
-  let most = LEAST[mode];
-  for (const value of found) if (value > most) most = value;
+  const drawn = new Set(points.edges);
+  const sorted = Float32Array.from(drawn, (n) => found[n]).sort();
+  const last = sorted.length - 1;
+  const most = Math.max(LEAST[mode], sorted[mode === "strain" ? Math.floor(HELD * last) : last] ?? 0);
   if (most <= largest && most > 0.4 * largest) return largest;
   const power = 10 ** Math.floor(Math.log10(most));
   largest = power * ROUND.find((step) => step * power >= most * 0.999);
