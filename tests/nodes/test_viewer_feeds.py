@@ -22,7 +22,8 @@ class Watcher(GuardedNode):
         super().__init__("watcher", **kwargs)
         self.health = Health(self, "test")
         self.post = Posted(self)
-        self.feeds = {feed.kind: feed for feed in image_feeds(self, self.post, 30.0)}
+        feeds = image_feeds(self, self.post, 30.0, lambda stamp: {"known": stamp})
+        self.feeds = {feed.kind: feed for feed in feeds}
 
 
 @pytest.fixture
@@ -73,6 +74,7 @@ def test_pixels_and_stamp_come_as_they_were_published(bench, watcher):
         "rows": 40,
         "columns": 30,
         "encoding": "mono8",
+        "known": 7000000009,
     }
     np.testing.assert_array_equal(np.frombuffer(packet.payload, np.uint8).reshape(40, 30), pixels)
 
@@ -110,14 +112,22 @@ def test_a_jpeg_of_speckle_is_near_what_it_was(bench, watcher):
     assert len(packet.payload) < 0.5 * smooth.size
 
 
-def test_where_the_pixels_are_is_latched(bench, watcher):
+def test_an_image_says_where_its_pixels_are_and_what_else_is_known(bench, watcher):
     matrix = np.array([[1e-4, 0, 0, -0.02], [0, 0, 1, 0], [0, 2e-4, 0, 1e-4], [0, 0, 0, 1.0]])
-    publisher = bench.peer.create_publisher(Float64MultiArray, "ultrasound/image_to_probe", LATCHED)
-    publisher.publish(affine_message(matrix))
-    feed = watcher.feeds["image_geometry"]
+    places = bench.peer.create_publisher(Float64MultiArray, "ultrasound/image_to_probe", LATCHED)
+    places.publish(affine_message(matrix))
+    feed = watcher.feeds["image"]
     feed.watch(nothing)
-    bench.spin_until(lambda: feed.sequence == 1)
-    assert feed.newest().header["matrix"] == matrix.ravel().tolist()
+    publisher = bench.publisher(Image, "ultrasound/image")
+
+    def header():
+        publisher.publish(image_message(speckle(4, 4), Time(sec=7), "probe"))
+        newest = feed.newest()
+        return newest.header if newest and "matrix" in newest.header else None
+
+    bench.spin_until(header)
+    assert header()["matrix"] == matrix.ravel().tolist()
+    assert header()["known"] == 7 * 10**9
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,10 @@ def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracke
     assert answers[-1] == ("page", 2)
     moved = [a for a, pose in zip(answers, tracked, strict=True) if pose.pose.position.x > 1e-6]
     assert moved[0] is not None
+    pressed = [hand.press(nanoseconds_of(pose.header.stamp), None) for pose in tracked]
+    assert pressed == pytest.approx([depth(pose) for pose in tracked])
+    assert hand.press(7, None) is None
+    assert hand.press(7, [0.01, 0.0, 0.004]) == pytest.approx(0.004)  # of somebody else's pose
 
 
 def test_the_page_that_moved_the_probe_last_holds_it_until_another_does_or_it_goes(

@@ -62,8 +62,9 @@ def graph(bench: Bench) -> SimpleNamespace:
     post = Posted(node)
     feeds: dict[str, Feed] = {}
     rest = RestMesh(node)
-    for made in (SkinFeeds, ProbeFeeds):
-        feeds |= {feed.kind: feed for feed in made(node, post, 30.0).feeds}
+    probe = ProbeFeeds(node, post, 30.0)
+    for made in (SkinFeeds(node, post, 30.0), probe):
+        feeds |= {feed.kind: feed for feed in made.feeds}
     feeds |= {feed.kind: feed for feed in TissueFeeds(node, post, 30.0, rest).feeds}
     feeds["structures"] = StructuresFeed(node, post, rest).feed
 
@@ -84,7 +85,8 @@ def graph(bench: Bench) -> SimpleNamespace:
         kept.append(publisher)
 
     kept: list[object] = []
-    return SimpleNamespace(bench=bench, node=node, feeds=feeds, newest=newest, latch=latch)
+    told = {"feeds": feeds, "newest": newest, "latch": latch, "probe": probe}
+    return SimpleNamespace(bench=bench, node=node, **told)
 
 
 def test_nothing_is_subscribed_to_while_no_page_watches(graph):
@@ -243,3 +245,7 @@ def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     poses.publish(pose_at(0.012, second=11))  # without a force
     packet = graph.newest("probe", lambda packet: packet.header["stamp"] == str(11 * 10**9))
     assert packet.header["force_age"] == 2.0
+    of_nine = graph.probe.at(str(9 * 10**9))
+    assert (of_nine["position"][2], of_nine["force"]) == (0.012, [0.0, 0.5, -3.0])
+    assert "force" not in graph.probe.at(str(11 * 10**9))
+    assert graph.probe.at("7") == {}

@@ -14,18 +14,15 @@ STANCE = {"x": 0.012, "y": 0.0, "z": 0.0, "press": 0.0042, "rotation": 0.0, "fan
 
 
 class FakeHand:
-    """Feeds ``image``, ``image_geometry`` and ``hand``, and the command ``hand``."""
+    """Feeds ``image`` and ``hand``, and the command ``hand``."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.asked: list[dict[str, Any]] = []
-        self.image, self.geometry = Feed("image", rate=None), Feed("image_geometry", rate=None)
-        self.state = Feed("hand", rate=None)
-        simulator.add(self.image, self.geometry, self.state)
+        self.image, self.state = Feed("image", rate=None), Feed("hand", rate=None)
+        simulator.add(self.image, self.state)
         simulator.commands["hand"] = self._take
         simulator.commands["take"] = self._take_over
         self.takes: list[Any] = []  # pages that were to take the probe
-        matrix = {"matrix": MATRIX}
-        self.geometry.offer(lambda n: Packet("image_geometry", n, matrix, b""))
         self.say()
         self.show()
 
@@ -44,7 +41,8 @@ class FakeHand:
         self.state.offer(lambda n: Packet("hand", n, header, b""))
 
     def show(self, **told: Any) -> None:
-        header = {"stamp": "1", "rows": 320, "columns": 320, "encoding": "mono8", **told}
+        header = {"stamp": "1", "rows": 320, "columns": 320, "encoding": "mono8"}
+        header |= {"matrix": MATRIX, **told}
         self.image.offer(lambda n: Packet("image", n, header, bytes(320 * 320)))
 
     def total(self, name: str) -> Any:

@@ -182,6 +182,21 @@ def test_dragging_sideways_slides_and_the_wheel_presses(page: Any, viewer: FakeH
     viewer.until(lambda: viewer.total("press") == pytest.approx(1.5e-3))
 
 
+def test_over_a_frozen_image_the_probe_stays_and_that_is_said(page: Any, viewer: FakeHand) -> None:
+    box = box_of_image(page)
+    x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    page.keyboard.press("Space")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x, y + 60, steps=4)
+    page.mouse.up()
+    page.mouse.wheel(0, 300)
+    assert "is frozen" in page.locator(".us-stale").inner_text()
+    page.keyboard.press("q")  # what the page sends comes in order
+    viewer.until(lambda: viewer.asked)
+    assert [[*wish["by"]] for wish in viewer.asked] == [["rotation"]]
+
+
 def test_a_burst_of_movements_is_one_wish_a_picture(page: Any, viewer: FakeHand) -> None:
     took = page.evaluate(
         """() => {

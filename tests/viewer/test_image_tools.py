@@ -20,15 +20,15 @@ TOOLS = "/us_sim/assets/image_tools"
 
 
 class Images:
-    """Images whose grey value is their number."""
+    """Images whose grey value is their number, each a second after the one before."""
 
     def __init__(self, simulator: Simulator) -> None:
-        self.feed, geometry = Feed("image", rate=None), Feed("image_geometry", rate=None)
-        simulator.add(self.feed, geometry)
-        geometry.offer(lambda n: Packet("image_geometry", n, {"matrix": MATRIX}, b""))
+        self.feed = Feed("image", rate=None)
+        simulator.add(self.feed)
 
-    def show(self, grey: int) -> None:
-        header = {"stamp": str(grey), "rows": ROWS, "columns": COLUMNS, "encoding": "mono8"}
+    def show(self, grey: int, **known: Any) -> None:
+        stamp = {"stamp": str(grey * 10**9), "encoding": "mono8"}
+        header = {"rows": ROWS, "columns": COLUMNS, "matrix": MATRIX, **stamp, **known}
         self.feed.offer(lambda n: Packet("image", n, header, bytes([grey]) * (ROWS * COLUMNS)))
 
 
@@ -64,8 +64,6 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.goto(served[0].address)
     page.get_by_text("Waiting for the first image").wait_for()
-    known = "import('/us_sim/assets/image.js').then(m => m.pixelToMillimetres(0, 0) !== null)"
-    until(lambda: page.evaluate(known), "the pixels' places are known")
     page.set_viewport_size({"width": 1100, "height": 720})  # which has the scale drawn
     page.wait_for_function("document.querySelector('.us-scale').width > 300")
     drawn = """() => {
@@ -85,6 +83,7 @@ def test_nothing_is_drawn_or_measured_before_the_first_image(
     for key in (" ", "c", ",", "."):
         page.keyboard.press(key)
     assert not page.evaluate(f"import('{TOOLS}/freeze.js').then(m => m.freeze.isFrozen)")
+    page.keyboard.press("p")
     assert page.evaluate(f"import('{TOOLS}/picture.js').then(m => m.picture())") is None
     simulator.feeds["image"] = images.feed
     page.evaluate("import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())")
@@ -152,6 +151,12 @@ def test_the_area_of_an_ellipse_and_its_circumference(page: Any) -> None:
     assert circumference == pytest.approx(42.3656, abs=0.5)  # SciPy: 4 a E(1 - b²/a²)
     page.keyboard.press("x")
     assert values(page) == []
+    page.keyboard.press("x")
+    assert len(values(page)) == 1  # and back
+    page.get_by_role("button", name="Remove ").click()
+    assert values(page) == []
+    page.keyboard.press("Control+z")
+    assert len(values(page)) == 1
 
 
 @pytest.mark.parametrize(
@@ -204,12 +209,45 @@ def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
     await_grey(page, 120)
 
 
+def test_a_measure_is_seen_with_its_frame_only(page: Any, images: Images) -> None:
+    other = [*MATRIX[:9], 2 * DOWN, *MATRIX[10:]]  # as deep again
+    images.show(41, matrix=other)
+    await_grey(page, 41)
+    images.show(42)
+    await_grey(page, 42)
+    page.keyboard.press("d")
+    images.show(43)
+    drag(page, at(page, 0, 10), at(page, 0, 30))  # of 42: who takes a tool freezes
+    assert values(page) == ["20.0 mm"]
+    page.keyboard.press(",")
+    await_grey(page, 41)
+    assert values(page) == []
+    page.keyboard.press("d")
+    drag(page, at(page, 0, 10), at(page, 0, 30))
+    assert values(page) == ["40.0 mm"]
+    page.keyboard.press(".")
+    await_grey(page, 42)
+    assert values(page) == ["20.0 mm"]
+    page.keyboard.press(" ")
+    images.show(44, scene="liver")
+    await_grey(page, 44)
+    assert values(page) == []
+    assert page.locator(".us-handle").count() == 0
+    page.keyboard.press(" ")
+    for grey in (43, 42):
+        page.keyboard.press(",")
+        await_grey(page, grey)
+    assert values(page) == ["20.0 mm"]
+
+
 def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> None:
     kept = page.evaluate(
         f"""() => import('{TOOLS}/cine.js').then(({{ Cine }}) => {{
             const slow = new Cine(), large = new Cine();
-            for (let i = 0; i < 900; i++) slow.keep({{ i }}, new Uint8Array(100), i * 1000 / 30);
-            for (let i = 0; i < 200; i++) large.keep({{ i }}, {{ byteLength: 2 ** 20 }}, i);
+            const frame = (i, byteLength, time) =>
+                ({{ header: {{ i }}, payload: {{ byteLength }}, time }});
+            for (let i = 0; i < 900; i++) slow.keep(frame(i, 100, i * 1000 / 30));
+            for (let i = 0; i < 200; i++) large.keep(frame(i, 2 ** 20, i));
             const told = c => [c.frames.length, c.frames[0].header.i, c.bytes, c.duration];
             return [told(slow), told(large), slow.at(5000), slow.at(-1), slow.at(1e9)];
         }})"""
@@ -220,15 +258,22 @@ def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> Non
     assert numbers == [150, 0, 300]
 
 
-def test_the_kept_picture_has_the_image_its_scale_and_the_values(page: Any, tmp_path: Path) -> None:
-    page.evaluate("usSim.scene = () => 'upper_arm'")
+def test_the_kept_picture_has_the_image_its_scale_and_the_values(
+    page: Any, images: Images, tmp_path: Path
+) -> None:
+    images.show(40, press=0.0042, force=3.14, scene="upper_arm", settings={"gain": "6 dB"})
+    shown = "import('/us_sim/assets/image.js').then(m => m.frameShown())"
+    until(lambda: page.evaluate(f"{shown}.then(frame => frame.header.press)"), "the newer one")
     page.keyboard.press("d")
+    images.show(80, press=0.02, force=99)  # which is not the one that is measured
     drag(page, at(page, -10, 20), at(page, 10, 20))
     with page.expect_download() as download:
         page.keyboard.press("p")
     name = download.value.suggested_filename
-    assert name.startswith("us_sim-20")
-    assert name.endswith(".png")
+    when = page.evaluate("new Date(40000).toLocaleString('sv-SE').replace(/[^0-9]+/g, '-')")
+    assert name == f"us_sim-{when}-000.png"
+    facts = page.locator(".us-facts").inner_text()
+    assert facts.split(" · ")[1:] == ["depth 42.0 mm", "gain 6 dB", "press 4.2 mm", "force 3.1 N"]
     file = tmp_path / name
     download.value.save_as(file)
     picture = cv2.imread(str(file))
@@ -251,6 +296,7 @@ def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> 
     encoded = cv2.imencode(".jpg", np.full((rows, columns, 3), 90, np.uint8))[1].tobytes()
     feed = Feed("annotated", rate=None)
     header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "jpeg"}
+    header["matrix"] = MATRIX
     feed.offer(lambda n: Packet("annotated", n, header, encoded))
     simulator.add(feed)
     page.evaluate("import('/us_sim/assets/image.js').then(m => m.setMode('annotated'))")
@@ -268,14 +314,15 @@ def test_the_annotated_picture_is_measured_as_the_image_below_it(
 ) -> None:
     page.keyboard.press("d")
     drag(page, at(page, -8, 5), at(page, 4, 5))
+    lengths = values(page)
+    page.keyboard.press(" ")
     show_annotated(page, simulator, COLUMNS, ROWS)
     page.get_by_role("button", name="Distance", exact=True).click()
     drag(page, at(page, 0, 6), at(page, 0, 33))
-    lengths = [float(value.split()[0]) for value in values(page)]
-    assert lengths == pytest.approx([12, 27], abs=0.1)
+    lengths += values(page)
+    assert [float(each.split()[0]) for each in lengths] == pytest.approx([12, 27], abs=0.1)
     scale = page.locator(".us-scale")
     assert not scale.is_visible()  # that picture has scales of its own
-    page.keyboard.press(" ")
     page.keyboard.press(",")  # the image before it, which has not
     scale.wait_for()
 

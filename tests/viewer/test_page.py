@@ -31,14 +31,14 @@ READ = """() => {
 def offer(feed: Feed, pixels: Any) -> None:
     rows, columns = pixels.shape
     header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "mono8"}
+    header["matrix"] = MATRIX
     feed.offer(lambda sequence: Packet("image", sequence, header, pixels.tobytes()))
 
 
 def feeds_of(simulator: Simulator) -> tuple[Feed, list[bool]]:
     told: list[bool] = []
-    image, geometry = Feed("image", told.append), Feed("image_geometry", rate=None)
-    geometry.offer(lambda sequence: Packet("image_geometry", sequence, {"matrix": MATRIX}, b""))
-    simulator.add(image, geometry)
+    image = Feed("image", told.append)
+    simulator.add(image)
     return image, told
 
 

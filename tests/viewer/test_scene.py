@@ -66,17 +66,13 @@ class Patient:
             "probe_mesh",
             "probe",
         ]
-        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "image_geometry"]}
+        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image"]}
         simulator.add(*self.feeds.values())
         self._offer("skin_mesh", lambda n: self.skin.told("skin_mesh", n))
         self._offer("tissue_mesh", lambda n: self.tissue.told("tissue_mesh", n))
         self._offer("structures", lambda n: structures.told("structures", n, self.tissue.number))
         outline = image_outline(PROBE)
         self._offer("probe_mesh", lambda n: transducer_packet("probe_mesh", n, parts, outline))
-        matrix = PROBE.image_to_probe.ravel().tolist()
-        self._offer(
-            "image_geometry", lambda n: Packet("image_geometry", n, {"matrix": matrix}, b"")
-        )
         self.show(200)
         self.push()
         self.move(np.zeros(3))
@@ -103,6 +99,7 @@ class Patient:
     def show(self, grey: int, stamp: int = 0) -> None:
         """An image all in one grey, 0 to 255."""
         header = {"stamp": str(stamp), "rows": 48, "columns": 64, "encoding": "mono8"}
+        header["matrix"] = PROBE.image_to_probe.ravel().tolist()
         self._offer("image", lambda n: Packet("image", n, header, bytes([grey]) * (48 * 64)))
 
     def _offer(self, kind: str, pack: Callable[[int], Packet]) -> None:

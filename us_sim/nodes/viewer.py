@@ -6,6 +6,8 @@ import os
 import sys
 from typing import Any
 
+import numpy as np
+
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
@@ -21,11 +23,16 @@ from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.nodes.viewer_session import ViewerSession
+from us_sim.viewer.parameters import in_words
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = ["Viewer", "main"]
+
+
+IMAGED_WITH = ("gain", "dynamic_range", "focus")
+"""Parameters of ``slice_interpolator`` that pages are told with each image."""
 
 
 class Viewer(GuardedNode):
@@ -47,9 +54,10 @@ class Viewer(GuardedNode):
         )
         rest = RestMesh(self)
         hand = ViewerHand(self, self.post, self.simulator, rest)
-        self.simulator.add(*image_feeds(self, self.post, settings.rate, hand.asked.by))
-        for bodies in (SkinFeeds, ProbeFeeds):
-            self.simulator.add(*bodies(self, self.post, settings.rate).feeds)
+        self.simulator.add(*image_feeds(self, self.post, settings.rate, self._known))
+        probe = ProbeFeeds(self, self.post, settings.rate)
+        self._hand, self._probe = hand, probe
+        self.simulator.add(*SkinFeeds(self, self.post, settings.rate).feeds, *probe.feeds)
         self.simulator.add(*TissueFeeds(self, self.post, settings.rate, rest).feeds)
         self.simulator.add(StructuresFeed(self, self.post, rest).feed)
         self._server = WebServer(
@@ -63,6 +71,27 @@ class Viewer(GuardedNode):
                 f"the viewer listens at {settings.host}, for other computers, too: whoever has "
                 f"the address with its token can see and move everything, and nothing is encrypted"
             )
+
+    def _known(self, stamp: int) -> dict[str, Any]:
+        """For pages, beside the image of a stamp (ns): the scene, and how the probe was then.
+
+        m and N; settings in the unit that a person reads. ``command`` is the page, and its number
+        for it, of the last wish that is seen in the image; so the page can tell how long that took.
+        """
+        probe = self._probe.at(str(stamp))
+        parameters = self.simulator.nodes.of("slice_interpolator").parameters
+        told = {
+            "command": self._hand.asked.by(stamp),
+            "press": self._hand.press(stamp, probe.get("position")),
+            "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
+            "scene": self.simulator.session.state.scene or None,
+            "settings": {
+                in_words(name): f"{parameter.value:g} {parameter.unit}"
+                for name in IMAGED_WITH
+                if (parameter := parameters.get(name)) is not None and parameter.value is not None
+            },
+        }
+        return {name: value for name, value in told.items() if value is not None}
 
     def destroy_node(self) -> None:
         """End the web server first."""

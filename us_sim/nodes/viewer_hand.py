@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from numpy.typing import ArrayLike
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
@@ -50,6 +51,8 @@ LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
 NEAR = 0.02
 """m from the old place to a new surface: it is another one of the same patient."""
+KEPT = 512
+"""Poses whose press is remembered until their image is made."""
 ASTRAY, SETTLED = 3e-3, 1.0
 """m, and s of rest, from which on the tracked probe is not where it was put."""
 
@@ -90,12 +93,25 @@ class ViewerHand:
         self._elsewhere: Pose | None = None  # where somebody else has the probe
         self._last_stamp = 0  # ns, of the last pose
         self.asked = AskedPoses()
+        self._presses: dict[int, float] = {}  # m, by stamp, ns
         self._sent_at = self._rests_since = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
         self._moving_timer.cancel()
         self._resting_timer.cancel()
+
+    def press(self, stamp: int, position: ArrayLike | None) -> float | None:
+        """How deep (m) the probe is pressed, see `Stance`; None while that is not known.
+
+        Args:
+            stamp: ns, of its pose: if the hand has published that it is known.
+            position: (3,) m, where it is; if not, it is looked for on the skin.
+        """
+        known, surface = self._presses.get(stamp), self._standing
+        if known is not None or surface is None or position is None:
+            return known
+        return surface.under(np.asarray(position, dtype=np.float64))[1]
 
     def _command(self, value: Any, page: int) -> str | None:
         """What a page sent, in its thread; why it is not done, or None."""
@@ -275,7 +291,11 @@ class ViewerHand:
         assert self._standing is not None
         stamp = self._node.get_clock().now()
         self._last_stamp = stamp.nanoseconds
-        pose = self._motion.stance.pose(self._standing)
+        stance = self._motion.stance
+        pose = stance.pose(self._standing)
+        self._presses[stamp.nanoseconds] = stance.press
+        if len(self._presses) > KEPT:
+            del self._presses[next(iter(self._presses))]
         self.asked.published(stamp.nanoseconds)  # said first: its image may be there at once
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()

@@ -16,7 +16,6 @@ __all__ = ["STREAMED", "Taker"]
 
 STREAMED = (
     "image",
-    "image_geometry",
     "skin_mesh",
     "skin",
     "structures_mesh",

@@ -1,4 +1,4 @@
-"""The images of ``ultrasound/…``, as pixels or as JPEG, and where the pixels are."""
+"""The images of ``ultrasound/…``, as pixels or as JPEG, with what is known of each."""
 
 from __future__ import annotations
 
@@ -25,52 +25,49 @@ __all__ = ["image_feeds"]
 
 _QUALITY = 90
 """Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
-_COLOURS = {
-    "annotated": "ultrasound/image_annotated",
-    "m_mode": "ultrasound/m_mode",
-    "spectrum": "ultrasound/spectrum",
-}
-"""Streams of pictures in colour, and their topics."""
+_STRIPS = {"m_mode": "ultrasound/m_mode", "spectrum": "ultrasound/spectrum"}
+"""Streams of what runs over time, and their topics."""
 
-
-AskedBy = Callable[[int], tuple[str, int] | None]
+Known = Callable[[int], dict[str, Any]]
 
 
 def image_feeds(
-    node: GuardedNode, post: Posted, rate: float, asked_by: AskedBy = lambda _: None
+    node: GuardedNode, post: Posted, rate: float, known: Known = lambda _: {}
 ) -> list[Feed]:
-    """The B-mode image as ``image`` and ``image_jpeg``, its ``image_geometry``, and pictures.
+    """The B-mode image as ``image`` and ``image_jpeg``, and pictures in colour.
+
+    The header of a B-mode image, and of the annotated one, says where its pixels are (``matrix``).
 
     Args:
         node: that subscribes.
         post: has work done in the node's thread.
         rate: Hz, of images, at most, for each page.
-        asked_by: the page, and its number for it, of the last wish that is seen in the image of a
-            stamp, ns; so the page can tell how long that took.
+        known: what else is known of the image of a stamp, ns, for its header.
     """
+    places: dict[str, Any] = {}
 
-    def answering(make: Make) -> Make:
-        def answer(message: Image, sequence: int) -> Packet:
+    def place(message: Float64MultiArray) -> None:
+        places["matrix"] = affine_from(message).ravel().tolist()
+
+    node.create_subscription(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
+
+    def telling(make: Make) -> Make:
+        def tell(message: Image, sequence: int) -> Packet:
             packet = make(message, sequence)
-            asked = asked_by(int(packet.header["stamp"]))
-            told = {} if asked is None else {"command": list(asked)}
-            return replace(packet, header={**packet.header, **told})
+            told = known(int(packet.header["stamp"]))
+            return replace(packet, header={**packet.header, **places, **told})
 
-        return answer
+        return tell
 
     def images(topic: str, kind: str, make: Make) -> Feed:
         return WatchedTopic(node, post, Image, topic, make, kind, rate).feed
 
-    geometry = WatchedTopic(
-        *(node, post, Float64MultiArray, "ultrasound/image_to_probe", _geometry, "image_geometry"),
-        rate=None,
-        qos=LATCHED,
-    )
+    annotated = _colour_jpeg("annotated")
     return [
-        images("ultrasound/image", "image", answering(_pixels)),
-        images("ultrasound/image", "image_jpeg", answering(_grey_jpeg)),
-        *(images(topic, kind, _colour_jpeg(kind)) for kind, topic in _COLOURS.items()),
-        geometry.feed,
+        images("ultrasound/image", "image", telling(_pixels)),
+        images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
+        images("ultrasound/image_annotated", "annotated", telling(annotated)),
+        *(images(topic, kind, _colour_jpeg(kind)) for kind, topic in _STRIPS.items()),
     ]
 
 
@@ -102,8 +99,3 @@ def _header(message: Image, encoding: str) -> dict[str, Any]:
     stamp = str(nanoseconds_of(message.header.stamp))  # more digits than a number of JavaScript
     rows, columns = int(message.height), int(message.width)
     return {"stamp": stamp, "rows": rows, "columns": columns, "encoding": encoding}
-
-
-def _geometry(message: Float64MultiArray, sequence: int) -> Packet:
-    matrix = affine_from(message)
-    return Packet("image_geometry", sequence, {"matrix": matrix.ravel().tolist()}, b"")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -26,6 +28,8 @@ from us_sim.viewer.packet import Packet
 __all__ = ["ProbeFeeds"]
 
 _POSE, _WRENCH = "probe/pose", "probe/wrench"
+_KEPT = 16
+"""Poses and wrenches, until the image of their stamp is made."""
 
 
 class ProbeFeeds:
@@ -38,8 +42,8 @@ class ProbeFeeds:
         self._node = node
         self._feed = Feed("probe", lambda _: post(self._listen), rate)
         self._subscriptions: list[Any] = []
-        self._pose: bytes | None = None
-        self._wrench: bytes | None = None
+        self._poses: deque[bytes] = deque(maxlen=_KEPT)
+        self._wrenches: deque[bytes] = deque(maxlen=_KEPT)
         self.feeds: list[Feed] = [told.feed, self._feed]
 
     def _listen(self) -> None:
@@ -49,7 +53,7 @@ class ProbeFeeds:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
         if self._feed.is_watched:
-            self._wrench = None  # of the time before
+            self._wrenches.clear()  # of the time before
             self._subscriptions = [
                 self._node.create_subscription(PoseStamped, _POSE, self._move, STREAM, raw=True),
                 self._node.create_subscription(
@@ -58,16 +62,32 @@ class ProbeFeeds:
             ]
 
     def _move(self, data: bytes) -> None:
-        self._pose = data
+        self._poses.append(data)
         self._offer()
 
     def _push(self, data: bytes) -> None:
-        self._wrench = data
+        self._wrenches.append(data)
         self._offer()
 
     def _offer(self) -> None:
-        if self._pose is not None:
-            self._feed.offer(partial(self._pack, self._pose, self._wrench))
+        if self._poses:
+            wrench = self._wrenches[-1] if self._wrenches else None
+            self._feed.offer(partial(self._pack, self._poses[-1], wrench))
+
+    def at(self, stamp: str) -> dict[str, Any]:
+        """Position, quaternion, force and torque of a stamp, ns, as far as they are known.
+
+        While nobody watches the stream ``probe`` nothing is.
+        """
+        kinds: list[tuple[Any, str, deque[bytes], Callable[[Any], dict[str, Any]], str]] = [
+            (PoseStamped, _POSE, self._poses, _posed, "stamp"),
+            (WrenchStamped, _WRENCH, self._wrenches, _pushed, "force_stamp"),
+        ]
+        found: dict[str, Any] = {}
+        for kind, topic, kept, make, key in kinds:
+            headers = (made_of(self._node, kind, topic, each, make) for each in reversed([*kept]))
+            found |= next((each for each in headers if each and each[key] == stamp), {})
+        return found
 
     def _pack(self, pose: bytes, wrench: bytes | None, sequence: int) -> Packet | None:
         header = made_of(self._node, PoseStamped, _POSE, pose, _posed)

@@ -1,8 +1,11 @@
 /**
  * The ultrasound image on a canvas, with its depth scale.
  *
- * Pixels of the canvas `#ultrasound canvas.us-image` are those of the image. Where they are comes
- * with `image_geometry`: a 4 × 4 matrix from (column, row, 0, 1) to metres in frame `probe`.
+ * Pixels of the canvas `#ultrasound canvas.us-image` are those of the image. Where they are says the
+ * image's `matrix`, 4 × 4, from (column, row, 0, 1) to metres in frame `probe`.
+ *
+ * A frame is an image with all that belongs to it, live or kept: {header, payload} as they came,
+ * `time` (ms of `performance.now()`) when, `mode`, its name on the page, and `measures` on it.
  */
 
 import { element, events } from "./events.js";
@@ -28,9 +31,10 @@ canvas.setAttribute("role", "img");
 canvas.setAttribute("aria-label", "Ultrasound image");
 const context = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
 
-/** 16 numbers, row by row, or null before the first. */
+let shownFrame = null;
+/** The shown frame's matrix: 16 numbers, row by row, or null while they are not known. */
 let geometry = null;
-let pixels = null;
+let grey = null; // ImageData that every grey image is put through
 const handlers = [];
 
 /** The canvas that holds the image, one canvas pixel an image pixel. */
@@ -43,42 +47,71 @@ export function hasImage() {
   return waiting.hidden;
 }
 
-/** From (column, row), of pixels, to [lateral, axial] mm in frame `probe`; null if not known. */
-export function pixelToMillimetres(column, row) {
-  if (!geometry) return null;
-  const at = (i) => 1000 * (geometry[i] * column + geometry[i + 1] * row + geometry[i + 3]);
+/** The frame that is seen; null before the first. */
+export function frameShown() {
+  return shownFrame;
+}
+
+/** From (column, row), of a frame's pixels, to [lateral, axial] mm in frame `probe`; null if not known. */
+export function pixelToMillimetres(column, row, matrix = geometry) {
+  if (!matrix) return null;
+  const at = (i) => 1000 * (matrix[i] * column + matrix[i + 1] * row + matrix[i + 3]);
   return [at(0), at(8)];
 }
 
-/** Have `handler(header, payload)` called when an image was drawn. */
+/** Have `handler(frame)` called when an image has come and was drawn. */
 export function onImage(handler) {
   handlers.push(handler);
 }
 
-/** Draw what a packet of the image holds; also one that was kept. */
-export async function drawImage(header, payload) {
-  const { columns, rows } = header;
-  scale.hidden = header.kind === "annotated"; // that one has scales of its own
+/** From a frame to what puts its pixels on a context of a canvas of its size, once. */
+export async function painter({ header, payload }) {
+  if (header.encoding !== "mono8") {
+    const bitmap = await createImageBitmap(new Blob([payload], { type: "image/jpeg" }));
+    return (to) => {
+      to.drawImage(bitmap, 0, 0);
+      bitmap.close();
+    };
+  }
+  return (to) => {
+    const { columns, rows } = header;
+    if (grey?.width !== columns || grey.height !== rows) grey = new ImageData(columns, rows);
+    const words = new Uint32Array(grey.data.buffer);
+    for (let i = 0; i < words.length; i++) words[i] = 0xff000000 | (payload[i] * 0x010101);
+    to.putImageData(grey, 0, 0);
+  };
+}
+
+/** Counts what makes an image that is still being decoded one that is not wanted any more. */
+let turn = 0;
+
+/** Draw a frame that was kept, unless another is wanted before it is ready. */
+export async function drawKept(frame) {
+  turn += 1;
+  await draw(frame);
+}
+
+/** Whether it was drawn. */
+async function draw(frame) {
+  const mine = turn;
+  const paint = await painter(frame);
+  if (mine !== turn) return false;
+  const { columns, rows, kind, matrix = null } = frame.header;
+  const isOther = String(matrix) !== String(geometry);
+  const isNew = canvas.width !== columns || canvas.height !== rows || isOther || !hasImage();
+  scale.hidden = kind === "annotated"; // that one has scales of its own
   if (canvas.width !== columns || canvas.height !== rows) {
     canvas.width = columns;
     canvas.height = rows;
-    pixels = null;
-    drawScale();
   }
-  if (header.encoding === "mono8") {
-    pixels ??= context.createImageData(columns, rows);
-    const words = new Uint32Array(pixels.data.buffer);
-    for (let i = 0; i < words.length; i++) words[i] = 0xff000000 | (payload[i] * 0x010101);
-    context.putImageData(pixels, 0, 0);
-  } else {
-    const bitmap = await createImageBitmap(new Blob([payload], { type: "image/jpeg" }));
-    context.drawImage(bitmap, 0, 0);
-    bitmap.close();
-  }
-  if (!hasImage()) {
-    waiting.hidden = true;
-    drawScale();
-  }
+  paint(context);
+  shownFrame = frame;
+  geometry = matrix;
+  waiting.hidden = true;
+  if (isNew) drawScale();
+  if (isOther) events.tell("image-geometry", geometry);
+  events.tell("image-shown", frame);
+  return true;
 }
 
 let live = true;
@@ -90,8 +123,21 @@ let arrived = 0;
 /** Images of a probe at rest come five times a second; without any the last one is marked. */
 const STALE_MS = 1000;
 
+/** ms for which it is said what a frozen image does not do. */
+const REMINDED_MS = 4000;
+let reminded = -REMINDED_MS;
+
+/** Say for a while that the image is frozen, to who drags on it. */
+export function remindFrozen() {
+  reminded = performance.now();
+  showRemark();
+}
+
 /** What is to be known of the image, or nothing. */
 function remark() {
+  if (!live && performance.now() - reminded < REMINDED_MS) {
+    return "The image is frozen and the probe stays where it is: press Go on to move it here";
+  }
   if (!live) return label === held ? "" : `The image is frozen: Go on shows ${label}`;
   const age = arrived ? performance.now() - arrived : 0;
   return document.hidden || age < STALE_MS ? "" : `No new image for ${Math.floor(age / 1000)} s`;
@@ -109,6 +155,7 @@ export function setLive(on) {
   live = on;
   held = label;
   arrived = 0;
+  turn += 1;
   stream.watch(shown, on);
 }
 
@@ -130,20 +177,15 @@ export function setMode(mode, name) {
 async function take(header, payload) {
   if (header.kind !== shown || !live) return; // what was under way as it was frozen
   arrived = performance.now();
-  await drawImage(header, payload);
-  for (const handle of handlers) handle(header, payload);
+  const frame = { header, payload, time: arrived, mode: label, measures: [] };
+  if (!(await draw(frame))) return;
+  for (const handle of handlers) handle(frame);
   events.tell("image-drawn", header);
 }
 
 stream.on(KIND, take);
 stream.on("annotated", take);
-stream.on("image_geometry", (header) => {
-  geometry = header.matrix;
-  drawScale();
-  events.tell("image-geometry", geometry);
-});
 stream.watch(KIND);
-stream.watch("image_geometry");
 
 /** The rectangle of the image within the canvas' box, CSS pixels: it keeps its shape in mm. */
 export function imageBox() {

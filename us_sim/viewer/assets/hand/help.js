@@ -18,7 +18,8 @@ const PARTS = {
     ["Space", "freeze, go on"],
     ["C  ,  .", "play, step through the last 10 s"],
     ["D O T", "distance, ellipse, text"],
-    ["Esc X P", "no tool, clear all, save"],
+    ["Esc, P", "no tool, save"],
+    ["X, Ctrl Z", "clear or have back, undo"],
   ],
   Keys: [
     ["← → ↑ ↓", "slide"],

@@ -1,10 +1,11 @@
 /**
  * Dragging over the ultrasound image moves the probe: down presses, sideways slides; with two
- * fingers turning rotates. The wheel presses. Lengths are those of the image.
+ * fingers turning rotates. The wheel presses. Lengths are those of the image. A frozen image would
+ * not show that, so there the probe stays.
  */
 
 import { element, events } from "../events.js";
-import { imageBox, pixelToMillimetres, imageCanvas } from "../image.js";
+import { imageBox, imageCanvas, pixelToMillimetres, remindFrozen } from "../image.js";
 import { Fingers } from "./fingers.js";
 import { hand } from "./hand.js";
 
@@ -18,10 +19,12 @@ const UNKNOWN = 1e-4;
 const place = await element("ultrasound");
 const fingers = new Fingers();
 let isTaken = false;
+let isFrozen = false;
 let travelled = [0, 0];
 let mode = null;
 
 events.on("image-tool", (tool) => (isTaken = tool !== null));
+events.on("image-frozen", (on) => (isFrozen = on));
 
 function metresPerPixel() {
   const from = pixelToMillimetres(0, 0);
@@ -44,6 +47,10 @@ place.addEventListener("pointerdown", (event) => {
 place.addEventListener("pointermove", (event) => {
   if (!place.hasPointerCapture(event.pointerId)) return;
   const { right, down, turn } = fingers.moved(event);
+  if (isFrozen) {
+    remindFrozen();
+    return;
+  }
   travelled = [travelled[0] + right, travelled[1] + down];
   const scale = metresPerPixel();
   if (fingers.count > 1) {
@@ -69,6 +76,10 @@ place.addEventListener(
   "wheel",
   (event) => {
     event.preventDefault();
+    if (isFrozen) {
+      remindFrozen();
+      return;
+    }
     const notches = event.deltaMode === 0 ? event.deltaY / 100 : event.deltaY / 3;
     hand.ask({ by: { press: notches * NOTCH } }, event.timeStamp);
   },

@@ -8,7 +8,7 @@ export class Cine {
   #frames = [];
   #bytes = 0;
 
-  /** {header, payload, time} of the images, oldest first; `time` in ms, when they came. */
+  /** The frames, oldest first. */
   get frames() {
     return this.#frames;
   }
@@ -18,10 +18,11 @@ export class Cine {
     return this.#bytes;
   }
 
-  /** Keep an image that came at `time`, ms; those that are too old, or too many, are let go. */
-  keep(header, payload, time) {
-    this.#frames.push({ header, payload, time });
-    this.#bytes += payload.byteLength;
+  /** Keep a frame; those that are too old, or too many, are let go. */
+  keep(frame) {
+    const { time } = frame;
+    this.#frames.push(frame);
+    this.#bytes += frame.payload.byteLength;
     let old = 0;
     let bytes = this.#bytes;
     while (

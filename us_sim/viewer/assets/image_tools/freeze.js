@@ -1,7 +1,7 @@
 /** Freezing the image, and looking through the last seconds before that. */
 
 import { events } from "../events.js";
-import { drawImage, hasImage, onImage, setLive } from "../image.js";
+import { drawKept, hasImage, onImage, setLive } from "../image.js";
 import { Cine } from "./cine.js";
 
 const cine = new Cine();
@@ -14,7 +14,7 @@ function tell() {
   for (const handle of handlers) handle();
 }
 
-onImage((header, payload) => cine.keep(header, payload, performance.now()));
+onImage((frame) => cine.keep(frame));
 
 export const freeze = {
   cine,
@@ -48,13 +48,19 @@ export const freeze = {
     tell();
   },
 
+  /** Freeze, if that is not so yet, and stand still. */
+  hold() {
+    if (!isFrozen) this.toggle();
+    else if (playing) this.play(false);
+  },
+
   /** Show one of the kept images; freezes. */
   async show(wanted) {
     if (!hasImage()) return;
     if (!isFrozen) this.toggle();
     number = Math.min(Math.max(wanted, 0), cine.frames.length - 1);
     const frame = cine.frames[number];
-    if (frame) await drawImage(frame.header, frame.payload);
+    if (frame) await drawKept(frame);
     tell();
   },
 

@@ -1,11 +1,11 @@
 /** The bar below the ultrasound image: freeze, cine loop, measurements, picture. */
 
 import { element, events } from "../events.js";
-import { hasImage } from "../image.js";
+import { frameShown, hasImage } from "../image.js";
 import { isTyping } from "../hand/typing.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
-import { save } from "./picture.js";
+import { factsOf, save } from "./picture.js";
 
 const style = document.createElement("link");
 style.rel = "stylesheet";
@@ -19,7 +19,9 @@ const list = document.createElement("ol");
 list.className = "us-values";
 list.setAttribute("aria-label", "Measured values");
 place.append(bar);
-(await element("ultrasound")).append(list);
+const facts = Object.assign(document.createElement("p"), { className: "us-facts" });
+facts.title = "Of the image that is shown";
+(await element("ultrasound")).append(list, facts);
 
 function button(text, title, onclick) {
   const made = Object.assign(document.createElement("button"), { type: "button", title, onclick });
@@ -47,8 +49,14 @@ const tools = {
   ellipse: button("Ellipse", "Drag an axis, then its other end: mm² (key O)", () => overlay.use("ellipse")),
   note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
 };
-const clearing = button("Clear", "Remove all measurements and texts (key X)", () => overlay.clear());
+const clearing = button("Clear", "", clearOrUndo);
 const saving = button("Save", "Keep the image with its scale and measurements as a PNG file (key P)", save);
+
+/** Remove what is on the image, or have it back. */
+function clearOrUndo() {
+  if (overlay.measures.length) overlay.clear();
+  else overlay.undo();
+}
 
 scrubber.addEventListener("input", () => {
   if (freeze.isPlaying) freeze.play(false);
@@ -74,8 +82,9 @@ function showFreeze() {
   freezing.textContent = freeze.isFrozen ? "Go on" : "Freeze";
   press(playing, freeze.isPlaying);
   playing.textContent = freeze.isPlaying ? "Stop" : "Play";
-  scrubber.hidden = moment.hidden = !freeze.isFrozen;
+  scrubber.hidden = moment.hidden = facts.hidden = !freeze.isFrozen;
   if (!freeze.isFrozen || !frames.length) return;
+  facts.textContent = factsOf(frameShown()).join(" · ");
   scrubber.max = frames.length - 1;
   scrubber.value = freeze.number;
   const before = (frames[freeze.number].time - frames.at(-1).time) / 1000;
@@ -88,7 +97,12 @@ function showMeasures() {
     made.disabled = Boolean(overlay.obstacle);
     made.title = overlay.obstacle || made.dataset.title;
   }
-  clearing.disabled = !overlay.measures.length;
+  const isUndo = !overlay.measures.length && overlay.canUndo;
+  clearing.textContent = isUndo ? "Undo" : "Clear";
+  clearing.title = isUndo
+    ? "Have the measurements and texts back (key X)"
+    : "Remove the measurements and texts of this image (key X)";
+  clearing.disabled = !overlay.measures.length && !isUndo;
   list.replaceChildren(
     ...overlay.measures.map((measure) => {
       const item = document.createElement("li");
@@ -113,11 +127,16 @@ const KEYS = {
   d: () => overlay.use("distance"),
   o: () => overlay.use("ellipse"),
   t: () => overlay.use("note"),
-  x: () => overlay.clear(),
+  x: clearOrUndo,
   p: save,
 };
 addEventListener("keydown", (event) => {
   if (event.key === "Escape" && overlay.tool) overlay.use(null);
+  const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
+  if (isUndo && !event.target.closest?.("input, textarea") && overlay.canUndo) {
+    event.preventDefault();
+    overlay.undo();
+  }
   if (isTyping(event)) return;
   const act = event.key === " " ? () => freeze.toggle() : KEYS[event.key.toLowerCase()] ?? KEYS[event.key];
   if (!act || event.repeat) return;

@@ -1,7 +1,13 @@
-/** Draws what is measured over the image, and lets its points be dragged. */
+/**
+ * Draws what is measured over the image, and lets its points be dragged.
+ *
+ * A measure belongs to the frame that it was made on, and is seen with that frame only. So who takes
+ * a tool freezes the image: the next one would be without it.
+ */
 
 import { element, events } from "../events.js";
-import { onImage } from "../image.js";
+import { frameShown } from "../image.js";
+import { freeze } from "./freeze.js";
 import { Distance, Ellipse, Note } from "./measures.js";
 import { plane } from "./plane.js";
 
@@ -17,19 +23,22 @@ sheet.classList.add("us-measures");
 sheet.setAttribute("aria-label", "Measurements");
 place.append(sheet);
 
-const measures = [];
 const handlers = [];
 let tool = null;
 let drag = null;
-let colours = 0;
-/** Columns and rows of the B-mode image of this geometry; the annotated one is drawn over it. */
+/** The header of the last B-mode image; the annotated one is drawn over it. */
 let plain = null;
-let matrix = null;
 /** Why nothing can be measured, for a person. */
 let obstacle = "There is no image yet";
 
+/** The measures of the frame that is shown. */
+function measuresShown() {
+  return frameShown()?.measures ?? [];
+}
+
 function draw() {
   const map = obstacle ? null : plane();
+  const measures = measuresShown();
   const focused = document.activeElement?.dataset?.point;
   sheet.replaceChildren();
   if (map) for (const [number, measure] of measures.entries()) drawOne(measure, number, map);
@@ -94,7 +103,7 @@ function at(event) {
 
 function pointOf(target) {
   const [number, index] = target.dataset.point.split(" ").map(Number);
-  return { measure: measures[number], index };
+  return { measure: measuresShown()[number], index };
 }
 
 sheet.addEventListener("pointerdown", (event) => {
@@ -102,8 +111,10 @@ sheet.addEventListener("pointerdown", (event) => {
   if (event.button !== 0 || !map) return;
   if (tool) {
     const point = map.toPlane(at(event));
-    const measure = Object.assign(new KINDS[tool](point), { colour: COLOURS[colours % COLOURS.length] });
-    colours += 1;
+    const measures = measuresShown();
+    const isFree = (colour) => measures.every((other) => other.colour !== colour);
+    const colour = COLOURS.find(isFree) ?? COLOURS[measures.length % COLOURS.length];
+    const measure = Object.assign(new KINDS[tool](point), { colour });
     if (tool === "note") {
       event.preventDefault();
       askWords(measure);
@@ -148,7 +159,7 @@ const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 sheet.addEventListener("keydown", (event) => {
   if (!event.target.dataset?.point) return;
   const { measure, index } = pointOf(event.target);
-  if (event.key === "Delete" || event.key === "Backspace") remove(measure);
+  if (event.key === "Delete" || event.key === "Backspace") overlay.remove(measure);
   else if (event.key in STEPS) {
     const map = plane();
     const [x, y] = map.toScreen(measure.points[index]);
@@ -167,6 +178,7 @@ sheet.addEventListener("dblclick", (event) => {
 
 /** Let the person write the words of a note where it is. */
 function askWords(note) {
+  const { measures } = frameShown();
   const entry = document.createElement("input");
   Object.assign(entry, { className: "us-words", value: note.words, maxLength: 60 });
   entry.setAttribute("aria-label", "Text on the image; Enter ends it");
@@ -180,7 +192,7 @@ function askWords(note) {
     isOver = true;
     if (isKept) note.words = entry.value.trim();
     entry.remove();
-    if (note.isTooSmall) remove(note);
+    if (note.isTooSmall) remove(note, measures);
     else if (!measures.includes(note)) measures.push(note);
     draw();
   };
@@ -193,17 +205,28 @@ function askWords(note) {
   entry.addEventListener("blur", () => end(true));
 }
 
-function remove(measure) {
+function remove(measure, measures = measuresShown()) {
   const index = measures.indexOf(measure);
   if (index >= 0) measures.splice(index, 1);
+}
+
+/** Remember what there is on the frame that is shown, for `undo`. */
+function remember() {
+  const frame = frameShown();
+  if (frame?.measures.length) frame.removed = [...frame.measures];
 }
 
 export const overlay = {
   sheet,
 
-  /** What there is, in the order in which it was made; each has `text`, `points` and `colour`. */
+  /** What there is on the frame that is shown, as it was made; each has `text`, `points` and `colour`. */
   get measures() {
-    return measures;
+    return measuresShown();
+  },
+
+  /** Whether something was removed from that frame that can come back. */
+  get canUndo() {
+    return Boolean(frameShown()?.removed);
   },
 
   /** "distance", "ellipse", "note", or null. */
@@ -221,37 +244,51 @@ export const overlay = {
     handlers.push(handler);
   },
 
-  /** Take a tool in hand, for one measurement; the same again puts it away. */
+  /** Take a tool in hand, for one measurement, and freeze; the same again puts it away. */
   use(wanted) {
     tool = wanted === tool || obstacle ? null : wanted;
     sheet.classList.toggle("us-measuring", tool !== null);
     events.tell("image-tool", tool);
+    if (tool) freeze.hold();
     draw();
   },
 
   remove(measure) {
+    remember();
     remove(measure);
     draw();
   },
 
-  /** Remove everything. */
+  /** Remove everything from the frame that is shown. */
   clear() {
-    measures.length = 0;
+    remember();
+    measuresShown().length = 0;
+    draw();
+  },
+
+  /** Have what was removed last from that frame back. */
+  undo() {
+    const frame = frameShown();
+    if (!frame?.removed) return;
+    frame.measures.push(...frame.removed.filter((measure) => !frame.measures.includes(measure)));
+    frame.removed = null;
     draw();
   },
 };
 
 new ResizeObserver(draw).observe(place);
-events.on("image-geometry", (geometry) => {
-  if (matrix !== null && matrix !== String(geometry)) plain = null;
-  matrix = String(geometry);
-  block("");
-  draw();
+freeze.on(() => {
+  if (freeze.isFrozen) return;
+  drag = null;
+  if (tool) overlay.use(null);
 });
-onImage(({ kind, columns, rows }) => {
-  if (kind !== "annotated") plain = [columns, rows];
-  const isLikePlain = !plain || (plain[0] === columns && plain[1] === rows);
+events.on("image-shown", ({ header, measures, removed }) => {
+  const { kind, columns, rows } = header;
+  if (kind !== "annotated") plain = header;
+  const isSame = plain && String(plain.matrix) === String(header.matrix);
+  const isLikePlain = !isSame || (plain.columns === columns && plain.rows === rows);
   block(isLikePlain ? "" : "This picture has another size than the B-mode image, whose scale is known");
+  if (sheet.childElementCount || measures.length || removed) draw();
 });
 
 /** Say why nothing can be measured, or that it can. */

@@ -1,27 +1,49 @@
-/** The image as a picture to keep: with its scale, measurements, the scene's name and the time. */
+/** A frame as a picture to keep: with its scale and measures, and what is known of it. */
 
-import { hasImage, imageCanvas, pixelToMillimetres } from "../image.js";
-import { overlay } from "./overlay.js";
+import { frameShown, painter, pixelToMillimetres } from "../image.js";
 import { Ellipse, Note } from "./measures.js";
 
 /** Pixels: the least height of the image, and what is around it. */
 const LEAST = 768;
 const LEFT = 56;
-const TOP = 40;
+const TOP = 64;
 const EDGE = 20;
 const LINE = 24;
 
-/** The picture on a canvas; null before the first image. */
-export function picture() {
-  const image = imageCanvas();
-  const first = pixelToMillimetres(-0.5, -0.5);
-  const last = pixelToMillimetres(image.width - 0.5, image.height - 0.5);
-  if (!first || !hasImage()) return null;
-  const scale = Math.max(LEAST, image.height) / (last[1] - first[1]); // pixels a mm
+/** Time of a frame, s since 1970 in its stamp's ns, as it is here. */
+function timeOf({ header }) {
+  const milliseconds = Number(BigInt(header.stamp) / 1_000_000n);
+  const fraction = String(milliseconds % 1000).padStart(3, "0");
+  return `${new Date(milliseconds).toLocaleString("sv-SE")}.${fraction}`;
+}
+
+/** What is known of a frame, in words, as far as it is known. */
+export function factsOf(frame) {
+  const { matrix, rows, settings = {}, press, force } = frame.header;
+  const of = (value, factor, unit) =>
+    value === undefined ? [] : [`${(factor * value).toFixed(1).replace(/^-(0\.0)$/, "$1")} ${unit}`];
+  return [
+    timeOf(frame),
+    ...(matrix ? [`depth ${pixelToMillimetres(0, rows - 0.5, matrix)[1].toFixed(1)} mm`] : []),
+    ...Object.entries(settings).map(([name, value]) => `${name} ${value}`),
+    ...of(press, 1000, "mm").map((text) => `press ${text}`),
+    ...of(force, 1, "N").map((text) => `force ${text}`),
+  ];
+}
+
+/** The picture of a frame on a canvas; null where it is not known where its pixels are. */
+export async function picture(frame = frameShown()) {
+  const { columns, rows, matrix } = frame?.header ?? {};
+  if (!matrix) return null;
+  const first = pixelToMillimetres(-0.5, -0.5, matrix);
+  const last = pixelToMillimetres(columns - 0.5, rows - 0.5, matrix);
+  const scale = Math.max(LEAST, rows) / (last[1] - first[1]); // pixels a mm
   const width = Math.round((last[0] - first[0]) * scale);
   const height = Math.round((last[1] - first[1]) * scale);
-  const measures = overlay.obstacle ? [] : overlay.measures;
+  const { measures } = frame;
   const lines = measures.filter((measure) => !(measure instanceof Note));
+  const image = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
+  (await painter(frame))(image.getContext("2d"));
   const canvas = document.createElement("canvas");
   canvas.width = LEFT + width + EDGE;
   canvas.height = TOP + height + EDGE + LINE * lines.length;
@@ -32,8 +54,11 @@ export function picture() {
   draw.font = "16px Roboto, sans-serif";
   draw.fillStyle = draw.strokeStyle = "#b9c2c9";
   draw.textBaseline = "middle";
-  const when = new Date().toLocaleString("sv-SE");
-  draw.fillText([window.usSim?.scene?.() ?? "us_sim", when].join("   "), LEFT, TOP / 2);
+  const [when, ...facts] = factsOf(frame);
+  const what = [frame.header.scene || "us_sim", frame.mode, when, "simulated"];
+  for (const [row, text] of [what.join("   "), facts.join("   ")].entries()) {
+    draw.fillText(text, LEFT, EDGE + LINE * row, width);
+  }
   drawDepths(draw, first[1], last[1], scale);
   const to = ([x, y]) => [LEFT + (x - first[0]) * scale, TOP + (y - first[1]) * scale];
   for (const [number, measure] of measures.entries()) drawMeasure(draw, measure, number, to, scale);
@@ -80,14 +105,18 @@ function drawMeasure(draw, measure, number, to, scale) {
   draw.fillText(measure instanceof Note ? measure.words : `${number + 1}`, x + 11, y - 10);
 }
 
-/** Have the browser keep it as a file. */
-export function save() {
-  picture()?.toBlob((blob) => {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(blob);
-    const when = new Date().toLocaleString("sv-SE").replace(/[^0-9]+/g, "-");
-    link.download = `us_sim-${when}.png`;
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-  }, "image/png");
+/** Have the browser keep the frame that is shown as a file. */
+export async function save() {
+  const frame = frameShown();
+  const canvas = await picture(frame);
+  canvas?.toBlob((blob) => keep(blob, frame, "png"), "image/png");
+}
+
+/** Have the browser keep what was made of a frame. */
+function keep(blob, frame, kind) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = `us_sim-${timeOf(frame).replace(/[^0-9]+/g, "-")}.${kind}`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }

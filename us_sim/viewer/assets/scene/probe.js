@@ -196,7 +196,7 @@ events.on("image-geometry", (matrix) => {
   geometry = matrix;
   layOut();
 });
-onImage((header, payload) => {
+onImage(({ payload }) => {
   const { width, height } = imageCanvas();
   if (width !== size[0] || height !== size[1]) layOut();
   // A probe at rest sends the same image again and again.
