@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
@@ -23,8 +24,10 @@ from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.recording.attached import extract
 from us_sim.recording.mcap_output import McapOutput
+from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
+from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 
 srv = pytest.importorskip("rosbag2_interfaces.srv")
@@ -194,6 +197,37 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
     assert Path(again.path).parent == tmp_path / "again"
     replace = dataclasses.replace
     assert replace(again, path=None, origin="") == replace(load_scene(scene), path=None, origin="")
+
+
+def bag_of(folder, frame, x=0.0, topic="/tracker/pose"):
+    """A bag, in a folder, of two poses at x in a frame."""
+    stamps = 1_700_000_000_000_000_000 + np.arange(2) * 10**8
+    places = np.tile([x, 0.0, 0.0], (2, 1)), np.tile([0.0, 0, 0, 1], (2, 1))
+    write_path(folder, ProbePath(topic, frame, stamps, *places))
+    return folder
+
+
+@pytest.mark.parametrize("played", [None, "other"])
+def test_the_bag_that_was_played_is_attached_whole(bench, tmp_path, small_scene, played):
+    own, other = bag_of(tmp_path / "own", "ndi"), bag_of(tmp_path / "other", "ndi", 0.01)
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        f"based_on: {small_scene}\npath: own\n"
+        "tracker: {source: path, file: own, frame: ndi, registration: {position: [0, 0.02, 0]}}\n"
+    )
+    file, path = tmp_path / "session.mcap", played and str(tmp_path / played)
+    end(bench, bench.make(SessionRecorder, file=str(file), scene=str(scene), path=path or ""))
+    extract(file, tmp_path / "again")
+    again = load_scene(tmp_path / "again" / "scene.yaml")
+    kept = tmp_path / "again" / (played or "own")
+    assert again.path == again.tracker.file == str(kept)
+    assert list(read_bag(kept).messages()) == list(read_bag(other if played else own).messages())
+    assert read_bag(kept).complete
+    session = bag_of(tmp_path / "probe", "patient", 0.03, "/probe/pose")
+    assert path_of(again, session).frame_id == "patient"  # the probe's own
+    elsewhere = bag_of(tmp_path / "elsewhere", "moon")
+    with pytest.raises(BagError, match=r"'moon'.*'ndi'"):
+        path_of(again, elsewhere)
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,11 @@ def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):
     [
         ({}, {}, "tracker.file: is missing"),
         ({"file": "{bag}"}, {"lockstep": True}, "give the recording with --path"),
-        ({"file": "{bag}", "frame": "moon"}, {}, "in frame 'patient'"),
+        (
+            {"file": "{recording}", "body": "ProbeToTracker", "frame": "moon"},
+            {},
+            "in frame 'Tracker'",
+        ),
         ({"file": "{bag}", "body": "nothing"}, {}, "nothing"),
         (
             {"file": "{recording}"},

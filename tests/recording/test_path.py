@@ -9,6 +9,8 @@ from hypothesis.extra import numpy as arrays
 from us_sim.errors import BagError
 from us_sim.recording.path import POSE_STAMPED, ProbePath, read_path, write_path
 from us_sim.recording.reader import read_bag
+from us_sim.recording.recorded_poses import bodies_in
+from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000
@@ -123,13 +125,15 @@ def test_which_topic(tmp_path):
         bag.add_topic("/note", "std_msgs/msg/String")
         bag.write("/note", HI, EPOCH)
         bag.flush()
-        with pytest.raises(BagError, match=r"no topic of .*PoseStamped; it has /note \(std_msgs"):
+        with pytest.raises(BagError, match=r"no topic of .*PoseStamped.*it has /note \(std_msgs"):
             read_path(tmp_path / "bag.mcap")
         for topic in ("/haptic/pose", "/probe/pose"):
             bag.add_topic(topic, POSE_STAMPED)
-    with pytest.raises(BagError, match="topics: name one by --pose, of /haptic/pose, /probe/pose"):
+    with pytest.raises(BagError, match="name one by --pose, of /haptic/pose, /probe/pose"):
         read_path(tmp_path, option="--pose")
-    with pytest.raises(BagError, match="/note as std_msgs/msg/String: a path needs geometry_msgs"):
+    with pytest.raises(
+        BagError, match="/note as std_msgs/msg/String: a path needs one of geometry_msgs"
+    ):
         read_path(tmp_path, "note")
     with pytest.raises(BagError, match="no topic /moon/pose; it has /haptic/pose, /note"):
         read_path(tmp_path, "/moon/pose")
@@ -182,3 +186,127 @@ def test_no_bag(tmp_path, missing):
 def test_arrays_of_different_lengths():
     with pytest.raises(BagError, match="a path of 2 stamps"):
         ProbePath("/p", "patient", np.arange(2), np.zeros((3, 3)), np.zeros((2, 4)))
+
+
+def message(type_name, **fields):
+    """A message of rosbags."""
+    return jazzy_definitions().types[type_name](**fields)
+
+
+def vector(kind, x):
+    return message(f"geometry_msgs/msg/{kind}", x=x, y=0.0, z=0.0)
+
+
+def header(frame, k):
+    stamp = message("builtin_interfaces/msg/Time", sec=EPOCH // 10**9, nanosec=k)
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def upright():
+    return message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+def pose_at(x):
+    point = vector("Point", x)
+    return message("geometry_msgs/msg/Pose", position=point, orientation=upright())
+
+
+def transform(parent, child, x, k):
+    moved = message(
+        "geometry_msgs/msg/Transform", translation=vector("Vector3", x), rotation=upright()
+    )
+    fields = {"header": header(parent, k), "child_frame_id": child, "transform": moved}
+    return message("geometry_msgs/msg/TransformStamped", **fields)
+
+
+def of_type(kind, k):
+    """A message whose body, `tip` or `1`, is at x = k in frame `base`."""
+    x, head = float(k), {"header": header("base", k)}
+    covariance = {"covariance": np.zeros(36)}
+    known = message("geometry_msgs/msg/PoseWithCovariance", pose=pose_at(x), **covariance)
+    still = message(
+        "geometry_msgs/msg/Twist", linear=vector("Vector3", 0.0), angular=vector("Vector3", 0.0)
+    )
+    twist = message("geometry_msgs/msg/TwistWithCovariance", twist=still, **covariance)
+    moved = transform("base", "tip", x, k)
+    return {
+        POSE_STAMPED: lambda: message(kind, **head, pose=pose_at(x)),
+        TF: lambda: message(kind, transforms=[transform("map", "base", 9.0, k), moved]),
+        "geometry_msgs/msg/TransformStamped": lambda: moved,
+        "geometry_msgs/msg/PoseArray": lambda: message(
+            kind, **head, poses=[pose_at(9), pose_at(x)]
+        ),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": lambda: message(kind, **head, pose=known),
+        "nav_msgs/msg/Odometry": lambda: message(
+            kind, **head, child_frame_id="tip", pose=known, twist=twist
+        ),
+    }[kind]()
+
+
+def record(file, topics):
+    """A bag of messages by topic."""
+    with BagWriter(file) as bag:
+        for topic, messages in topics.items():
+            kind = messages[0].__msgtype__
+            bag.add_topic(topic, kind)
+            for k, each in enumerate(messages):
+                bag.write(topic, jazzy_definitions().serialize_cdr(each, kind), EPOCH + k)
+
+
+TF = "tf2_msgs/msg/TFMessage"
+
+
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [
+        ("geometry_msgs/msg/TransformStamped", ""),
+        ("geometry_msgs/msg/PoseWithCovarianceStamped", ""),
+        ("nav_msgs/msg/Odometry", ""),
+        ("geometry_msgs/msg/PoseArray", ":1"),
+        (TF, ":tip"),
+    ],
+)
+def test_every_kind_of_pose_message_is_a_path(tmp_path, kind, body):
+    file = tmp_path / "bag.mcap"
+    record(file, {"/poses": [of_type(kind, k) for k in range(4)]})
+    path = read_path(file, f"poses{body}" if body else None)
+    assert (path.topic, path.frame_id) == (f"/poses{body}", "base")
+    np.testing.assert_array_equal(path.positions, [[k, 0, 0] for k in range(4)])
+    np.testing.assert_array_equal(path.stamps - EPOCH // 10**9 * 10**9, range(4))
+    if body:
+        with pytest.raises(BagError, match=f"name one by --topic, of /poses:.*, /poses{body}"):
+            read_path(file, option="--topic")
+        with pytest.raises(BagError, match=f"no /poses:moon; it has .*/poses{body}"):
+            read_path(file, "poses:moon")
+
+
+def test_a_frame_of_tf_is_followed_up_to_another(tmp_path):
+    file = tmp_path / "bag.mcap"
+    mount = message(TF, transforms=[transform("tip", "probe", 0.5, 0)])
+    record(file, {"/tf_static": [mount], "/tf": [of_type(TF, k) for k in range(3)]})
+    path = read_path(file, "/tf:probe:base")
+    assert path.frame_id == "base"
+    np.testing.assert_array_equal(path.positions[:, 0], [0.5, 1.5, 2.5])
+    assert read_path(file, "/tf:tip:map").positions[-1, 0] == 11.0
+    with pytest.raises(BagError, match="no way in /tf from 'base' up to 'tip'"):
+        read_path(file, "/tf:base:tip")
+
+
+def test_tf_of_a_real_recorder_holds_the_path_of_its_poses(shared_data):
+    bag = shared_data / "ros2-jazzy/bags/probe_path_mcap"
+    (body,) = bodies_in(read_bag(bag))[TF]
+    moved, posed = read_path(bag, body), read_path(bag)
+    among = np.isin(moved.stamps, posed.stamps)
+    assert among.sum() > 250
+    of_both = posed.positions[np.isin(posed.stamps, moved.stamps)]
+    np.testing.assert_allclose(moved.positions[among], of_both, atol=1e-12)
+
+
+def test_where_a_hand_and_a_device_took_turns_the_probes_own_poses_are_the_path(tmp_path):
+    file = tmp_path / "session.mcap"
+    seen = message(POSE_STAMPED, header=header("ndi", 0), pose=pose_at(1.0))
+    own = message(POSE_STAMPED, header=header("patient", 1), pose=pose_at(2.0))
+    record(file, {"/tracker/pose": [seen, own], "/probe/pose": [own]})
+    assert read_path(file).topic == "/probe/pose"
+    with pytest.raises(BagError, match="in the frames ndi, patient"):
+        read_path(file, "tracker/pose")

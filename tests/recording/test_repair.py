@@ -1,8 +1,11 @@
 """Recordings that were cut or damaged, made whole; and what is attached to them, taken out."""
 
+import sqlite3
+
 import pytest
 from killed import kill_once
 from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
 
 from us_sim.command.main import main
 from us_sim.errors import BagError
@@ -101,7 +104,30 @@ def test_the_commands(session, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["", "..", "/etc/passwd", "a/../../b", "c:\\x", "x\ny"])
+def test_messages_of_a_type_that_nobody_defines_are_kept(tmp_path):
+    database = sqlite3.connect(tmp_path / "foreign.db3")
+    database.executescript(
+        "CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data);"
+        "INSERT INTO topics VALUES (1, '/call', 'some_interfaces/srv/Add_Event', 'cdr');"
+        f"INSERT INTO messages VALUES (1, 1, {EPOCH}, x'00010000'), (2, 1, {EPOCH + 1}, x'0001');"
+    )
+    database.close()
+    made = repair(tmp_path / "foreign.db3", tmp_path / "whole")
+    assert (made.message_count, made.faults) == (2, ())
+    with Reader(tmp_path / "whole") as other:  # of rosbags
+        assert [data for _, _, data in other.messages()] == [b"\0\1\0\0", b"\0\1"]
+    again = repair(made.path, tmp_path / "again")
+    assert list(read_bag(again.path).messages()) == list(read_bag(made.path).messages())
+
+
+@pytest.mark.parametrize(("name", "count"), [("talker", 20), ("topics_and_services", 13)])
+def test_all_of_a_foreign_database_is_kept(shared_data, tmp_path, name, count):
+    made = repair(shared_data / f"foreign-files/{name}.db3", tmp_path / "whole")
+    assert (made.message_count, made.faults) == (count, ())
+
+
+@pytest.mark.parametrize("name", ["", "..", "/etc/passwd", "a/../../b", "a//b", "c:\\x", "x\ny"])
 def test_an_attachment_goes_nowhere_but_into_the_folder(tmp_path, name, capsys):
     with BagWriter(tmp_path / "bag.mcap") as bag:
         bag.attach(name, "text/plain", b"harm", EPOCH)

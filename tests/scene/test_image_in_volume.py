@@ -104,6 +104,11 @@ def test_a_registration_moves_the_images(tmp_path, path, volume):
         check_path_in_volume(scene_at(tmp_path, (0, 0, 0), tracker=away), path, volume)
 
 
+def test_the_probes_own_poses_are_not_registered_again(tmp_path, path, volume):
+    away = {"frame": "ndi", "registration": {"position": [0.3, 0, 0]}}
+    check_path_in_volume(scene_at(tmp_path, (0, 0, 0), tracker=away), path, volume)
+
+
 @pytest.mark.parametrize("command", ["run", "dry-run", "render", "demo"])
 @pytest.mark.usefixtures("volume")
 def test_the_commands_say_so_before_they_start(tmp_path, path, command, capsys):

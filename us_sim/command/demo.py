@@ -8,6 +8,7 @@ from typing import Any
 
 from us_sim.command.scene_options import (
     add_network_option,
+    add_path_option,
     add_scene_options,
     add_supervision_options,
     add_view_option,
@@ -16,7 +17,6 @@ from us_sim.command.scene_options import (
     supervision,
     viewed,
 )
-from us_sim.share import find_bag
 
 __all__ = ["add_demo"]
 
@@ -42,11 +42,8 @@ def _add_options(demo: argparse.ArgumentParser) -> None:
         help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
         "default: camera where the scene's tracker is one",
     )
-    demo.add_argument(
-        "--path",
-        type=find_bag,
-        metavar="BAG",
-        help="play this probe path, such as hand.mcap, a brisk hand; default: the scene's own",
+    add_path_option(
+        demo, "play this probe path, such as hand.mcap, a brisk hand; default: the scene's own"
     )
     demo.add_argument(
         "--out",
@@ -76,6 +73,7 @@ def _demo(args: argparse.Namespace) -> int:
             supervision=supervision(args),
             source=args.source,
             path=args.path,
+            topic=args.topic,
             view=viewed(args),
             forks=forks,
         )

@@ -6,8 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from us_sim.command.scene_options import add_scene_options, node_parameters, scene_name
-from us_sim.share import find_bag
+from us_sim.command.scene_options import (
+    add_path_option,
+    add_scene_options,
+    node_parameters,
+    scene_name,
+)
 
 __all__ = ["add_render"]
 
@@ -16,9 +20,7 @@ def add_render(commands: Any) -> None:
     """Add the command to `us-sim`'s."""
     render = commands.add_parser("render", help="one image for every pose of a path, repeatably")
     render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
-    render.add_argument(
-        "--path", type=find_bag, metavar="BAG", help="bag with the probe path; default: the scene's"
-    )
+    add_path_option(render, "bag with the probe path; default: the scene's")
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     render.add_argument(
         "--truth",
@@ -35,4 +37,4 @@ def _render(args: argparse.Namespace) -> int:
 
     scene = load_scene(scene_name(args), volume=args.volume)
     parameters = node_parameters(args.param)
-    return render_scene(scene, args.path, args.out, parameters, truth=args.truth)
+    return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)

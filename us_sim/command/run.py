@@ -9,6 +9,7 @@ from typing import Any
 
 from us_sim.command.scene_options import (
     add_network_option,
+    add_path_option,
     add_scene_options,
     add_supervision_options,
     add_view_option,
@@ -20,7 +21,6 @@ from us_sim.command.scene_options import (
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.share import find_bag
 
 __all__ = ["RunSettings", "add_run"]
 
@@ -51,7 +51,7 @@ def _add_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_setting_options(run, RunSettings)
     add_supervision_options(run)
-    run.add_argument("--path", type=find_bag, metavar="BAG", help="play this bag's probe path")
+    add_path_option(run, "play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
     add_scene_options(run)
     add_view_option(run)
@@ -75,6 +75,7 @@ def _run(args: argparse.Namespace) -> int:
             parameters,
             record=asked.record,
             path=args.path,
+            topic=args.topic,
             duration=asked.duration,
             network=args.network,
             supervision=supervision(args),
@@ -96,9 +97,10 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
         from us_sim.scene.building import volume_of
         from us_sim.scene.image_in_volume import check_path_in_volume
 
-        check_path_in_volume(scene, path, volume_of(scene))
+        check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
     parameters = node_parameters(args.param)
-    print(dry_run(scene, parameters, record=asked.record, path=args.path, view=viewed(args)))
+    asked_of = {"record": asked.record, "path": args.path, "topic": args.topic}
+    print(dry_run(scene, parameters, **asked_of, view=viewed(args)))
     if checked:
         print(f"readable  {', '.join(checked)}")
     return 0

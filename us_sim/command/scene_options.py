@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.errors import UsSimError
 from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.share import find_bag
 
 if TYPE_CHECKING:
     from us_sim.viewer.viewer_settings import ViewerSettings
 
 __all__ = [
     "add_network_option",
+    "add_path_option",
     "add_scene_options",
     "add_supervision_options",
     "add_view_option",
@@ -44,6 +46,17 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NODE.NAME=VALUE",
         help="set a node's parameter; may be given again",
+    )
+
+
+def add_path_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """A probe path to play, and the body in it."""
+    parser.add_argument("--path", type=find_bag, metavar="BAG", help=what)
+    parser.add_argument(
+        "--topic",
+        metavar="NAME",
+        help="of the path's poses, where the bag has several: a topic, TOPIC:NUMBER in a "
+        "PoseArray, TOPIC:FRAME or TOPIC:FRAME:PARENT in tf, or a recording's transform",
     )
 
 

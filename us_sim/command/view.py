@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from us_sim.share import find_bag
-
 __all__ = ["add_view"]
 
 
@@ -21,6 +19,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.command.run import RunSettings
     from us_sim.command.scene_options import (
         add_network_option,
+        add_path_option,
         add_scene_options,
         add_supervision_options,
         add_viewer_options,
@@ -32,11 +31,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_viewer_options(parser)
     add_setting_options(parser, RunSettings, ("record",))
-    parser.add_argument(
-        "--path",
-        type=find_bag,
-        metavar="BAG",
-        help="play this bag's probe path, and hold the probe at its end until it is taken",
+    add_path_option(
+        parser, "play this bag's probe path, and hold the probe at its end until it is taken"
     )
     parser.add_argument("--loop", action="store_true", help="play the path again and again")
     parser.add_argument(
@@ -85,6 +81,7 @@ def _view(args: argparse.Namespace) -> int:
             parameters,
             record=read_settings(args, RunSettings, ("record",)).record,
             path=args.path,
+            topic=args.topic,
             duration=None,
             network=args.network,
             supervision=supervision(args),

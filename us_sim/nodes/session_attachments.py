@@ -14,7 +14,8 @@ import yaml
 from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.recording.attached import versions
-from us_sim.scene.reading import load_scene, scene_document, with_volume
+from us_sim.recording.storage import bag_files
+from us_sim.scene.reading import parse_scene, scene_document, with_path, with_volume
 from us_sim.settings.setting import rules_of
 
 __all__ = ["session_attachments"]
@@ -50,7 +51,7 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
         else:
             _attach(attached, path)
     if settings.scene is not None:
-        listed |= _attach_scene(attached, settings.scene, settings.volume)
+        listed |= _attach_scene(attached, settings)
     if listed:
         lines = [f"{checksum}  {path}\n" for path, checksum in sorted(listed.items())]
         attached["files.txt"] = "text/plain", "".join(lines).encode()
@@ -58,32 +59,52 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
 
 
 def _attach_scene(
-    attached: dict[str, tuple[str, bytes]], scene: str, volume: str | None
+    attached: dict[str, tuple[str, bytes]], settings: SessionRecorderSettings
 ) -> dict[Path, str]:
     """Attach a scene and its small files; the checksums of all its files."""
-    document, _, _ = scene_document(scene)
-    if volume:
-        document = with_volume(document, volume)
+    document, folders, origin = scene_document(str(settings.scene))
+    if settings.volume:
+        document = with_volume(document, settings.volume)
+    if settings.path:
+        document = with_path(document, settings.path)
     listed: dict[Path, str] = {}
     places = {}
-    for path in sorted(set(_files(load_scene(scene, volume=volume)))):
-        small = path.is_file() and path.stat().st_size <= LARGEST
-        places[path] = path.name if small and _attach(attached, path) else str(path)
-        listed[path] = _checksum(path)
+    scene = parse_scene(document, origin=origin, folders=folders)
+    for path in sorted(set(_files(scene))):
+        parts = _parts(path)
+        small = sum(part.stat().st_size for part in parts if part.is_file()) <= LARGEST
+        whole = small and all(
+            part.is_file() and _attach(attached, part, str(part.relative_to(path.parent)))
+            for part in parts
+        )
+        places[path] = path.name if whole else str(path)
+        listed |= {part: _checksum(part) for part in parts}
     text = yaml.safe_dump(_placed(document, places), sort_keys=False, allow_unicode=True)
     attached["scene.yaml"] = "application/yaml", text.encode()
     return listed
 
 
-def _attach(attached: dict[str, tuple[str, bytes]], path: Path) -> bool:
-    """Attach a file by its own name; False if another one has that name already."""
-    if path.name in (*attached, "scene.yaml", "files.txt"):
+def _parts(path: Path) -> list[Path]:
+    """The file itself, or those of the bag in a folder."""
+    if not path.is_dir():
+        return [path]
+    try:
+        files, metadata = bag_files(path)
+    except (BagError, OSError):
+        return [path]
+    return [*files, path / "metadata.yaml"] if metadata else files
+
+
+def _attach(attached: dict[str, tuple[str, bytes]], path: Path, name: str = "") -> bool:
+    """Attach a file by its own name or another; False if there is one of that name already."""
+    name = name or path.name
+    if name in (*attached, "scene.yaml", "files.txt"):
         return False
     try:
         data = path.read_bytes()
     except OSError as error:
         raise BagError(f"{path} cannot be attached: {error.strerror}") from None
-    attached[path.name] = mimetypes.guess_type(path.name)[0] or "application/octet-stream", data
+    attached[name] = mimetypes.guess_type(name)[0] or "application/octet-stream", data
     return True
 
 

@@ -147,6 +147,11 @@ class SessionRecorderSettings(Settings):
     volume: str | None = setting(
         description="volume file in place of the scene's", default=None, file=True
     )
+    path: str | None = setting(
+        description="bag or tracker recording that is played in place of the scene's path",
+        default=None,
+        file=True,
+    )
     parameters: str = setting(
         description="those of all nodes, as YAML: attached as parameters.yaml", default=""
     )

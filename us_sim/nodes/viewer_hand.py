@@ -21,6 +21,7 @@ from us_sim.nodes.probe_whereabouts import ProbeWhereabouts
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
+from us_sim.tracking.measurement import PATIENT
 from us_sim.tracking.virtual_hand.motion import Motion
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import Stance
@@ -33,7 +34,6 @@ from us_sim.viewer.simulator import Simulator
 
 __all__ = ["ViewerHand"]
 
-PATIENT = "patient"
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
 images than that."""

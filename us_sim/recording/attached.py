@@ -24,13 +24,14 @@ def extract(bag: Path, folder: Path) -> list[Path]:
     if not attached:
         raise BagError(f"{bag} has no files attached: nothing to extract")
     for name in attached:
-        if name in ("", ".", "..") or any(c in "/\\:" or not c.isprintable() for c in name):
+        parts = name.split("/")  # of a bag in a folder
+        if {"", ".", ".."} & {*parts} or any(c in "\\:" or not c.isprintable() for c in name):
             raise BagError(f"{bag} has a file attached that is called {name!r}: not a file's name")
     files = []
     for name, each in attached.items():
         file = folder / name
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            file.parent.mkdir(parents=True, exist_ok=True)
             with file.open("xb") as stream:
                 stream.write(each.data)
         except FileExistsError:

@@ -21,7 +21,7 @@ class _Topic:
     """A topic being written."""
 
     type_name: str
-    schema: str
+    schema: str | None  # None where nobody knows it
     qos: tuple[QosProfile, ...]
     type_hash: str
 
@@ -49,11 +49,14 @@ class Contents:
         qos: Sequence[object],
         type_hash: str | None,
         schema: str | None,
+        *,
+        defined: bool = True,
     ) -> bool:
         """Make a topic known, or add what is offered anew; whether it was not known.
 
         Raises:
-            BagError: the name is none, or the type is unknown or differs from before.
+            BagError: the name is none, or the type differs from before, or has no definition that
+                can be understood and must be ``defined``.
         """
         if not topic or any(character.isspace() for character in topic):
             raise BagError(f"{topic!r} is not a topic name")
@@ -65,10 +68,14 @@ class Contents:
                 )
             known.qos = tuple(dict.fromkeys((*known.qos, *profiles)))
             return False
-        text = schema_text(type_name) if schema is None else schema
-        if type_hash is None:
-            type_hash = definitions(type_name, text).hash_rihs01(type_name)
-        self._topics[topic] = _Topic(type_name, text, profiles, type_hash)
+        try:
+            schema = schema_text(type_name) if schema is None else schema
+            if type_hash is None:
+                type_hash = definitions(type_name, schema).hash_rihs01(type_name)
+        except BagError:
+            if defined:
+                raise
+        self._topics[topic] = _Topic(type_name, schema, profiles, type_hash or "")
         return True
 
     def introduce(self, topic: str, output: McapOutput) -> None:

@@ -146,13 +146,15 @@ class McapOutput:
         return self.counts.total()
 
     def add_topic(
-        self, topic: str, type_name: str, definition: str, metadata: dict[str, str]
+        self, topic: str, type_name: str, definition: str | None, metadata: dict[str, str]
     ) -> None:
-        """Make a topic known, with the definition of its type."""
+        """Make a topic known, with the definition of its type; None says that there is none."""
         schemas, channels = self._schemas, self._channels
         if type_name not in schemas:
+            encoding = "" if definition is None else "ros2msg"
+            data = (definition or "").encode()
             schemas[type_name] = Schema(
-                id=len(schemas) + 1, data=definition.encode(), encoding="ros2msg", name=type_name
+                id=len(schemas) + 1, data=data, encoding=encoding, name=type_name
             )
         channels[topic] = Channel(
             id=len(channels) + 1,

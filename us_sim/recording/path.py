@@ -1,4 +1,4 @@
-"""A probe's path: the poses of one PoseStamped topic of a bag, as arrays.
+"""A probe's path: the poses of one body in a bag or a tracker recording, as arrays.
 
 >>> import numpy as np, tempfile
 >>> from us_sim.recording.path import ProbePath, read_path, write_path
@@ -23,14 +23,15 @@ from us_sim.errors import BagError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.recorded_poses import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.schemas import jazzy_definitions
-from us_sim.recording.topic import BagMessage, BagTopic
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
 
 __all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
 
-POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+_MOST_NAMES = 20
+"""Bodies that are listed where one has to be named."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +90,10 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
     Args:
         path: any bag that ``read_bag`` reads, or a recording.
-        topic: its name, with or without the leading slash; by default the bag's only
-            PoseStamped topic, or among several the one named ``tracker/pose``. In a recording, a
-            transform (``ProbeToReference``).
+        topic: of the bag, or with what `recorded_poses` names a body by (``/tf:probe``); by
+            default the bag's only PoseStamped topic, among several the one named
+            ``tracker/pose`` (where its poses are of several frames, ``probe/pose``), and without
+            any the only body of other types. In a recording, a transform (``ProbeToReference``).
         option: what a person names the topic by, for the sentence on several.
 
     Raises:
@@ -108,10 +110,12 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
             raise TrackingError(f"{path}: has several transforms: name one by {option}, of {names}")
         return recording.probe_path(topic)
     bag = read_bag(path)
-    chosen = _pose_topic(bag, topic, option)
-    if chosen.message_count == 0:
-        raise BagError(f"{bag.path} holds no pose on {chosen.name}; {bag.note or 'it is silent'}")
-    return _extract(bag, chosen, list(bag.messages([chosen.name])))
+    read = _read(bag, topic or _only_body(bag, option))
+    if topic is None and len(read.frames) > 1:  # a hand and a device took turns
+        poses = [each.name for each in bag.topics if each.type_name == POSE_STAMPED]
+        of_probe = [name for name in poses if name.endswith("/probe/pose") and name != read.name]
+        read = _read(bag, of_probe[0]) if len(of_probe) == 1 else read
+    return _usable(bag, read)
 
 
 def is_tracker_recording(path: str | Path) -> bool:
@@ -168,51 +172,63 @@ def _serialized(
     return store.serialize_cdr(message, POSE_STAMPED, little_endian=True)
 
 
-def _pose_topic(bag: Bag, name: str | None, option: str) -> BagTopic:
-    """The topic of that name, or the bag's only one with poses, or a session's tracker poses."""
-    if name is not None:
-        topic = bag.topic(name)
-        if topic.type_name != POSE_STAMPED:
-            raise BagError(
-                f"{bag.path} holds {topic.name} as {topic.type_name}: a path needs {POSE_STAMPED}"
-            )
-        return topic
-    poses = [topic for topic in bag.topics if topic.type_name == POSE_STAMPED]
-    tracked = [topic for topic in poses if topic.name.endswith("/tracker/pose")]
-    for candidates in (poses, tracked):
+def _only_body(bag: Bag, option: str) -> str:
+    """The bag's only topic of PoseStamped, a session's tracker poses, or the only other body."""
+    stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
+    tracked = [name for name in stamped if name.endswith("/tracker/pose")]
+    others = [] if stamped else [name for names in bodies_in(bag).values() for name in names]
+    for candidates in (stamped, tracked, others):
         if len(candidates) == 1:
             return candidates[0]
-    if poses:
-        names = ", ".join(sorted(topic.name for topic in poses))
+    names = sorted(stamped or others)
+    if names:
+        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         raise BagError(
-            f"{bag.path} holds poses on several topics: name one by {option}, of {names}"
+            f"{bag.path} holds poses of several bodies: name one by {option}, of "
+            f"{', '.join(names[:_MOST_NAMES])}{more}"
         )
     found = ", ".join(sorted(f"{topic.name} ({topic.type_name})" for topic in bag.topics))
-    raise BagError(f"{bag.path} holds no topic of {POSE_STAMPED}; it has {found or 'no topic'}")
+    raise BagError(
+        f"{bag.path} holds no topic of {POSE_STAMPED}, nor of other poses; it has "
+        f"{found or 'no topic'}"
+    )
 
 
-def _extract(bag: Bag, topic: BagTopic, messages: list[BagMessage]) -> ProbePath:
-    """The usable poses of the messages of one topic."""
-    count = len(messages)
-    stamps, log_times = np.empty(count, np.int64), np.empty(count, np.int64)
-    poses = np.empty((count, 7))
-    frames: dict[str, None] = {}
-    for k, raw in enumerate(messages):
-        message = bag.deserialize(raw)
-        try:
-            stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
-            stamps[k] = stamp.sec * 10**9 + stamp.nanosec
-            log_times[k] = raw.log_time
-            poses[k] = p.x, p.y, p.z, q.x, q.y, q.z, q.w
-            frames[message.header.frame_id] = None
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise BagError(
-                f"{bag.path} defines or times {topic.type_name} as ROS 2 does not, so that there "
-                f"are no poses on {topic.name}: {error}"
-            ) from None
-    if len(frames) > 1:
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """All recorded poses of a body."""
+
+    name: str
+    frames: tuple[str, ...]  # in which they are
+    times: NDArray[np.int64]  # (K, 2) ns: log time and stamp
+    poses: NDArray[np.float64]  # (K, 7)
+
+
+def _read(bag: Bag, name: str) -> _Read:
+    """What is recorded of a body."""
+    topic, colon, body = name.partition(":")
+    name = bag.topic(topic).name + colon + body
+    rows = list(pose_rows(bag, name))
+    try:
+        times = np.array([(row.log_time, row.stamp) for row in rows], np.int64)
+    except OverflowError as error:
+        raise BagError(f"{bag.path}: {name}: a time is no number of 64 bits: {error}") from None
+    return _Read(
+        name,
+        tuple(dict.fromkeys(row.frame_id for row in rows)),
+        times.reshape(-1, 2),
+        np.array([row.pose for row in rows], np.float64).reshape(-1, 7),
+    )
+
+
+def _usable(bag: Bag, read: _Read) -> ProbePath:
+    """The poses of one frame that can be used."""
+    count, poses = len(read.poses), read.poses
+    if not count:
+        raise BagError(f"{bag.path} holds no pose on {read.name}; {bag.note or 'it is silent'}")
+    if len(read.frames) > 1:
         raise BagError(
-            f"{bag.path} holds poses on {topic.name} in the frames {', '.join(frames)}: a path "
+            f"{bag.path} holds poses on {read.name} in the frames {', '.join(read.frames)}: a path "
             f"has one frame"
         )
     # What geometry.pose.Pose refuses; a zero quaternion is what a tracker sends for a lost marker.
@@ -223,18 +239,18 @@ def _extract(bag: Bag, topic: BagTopic, messages: list[BagMessage]) -> ProbePath
     notes = [bag.note] if bag.note else []
     if rejected:
         notes.append(
-            f"{rejected} of the {count} poses on {topic.name} are not finite or have no "
+            f"{rejected} of the {count} poses on {read.name} are not finite or have no "
             f"orientation and are left out, the first being number {int(np.argmin(usable)) + 1}"
         )
     if rejected == count:
         raise BagError(f"{bag.path} holds no usable pose: {'; '.join(notes)}")
     return ProbePath(
-        topic=topic.name,
-        frame_id=next(iter(frames)),
-        stamps=stamps[usable],
+        topic=read.name,
+        frame_id=read.frames[0],
+        stamps=read.times[usable, 1],
         positions=poses[usable, :3],
         orientations=poses[usable, 3:],
-        log_times=log_times[usable],
+        log_times=read.times[usable, 0],
         rejected=rejected,
         note="; ".join(notes),
     )

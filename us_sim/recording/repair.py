@@ -68,6 +68,7 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
                     topic.qos,
                     topic.type_hash or None,
                     schema=topic.schema,
+                    defined=False,
                 )
             except BagError as error:
                 damage.append(f"{topic.name} is left out: {error}")

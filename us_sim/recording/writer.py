@@ -122,6 +122,7 @@ class BagWriter:
         type_hash: str | None = None,
         *,
         schema: str | None = None,
+        defined: bool = True,
     ) -> None:
         """Makes a topic known; adding it again with the same type adds what is offered anew.
 
@@ -132,13 +133,14 @@ class BagWriter:
                 later is in ``metadata.yaml`` and in files begun after that.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
+            defined: False takes a type whose definition is not known, and writes none.
 
         Raises:
             BagError: the type is unknown, differs from before, or the bag is closed.
         """
         if self._ended:
             raise BagError(self._closed_because)
-        if self._contents.add_topic(topic, type_name, qos, type_hash, schema):
+        if self._contents.add_topic(topic, type_name, qos, type_hash, schema, defined=defined):
             self._contents.introduce(topic, self._output)
 
     def write(

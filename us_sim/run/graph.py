@@ -116,12 +116,12 @@ def parameters_file(processes: Sequence[NodeProcess]) -> str:
 
 
 def player_settings(
-    scene: Scene, path: Path, recorder: SessionRecorderSettings | None
+    scene: Scene, path: Path, recorder: SessionRecorderSettings | None, topic: str = ""
 ) -> dict[str, object]:
     """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
     return {
         "path": str(path.expanduser().resolve()),
-        "topic": (scene.tracker.body or "") if scene.tracker.source.name == "path" else "",
+        "topic": topic,
         **_awaited(["tracker/pose", *scene.ready_topics], recorder),
     }
 

@@ -46,10 +46,11 @@ def dry_run(
     *,
     record: Path | None,
     path: Path | None,
+    topic: str | None = None,
     view: ViewerSettings | None = None,
 ) -> str:
     """What :func:`run` would start and what it would leave out, and why, one line each."""
-    plan_of(Request(scene, parameters, record, path, view=view))
+    plan_of(Request(scene, parameters, record, path, topic, view=view))
     rows = [
         ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
     ]
@@ -84,6 +85,7 @@ def run(
     duration: float | None,
     network: bool,
     supervision: SupervisionSettings,
+    topic: str | None = None,
     view: ViewerSettings | None = None,
     by_hand: bool = False,
     playing: Mapping[str, object] | None = None,
@@ -99,6 +101,7 @@ def run(
         duration: s, after which all ends.
         network: talk beyond this host.
         supervision: when a node hangs, and how often it is started again.
+        topic: of the body in the bag whose poses are played.
         view: address of the page that shows the simulation; None is no page.
         by_hand: poses come on ``tracker/pose``, whatever the scene's tracker is.
         playing: parameters of what plays the path.
@@ -108,11 +111,13 @@ def run(
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
             recorded.
     """
+    if topic and path is None:
+        raise UsSimError(f"--topic {topic}: is of a path: name its file with --path")
     keep_on_this_host(network=network)
-    request = Request(scene, parameters, record, path, duration=duration, view=view)
+    request = Request(scene, parameters, record, path, topic, duration=duration, view=view)
     request = replace(request, by_hand=by_hand, playing=playing or {})
     plan = plan_of(request).with_free_port()
-    prepare_volume(scene, path)
+    prepare_volume(scene, path, plan.topic)
     outcome = follow(plan, None, supervision, request, forks)
     for file in outcome.files:
         print(f"recorded to {file}")
@@ -130,6 +135,7 @@ def demo(
     supervision: SupervisionSettings,
     source: str | None = None,
     path: Path | None = None,
+    topic: str | None = None,
     view: ViewerSettings | None = None,
     forks: ForkServer | None = None,
 ) -> int:
@@ -145,6 +151,7 @@ def demo(
         source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
             None is the one that the scene's tracker asks for.
         path: bag or recording that is played in place of the scene's own path.
+        topic: of the body in it whose poses are played.
         view: address of the page that shows the simulation; None is no page.
         forks: that the nodes are forked from; None starts each as a program.
 
@@ -165,13 +172,13 @@ def demo(
         raise UsSimError(f"{recording} exists already; choose another folder with --out")
     source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     if source == "path":
-        path_of(scene, file)  # before anything is made for what cannot be played
+        path_of(scene, file, topic)  # before anything is made for what cannot be played
     with _made_unless_refused(out):
-        video = _prepared_video(scene, file) if source == "camera" else None
+        video = _prepared_video(scene, file, topic) if source == "camera" else None
         played = file if video is None else None
-        request = Request(scene, parameters, recording, played, video=video, view=view)
+        request = Request(scene, parameters, recording, played, topic, video=video, view=view)
         plan = plan_of(request).with_free_port()
-        prepare_volume(scene, played)
+        prepare_volume(scene, played, plan.topic)
     started = time.monotonic()
     outcome = follow(plan, out / "nodes.log", supervision, request, forks)
     try:
@@ -267,7 +274,7 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
     return 0
 
 
-def prepare_volume(scene: Scene, path: Path | None = None) -> None:
+def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = None) -> None:
     """Make a phantom that is not in the cache yet, in view of the person who waits.
 
     The tissue of a case is made too, and kept in the case. Of a phantom that is there nothing is
@@ -291,7 +298,7 @@ def prepare_volume(scene: Scene, path: Path | None = None) -> None:
         if path is not None:
             from us_sim.scene.image_in_volume import check_path_in_volume
 
-            check_path_in_volume(scene, path, volume)
+            check_path_in_volume(scene, path, volume, topic)
         if scene.volume.case is not None:
             from us_sim.scene.case_tissue import keep_tissue
 
@@ -311,7 +318,7 @@ def _is_kept(scene: Scene) -> bool:
     )
 
 
-def _prepared_video(scene: Scene, file: Path) -> PathVideo:
+def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
     """What the scene's camera sees of a path, rendered in view of the person who waits."""
     from us_sim.demo.camera_video import path_video
     from us_sim.recording.path import read_path
@@ -324,7 +331,7 @@ def _prepared_video(scene: Scene, file: Path) -> PathVideo:
                 bar.append(stack.enter_context(Progress("rendering the video", total, "images")))
             bar[0].update(done)
 
-        return path_video(scene, read_path(file), show)
+        return path_video(scene, read_path(file, topic, option="--topic"), show)
 
 
 def _require_a_cache() -> None:

@@ -35,7 +35,13 @@ QUIET_S = 0.25
 
 
 def render_scene(
-    scene: Scene, path: Path | None, out: Path, parameters: Parameters, *, truth: bool = False
+    scene: Scene,
+    path: Path | None,
+    out: Path,
+    parameters: Parameters,
+    *,
+    topic: str | None = None,
+    truth: bool = False,
 ) -> int:
     """`us-sim render`: with checks of its arguments, and progress.
 
@@ -52,10 +58,13 @@ def render_scene(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    prepare_volume(scene, path)
+    topic = path_of(scene, path, topic).topic
+    prepare_volume(scene, path, topic)
     folders = truth_folders(scene, out) if truth else {}
-    with Progress("rendering", len(path_of(scene, path)), "images") as bar:
-        count = render(scene, path, out, lambda done, _: bar.update(done), parameters, folders)
+    with Progress("rendering", len(path_of(scene, path, topic)), "images") as bar:
+        count = render(
+            scene, path, out, lambda done, _: bar.update(done), parameters, folders, topic=topic
+        )
     print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
     for what, folder in folders.items():
         print(f"the {what} of each in {folder}")
@@ -98,6 +107,7 @@ def render(
     progress: Callable[[int, int], None],
     parameters: Parameters | None = None,
     truth: Mapping[str, Path] | None = None,
+    topic: str = "",
 ) -> int:
     """Run ``scene`` along the path: ``out/images/*.png`` and ``out/session.mcap``.
 
@@ -107,6 +117,7 @@ def render(
         progress: called with the images done and the poses there are.
         parameters: more parameters by node, as YAML texts.
         truth: folders for what is known of each image, as `truth_folders` gives them.
+        topic: of the body in the path's file.
 
     Returns:
         The number of images, equal to the number of poses.
@@ -134,7 +145,7 @@ def render(
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
-        for name, settings in _nodes(scene, path, out, parameters or {}, truth or {}):
+        for name, settings in _nodes(scene, path, topic, out, parameters or {}, truth or {}):
             nodes.append(node_in_process(name, settings, context))
             executor.add_node(nodes[-1])
         for process in simulation_nodes(scene, parameters, played=True):
@@ -150,7 +161,12 @@ def render(
 
 
 def _nodes(
-    scene: Scene, path: Path, out: Path, parameters: Parameters, truth: Mapping[str, Path]
+    scene: Scene,
+    path: Path,
+    topic: str,
+    out: Path,
+    parameters: Parameters,
+    truth: Mapping[str, Path],
 ) -> list[tuple[str, dict[str, object]]]:
     """Name and parameters of each node: listeners first, the player last."""
     common: dict[str, object] = {"lockstep": True}
@@ -161,10 +177,11 @@ def _nodes(
         "exclude": ["/diagnostics"],
         "max_cache_size": 0,  # lose nothing, wait for the disk
         **scene_settings(scene),
+        "path": str(path.expanduser().resolve()),
         "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
     }
     recording = NodeProcess("session_recorder", recorder)
-    player = player_settings(scene, path, recorder_of([recording])) | {"lockstep": True}
+    player = player_settings(scene, path, recorder_of([recording]), topic) | {"lockstep": True}
     return [
         (recording.node, recorder),
         ("image_writer", {"folder": str(out / "images"), **writer}),

@@ -43,6 +43,7 @@ class Plan:
     duration: float | None = None  # s
     player: str = "path_player"  # node that plays them
     loops: bool = False  # it begins again at its end
+    topic: str | None = None  # of the body in the path that is played
 
     @property
     def nodes(self) -> list[str]:
@@ -92,6 +93,8 @@ def plan_of(request: Request) -> Plan:
     if request.record is not None:
         settings = {"file": str(request.record.expanduser().resolve())}
         settings |= scene_settings(scene)
+        if request.path is not None:
+            settings["path"] = _absolute(request)
         if request.video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings, recorder))
@@ -110,12 +113,14 @@ def plan_of(request: Request) -> Plan:
         return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
     if request.path is None:
         return Plan(processes, duration=request.duration)
-    count = len(path_of(scene, request.path, str(player.get("topic") or "") or None))
-    settings = player_settings(scene, request.path, awaited) | dict(request.playing)
+    path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
+    settings = player_settings(scene, request.path, awaited, path.topic) | dict(request.playing)
     processes.append(NodeProcess("path_player", settings, player))
     ends = not settings.get("stay")
     loops = bool(processes[-1].all_parameters.get("loop"))
-    return Plan(processes, count if ends else None, request.duration, loops=loops)
+    return Plan(
+        processes, len(path) if ends else None, request.duration, loops=loops, topic=path.topic
+    )
 
 
 def _absolute(request: Request) -> str:

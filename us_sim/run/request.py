@@ -28,6 +28,7 @@ class Request:
     parameters: Parameters = field(default_factory=dict)  # given by a person, by node
     record: Path | None = None  # MCAP file to record to
     path: Path | None = None  # bag to play to the tracker
+    topic: str | None = None  # of the body in it whose poses are played
     everything: bool = False  # the bag's topics are published in place of the scene's nodes
     playing: Mapping[str, object] = field(default_factory=dict)  # parameters of what plays it
     video: PathVideo | None = None  # to show the scene's camera in place of a path
@@ -46,4 +47,4 @@ class Request:
 
     def without_replay(self) -> Request:
         """Nothing is played."""
-        return replace(self, path=None, everything=False, playing={}, is_changed=True)
+        return replace(self, path=None, topic=None, everything=False, playing={}, is_changed=True)

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,9 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError, ProbeError, SceneError
+from us_sim.errors import BagError, ProbeError, SceneError, TrackingError
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES
+from us_sim.tracking.measurement import PATIENT
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
@@ -78,21 +80,36 @@ def volume_of(scene: Scene, progress: Callable[[float, str], None] | None = None
 
 
 def path_of(scene: Scene, file: Path, topic: str | None = None) -> ProbePath:
-    """The probe path in a bag or a recording, in the frame that the scene's tracker has.
+    """The probe path in a bag or a recording, of the scene's tracker or of the probe itself.
+
+    Args:
+        scene: whose tracker says which body of the file it is, where the file has that.
+        file: bag or recording.
+        topic: the body that a person names.
 
     Raises:
-        BagError: it cannot be read, or is in another frame.
+        BagError: it cannot be read, or is neither in the tracker's frame nor in ``patient``.
     """
     from us_sim.recording.path import read_path
 
-    option = "--param path_player.topic=NAME"
-    if scene.tracker.source.name == "path":
-        topic, option = topic or scene.tracker.body, "tracker.body"
-    path = read_path(file, topic, option=option)
-    if path.frame_id != scene.tracker.frame:
+    tracker = scene.tracker
+    named = {
+        "path": tracker.body,
+        "tf": f"tf:{tracker.body}:{tracker.frame}",
+        "pose_array": f"tracker/poses:{tracker.entry}",
+    }.get(tracker.source.name)
+    own = str(file) == tracker.file
+    path = None
+    if topic is None and named and not own:
+        with contextlib.suppress(BagError, TrackingError):  # it may be of another device
+            path = read_path(file, named)
+    if path is None:
+        topic = named if own else topic
+        path = read_path(file, topic, option="tracker.body" if own else "--topic")
+    if path.frame_id not in (tracker.frame, PATIENT):
         raise BagError(
             f"{file}: {path.topic} is in frame '{path.frame_id}', but the scene's tracker is in "
-            f"'{scene.tracker.frame}'; set tracker.frame in {scene.origin}"
+            f"'{tracker.frame}'; set tracker.frame in {scene.origin}"
         )
     return path
 

@@ -27,6 +27,7 @@ from us_sim.scene.building import path_of, probe_of
 from us_sim.scene.scene import Scene
 from us_sim.scene.tracker_building import tracker_poses_of
 from us_sim.slicing.probe.probe import Probe
+from us_sim.tracking.measurement import PATIENT
 from us_sim.volume.volume import Volume
 
 __all__ = ["check_path_in_volume", "part_inside"]
@@ -71,14 +72,16 @@ def part_inside(
     return parts
 
 
-def check_path_in_volume(scene: Scene, file: Path, volume: Volume) -> None:
+def check_path_in_volume(
+    scene: Scene, file: Path, volume: Volume, topic: str | None = None
+) -> None:
     """Refuse a path of which no image shows what was scanned.
 
     Raises:
         SceneError: with where the volume is, and where the images are.
         BagError: the path cannot be read.
     """
-    poses, probe = _sampled(scene, path_of(scene, file)), probe_of(scene)
+    poses, probe = _sampled(scene, path_of(scene, file, topic)), probe_of(scene)
     scanned = volume.intensities if volume.intensities.any() else None  # black at any pose
     shown = part_inside(probe, poses, volume.patient_to_index, volume.shape, scanned)
     if shown.max() >= _LITTLE:
@@ -98,6 +101,9 @@ def check_path_in_volume(scene: Scene, file: Path, volume: Volume) -> None:
 def _sampled(scene: Scene, path: ProbePath) -> list[Pose]:
     """Poses of the probe in ``patient`` along a path."""
     registration, calibration = tracker_poses_of(scene)
+    if path.frame_id == PATIENT:  # the probe's own, or of a tracker whose frame that is
+        of_tracker = scene.tracker.frame == PATIENT
+        registration, calibration = (registration, calibration) if of_tracker else (Pose(), Pose())
     picked = np.unique(np.linspace(0, len(path) - 1, _POSES).round().astype(int))
     tracked = [Pose(path.positions[i], path.orientations[i]) for i in picked]
     return [registration @ pose @ calibration for pose in tracked]

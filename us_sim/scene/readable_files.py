@@ -66,7 +66,7 @@ def check_files(scene: Scene) -> list[str]:
     if scene.path:
         from us_sim.recording.path import read_path
 
-        read_path(Path(scene.path), option="--param path_player.topic=NAME")
+        read_path(Path(scene.path), option="--topic")
         checked.append("path")
     return checked
 

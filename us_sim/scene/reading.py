@@ -22,7 +22,7 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.spelling import nearest, shown
 from us_sim.share import shared_roots
 
-__all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_volume"]
+__all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_path", "with_volume"]
 
 
 def find_scene(name: str | Path) -> Path:
@@ -87,6 +87,13 @@ def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
 def with_volume(document: dict[Any, Any], file: str) -> dict[Any, Any]:
     """The document with another volume in place of its own."""
     return merged(document, {"volume": {"file": file}})
+
+
+def with_path(document: dict[Any, Any], file: str) -> dict[Any, Any]:
+    """The document with another probe path in place of its own, and of its tracker's recording."""
+    tracker = document.get("tracker") or {}
+    plays = {"tracker": {"file": file}} if tracker.get("source") == "path" else {}
+    return merged(document, {"path": file, **plays})
 
 
 def parse_scene(document: object, *, origin: str = "scene", folders: Sequence[Path] = ()) -> Scene:

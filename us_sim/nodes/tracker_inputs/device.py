@@ -17,10 +17,7 @@ if TYPE_CHECKING:
     from us_sim.scene.scene import Scene
     from us_sim.tracking.measurement import Measurement
 
-__all__ = ["PATIENT", "Device", "TrackerInput"]
-
-PATIENT = "patient"
-"""The frame of the tissue, and of the probe's poses."""
+__all__ = ["Device", "TrackerInput"]
 
 
 class TrackerInput:

@@ -10,7 +10,7 @@ import numpy as np
 from us_sim.errors import SceneError
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import path_of
-from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.measurement import PATIENT, Measurement
 
 __all__ = ["PathInput"]
 
@@ -73,4 +73,6 @@ class PathInput(TrackerInput):
 
     def _send(self, stamp: int) -> None:
         self._device.health.received += 1
-        self._device.take(Measurement(stamp, self._path.pose(self._next)))
+        of_probe = self._path.frame_id == PATIENT != self._device.scene.tracker.frame
+        pose = self._path.pose(self._next)
+        self._device.take(Measurement(stamp, pose, of_probe=of_probe))

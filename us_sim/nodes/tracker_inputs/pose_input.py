@@ -6,8 +6,8 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 
-from us_sim.nodes.tracker_inputs.device import PATIENT, Device, TrackerInput
-from us_sim.tracking.measurement import Measurement
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.tracking.measurement import PATIENT, Measurement
 
 __all__ = ["PoseInput"]
 

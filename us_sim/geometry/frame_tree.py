@@ -1,7 +1,7 @@
 """Frames and their parents, as `tf` tells them, and the chain from one up to another.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.frame_tree import FrameTree
+>>> from us_sim.geometry.frame_tree import FrameTree
 >>> tree = FrameTree()
 >>> tree.place("tool", "base", Pose([0.0, 0.0, 0.2])), tree.place("tip", "tool", Pose([0.1, 0, 0]))
 (True, True)
