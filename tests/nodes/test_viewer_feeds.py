@@ -22,7 +22,10 @@ class Watcher(GuardedNode):
         super().__init__("watcher", **kwargs)
         self.health = Health(self, "test")
         self.post = Posted(self)
-        feeds = image_feeds(self, self.post, 30.0, lambda stamp: {"known": stamp})
+        self.flip = False
+        feeds = image_feeds(
+            self, self.post, 30.0, lambda stamp: {"known": stamp}, lambda: self.flip
+        )
         self.feeds = {feed.kind: feed for feed in feeds}
 
 
@@ -120,14 +123,25 @@ def test_an_image_says_where_its_pixels_are_and_what_else_is_known(bench, watche
     feed.watch(nothing)
     publisher = bench.publisher(Image, "ultrasound/image")
 
-    def header():
-        publisher.publish(image_message(speckle(4, 4), Time(sec=7), "probe"))
-        newest = feed.newest()
-        return newest.header if newest and "matrix" in newest.header else None
+    pixels = speckle(40, 30)
 
-    bench.spin_until(header)
-    assert header()["matrix"] == matrix.ravel().tolist()
-    assert header()["known"] == 7 * 10**9
+    def newest():
+        publisher.publish(image_message(pixels, Time(sec=7), "probe"))
+        packet = feed.newest()
+        return packet if packet and "matrix" in packet.header else None
+
+    packet = bench.spin_until(newest) or newest()
+    assert packet.header["matrix"] == matrix.ravel().tolist()
+    assert packet.header["known"] == 7 * 10**9
+    watcher.flip, last = True, feed.sequence
+    bench.spin_until(lambda: newest() and feed.sequence > last)
+    packet = newest()
+    shown = np.frombuffer(packet.payload, np.uint8).reshape(40, 30)
+    np.testing.assert_array_equal(shown, pixels[:, ::-1])
+    flipped = np.reshape(packet.header["matrix"], (4, 4))
+    for column, row in ((0, 0), (29, 3)):
+        there, here = flipped @ [29 - column, row, 0, 1], matrix @ [column, row, 0, 1]
+        np.testing.assert_allclose(there, here, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from fake_hand import PIXEL, FakeHand
+from fake_hand import MATRIX, PIXEL, FakeHand
 
 from us_sim.viewer.simulator import Simulator
 
@@ -168,7 +168,13 @@ def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: 
     )
 
 
-def test_dragging_sideways_slides_and_the_wheel_presses(page: Any, viewer: FakeHand) -> None:
+@pytest.mark.parametrize("flip", [1, -1])
+def test_dragging_sideways_slides_and_the_wheel_presses(
+    page: Any, viewer: FakeHand, flip: int
+) -> None:
+    viewer.show(stamp="2", matrix=[flip * PIXEL, 0, 0, flip * -0.0128, *MATRIX[4:]])
+    shown = "import('/us_sim/assets/image.js').then(m => m.frameShown().header.stamp)"
+    viewer.until(lambda: page.evaluate(shown) == "2")
     box = box_of_image(page)
     metres = 320 * PIXEL / box["height"]
     x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
@@ -176,7 +182,7 @@ def test_dragging_sideways_slides_and_the_wheel_presses(page: Any, viewer: FakeH
     page.mouse.down()
     page.mouse.move(x - 60, y, steps=10)
     page.mouse.up()
-    viewer.until(lambda: viewer.total("slide")[0] == pytest.approx(-60 * metres, rel=0.1))
+    viewer.until(lambda: viewer.total("slide")[0] == pytest.approx(flip * -60 * metres, rel=0.1))
     viewer.asked.clear()
     page.mouse.wheel(0, 300)
     viewer.until(lambda: viewer.total("press") == pytest.approx(1.5e-3))

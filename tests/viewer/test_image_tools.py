@@ -240,6 +240,31 @@ def test_a_measure_is_seen_with_its_frame_only(page: Any, images: Images) -> Non
     assert values(page) == ["20.0 mm"]
 
 
+def test_flipped_the_mark_is_right_and_measures_are_where_they_are_seen(
+    page: Any, images: Images, tmp_path: Path
+) -> None:
+    mark = page.locator(".us-mark")
+    image = page.locator(".us-image").bounding_box()
+    middle = image["x"] + image["width"] / 2
+    assert mark.bounding_box()["x"] < middle
+    flipped = [-ACROSS, 0, 0, 0.02 - ACROSS, *MATRIX[4:]]
+    images.show(41, matrix=flipped)
+    until(lambda: mark.bounding_box()["x"] > middle, "the mark is at the other side")
+    assert "right" in mark.get_attribute("title")
+    page.keyboard.press("d")
+    drag(page, at(page, -15, 10), at(page, -5, 20))  # at the left
+    assert values(page) == ["14.1 mm"]
+    points = f"import('{TOOLS}/overlay.js').then(m => m.overlay.measures[0].points)"
+    assert page.evaluate(points)[0] == pytest.approx([15, 10], abs=0.3)
+    handle = page.locator(".us-handle").first.bounding_box()
+    assert handle["x"] + handle["width"] / 2 == pytest.approx(at(page, -15, 10)[0], abs=1)
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    download.value.save_as(tmp_path / "flipped.png")
+    yellow = (cv2.imread(str(tmp_path / "flipped.png")) == (0x66, 0xD1, 0xFF)).all(axis=2)
+    assert np.flatnonzero(yellow[:800].any(axis=0)).max() < 0.5 * yellow.shape[1]
+
+
 def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> None:
     kept = page.evaluate(
         f"""() => import('{TOOLS}/cine.js').then(({{ Cine }}) => {{

@@ -19,9 +19,10 @@ PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from(
 PIXEL += "c.getContext('2d').getImageData(5, 5, 1, 1).data).slice(0, 3) : null; }}"
 
 
-def known(value: str) -> NodeParameters:
+def known(value: str, is_flipped: bool = False) -> NodeParameters:
     overlay = Parameter(NODE, "overlay", Kind.TEXT, value, choices=("none", "strain", "velocity"))
-    return NodeParameters(NODE, State.THERE, {"overlay": overlay})
+    flip = Parameter(NODE, "flip", Kind.TRUTH, is_flipped)
+    return NodeParameters(NODE, State.THERE, {"overlay": overlay, "flip": flip})
 
 
 @pytest.fixture
@@ -152,3 +153,16 @@ def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
     until(lambda: NODE in simulator.nodes.watched, "the page looks at the node")
     page.close()
     until(lambda: NODE not in simulator.nodes.watched, "nobody looks at it any more")
+
+
+def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(
+    page: Any, simulator: Simulator, asked: list[Any]
+) -> None:
+    page.goto(page.address)
+    flip = page.get_by_role("button", name="Flip")
+    flip.click()
+    until(lambda: asked == [True], "the node is asked")
+    simulator.nodes.tell(known("none", is_flipped=True))
+    until(lambda: flip.get_attribute("aria-pressed") == "true", "it is flipped")
+    flip.click()
+    until(lambda: asked == [True, False], "the node is asked for the other")

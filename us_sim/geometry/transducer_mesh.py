@@ -107,8 +107,14 @@ def transducer_mesh(collider: Collider) -> list[TransducerPart]:
     housing.append(_flat_ring(0.0, 0.0, _RELIEF_RADIUS, last))
     high, wide, long = _NOTCH
     middle = top - _SHOULDER - 0.012
+    # At -x, on the side of the image's first column: the mark is at the image's left.
+    half_turn = np.array([-1.0, -1.0, 1.0])
     notch = [
-        np.array([grip_x + high * scale, 0.0, middle]) + _turned(_flat_ring(0, 0, wide, 0), size)
+        half_turn
+        * (
+            np.array([grip_x + high * scale, 0.0, middle])
+            + _turned(_flat_ring(0, 0, wide, 0), size)
+        )
         for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3)))
     ]
     return [

@@ -94,7 +94,9 @@ class AnnotatedImage:
     def show_probe(self, probe: Probe) -> None:
         """The images that come are of another probe; those before it are not shown again."""
         self._probe = probe
-        self._annotation = Annotation(probe, self._structures)
+        self._annotation = Annotation(
+            probe, self._structures, is_flipped=self._settings.values["shown"].flip
+        )
         self._frame: Frame | None = None
         self._labels: Pixels | None = None
         self._is_outlined = False
@@ -172,6 +174,10 @@ class AnnotatedImage:
             image = frame.pixels
             self._outline(frame)
             overlay = self._overlay(frame)
+        if self._annotation.is_flipped != self._settings.values["shown"].flip:
+            self._annotation = Annotation(
+                self._probe, self._structures, is_flipped=not self._annotation.is_flipped
+            )
         lines = [line for each in self._streams if each.is_wanted for line in each.lines]
         picture = self._annotation.draw(image, self._labels, badge, overlay, lines)
         self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))

@@ -49,6 +49,11 @@ class AnnotatedImageSettings(Settings):
         choices=OVERLAYS,
         default="none",
     )
+    flip: bool = setting(
+        description="left and right exchanged in the annotated image and on the page: the probe's "
+        "mark is at the right then",
+        default=False,
+    )
 
 
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.nodes.viewer_session import ViewerSession
-from us_sim.viewer.parameters import in_words
+from us_sim.viewer.parameters import Parameter, in_words
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
@@ -54,7 +55,8 @@ class Viewer(GuardedNode):
         )
         rest = RestMesh(self)
         hand = ViewerHand(self, self.post, self.simulator, rest)
-        self.simulator.add(*image_feeds(self, self.post, settings.rate, self._known))
+        images = image_feeds(self, self.post, settings.rate, self._known, self._is_flipped)
+        self.simulator.add(*images)
         probe = ProbeFeeds(self, self.post, settings.rate)
         self._hand, self._probe = hand, probe
         self.simulator.add(*SkinFeeds(self, self.post, settings.rate).feeds, *probe.feeds)
@@ -72,6 +74,14 @@ class Viewer(GuardedNode):
                 f"the address with its token can see and move everything, and nothing is encrypted"
             )
 
+    @property
+    def _imaging(self) -> Mapping[str, Parameter]:
+        return self.simulator.nodes.of("slice_interpolator").parameters
+
+    def _is_flipped(self) -> bool:
+        flip = self._imaging.get("flip")
+        return flip is not None and bool(flip.raw)
+
     def _known(self, stamp: int) -> dict[str, Any]:
         """For pages, beside the image of a stamp (ns): the scene, and how the probe was then.
 
@@ -79,7 +89,7 @@ class Viewer(GuardedNode):
         for it, of the last wish that is seen in the image; so the page can tell how long that took.
         """
         probe = self._probe.at(str(stamp))
-        parameters = self.simulator.nodes.of("slice_interpolator").parameters
+        parameters = self._imaging
         told = {
             "command": self._hand.asked.by(stamp),
             "press": self._hand.press(stamp, probe.get("position")),

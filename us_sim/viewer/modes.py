@@ -12,7 +12,7 @@ from us_sim.viewer.simulator import Simulator
 
 __all__ = ["build_modes"]
 
-NODE, OVERLAY = "slice_interpolator", "overlay"
+NODE, OVERLAY, FLIP = "slice_interpolator", "overlay", "flip"
 MODES = {
     "b-mode": ("B-mode", "The image as it is"),
     "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
@@ -25,6 +25,7 @@ STRIPS = {
     "m_mode": ("M-mode", "Echoes along one line of the image over time"),
     "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
 }
+FLIP_TOLD = "Exchange left and right, on all pages; the dot is at the side of the probe's mark"
 _LOOK_S = 0.3
 
 
@@ -42,6 +43,7 @@ class _Modes:
             ui.element("span").classes("us-gap")
             for kind, (label, tooltip) in STRIPS.items():
                 self._buttons[kind] = _button(label, tooltip, lambda kind=kind: self._toggle(kind))
+            self._buttons[FLIP] = _button("Flip", FLIP_TOLD, self._flip)
         self._mark()
         board = simulator.nodes
         board.watch(NODE)
@@ -49,13 +51,24 @@ class _Modes:
         ui.timer(_LOOK_S, self._look)
 
     async def _choose(self, mode: str) -> None:
-        if mode != "b-mode":
-            asked = self._simulator.nodes.set(NODE, OVERLAY, mode)
-            refused = await asyncio.wrap_future(asked)
-            if refused:
-                ui.notify(refused, type="warning", multi_line=True)
-                return
-        self._show(mode)
+        if mode == "b-mode" or await self._set(OVERLAY, mode):
+            self._show(mode)
+
+    async def _flip(self) -> None:
+        await self._set(FLIP, not self._is_flipped)
+        self._mark()
+
+    async def _set(self, name: str, value: object) -> bool:
+        """Set a parameter; whether that was not refused."""
+        refused = await asyncio.wrap_future(self._simulator.nodes.set(NODE, name, value))
+        if refused:
+            ui.notify(refused, type="warning", multi_line=True)
+        return not refused
+
+    @property
+    def _is_flipped(self) -> bool:
+        parameter = self._simulator.nodes.of(NODE).parameters.get(FLIP)
+        return parameter is not None and bool(parameter.raw)
 
     def _show(self, mode: str) -> None:
         self._mode = mode
@@ -78,11 +91,14 @@ class _Modes:
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
+        self._mark()
 
     def _mark(self) -> None:
+        shown = {**self._strips, self._mode: True, FLIP: self._is_flipped}
         for name, button in self._buttons.items():
-            pressed = self._strips.get(name, name == self._mode)
-            button.props["aria-pressed"] = str(pressed).lower()
+            pressed = str(shown.get(name, False)).lower()
+            if button.props.get("aria-pressed") != pressed:
+                button.props["aria-pressed"] = pressed
 
 
 def _button(label: str, tooltip: str, on_click: Any) -> ui.button:

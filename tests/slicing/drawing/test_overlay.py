@@ -73,3 +73,25 @@ def test_an_overlay_lies_below_scales_and_names_and_its_outline_is_drawn():
     assert picture[150, 150].min() > 150  # the outline
     np.testing.assert_array_equal(picture[:, -12:], plain[:, -12:])  # the scale of depth
     assert (picture[20:130, 10:30] != plain[20:130, 10:30]).any()
+
+
+def test_flipped_all_but_what_is_written_has_left_and_right_exchanged():
+    rng = np.random.default_rng(4)
+    grey = rng.integers(0, 100, (300, 300), np.uint8)
+    labels = np.zeros((300, 300), np.uint8)
+    labels[180:260, 150:200] = 1
+    values = np.full((300, 300), np.nan, np.float32)
+    values[150:200, 60:110] = 0.2
+    outline = np.array([[60.0, 150], [109, 150], [109, 199], [60, 199]])
+    drawn = [np.array([[150.0, 20], [240, 140]])]
+    overlay = Overlay(values, SCALE, outline=outline)
+    structures = {1: ("vein", (0.2, 0.3, 0.9))}
+    plain = Annotation(PROBE, structures).draw(grey, labels, overlay=overlay, lines=drawn)
+    flipped = Annotation(PROBE, structures, is_flipped=True).draw(
+        grey, labels, overlay=overlay, lines=drawn
+    )
+    middle = slice(40, 260)  # without the scales
+    same = (plain[140:270, middle] == flipped[140:270, ::-1][:, middle]).all(axis=2)
+    assert same.mean() > 0.95  # names and smooth edges may differ
+    assert flipped[175, 299 - 80].tolist() == plain[175, 80].tolist()
+    assert (plain[:20] != flipped[:20, ::-1]).any()  # what is written, and that it is flipped

@@ -32,7 +32,11 @@ Known = Callable[[int], dict[str, Any]]
 
 
 def image_feeds(
-    node: GuardedNode, post: Posted, rate: float, known: Known = lambda _: {}
+    node: GuardedNode,
+    post: Posted,
+    rate: float,
+    known: Known = lambda _: {},
+    is_flipped: Callable[[], bool] = lambda: False,
 ) -> list[Feed]:
     """The B-mode image as ``image`` and ``image_jpeg``, and pictures in colour.
 
@@ -43,19 +47,24 @@ def image_feeds(
         post: has work done in the node's thread.
         rate: Hz, of images, at most, for each page.
         known: what else is known of the image of a stamp, ns, for its header.
+        is_flipped: whether left and right are to be exchanged, as they are in the annotated one.
     """
-    places: dict[str, Any] = {}
+    places: list[NDArray[np.float64]] = []
 
     def place(message: Float64MultiArray) -> None:
-        places["matrix"] = affine_from(message).ravel().tolist()
+        places[:] = [affine_from(message)]
 
     node.create_subscription(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
 
-    def telling(make: Make) -> Make:
+    def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
         def tell(message: Image, sequence: int) -> Packet:
-            packet = make(message, sequence)
-            told = known(int(packet.header["stamp"]))
-            return replace(packet, header={**packet.header, **places, **told})
+            flip = is_flipped()
+            packet = make(message, sequence, flip)
+            header = {**packet.header, **known(int(packet.header["stamp"]))}
+            for matrix in places:
+                of_pixels = _flipped(matrix, int(header["columns"])) if flip else matrix
+                header["matrix"] = of_pixels.ravel().tolist()
+            return replace(packet, header=header)
 
         return tell
 
@@ -66,18 +75,29 @@ def image_feeds(
     return [
         images("ultrasound/image", "image", telling(_pixels)),
         images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
-        images("ultrasound/image_annotated", "annotated", telling(annotated)),
+        images("ultrasound/image_annotated", "annotated", telling(lambda m, n, _: annotated(m, n))),
         *(images(topic, kind, _colour_jpeg(kind)) for kind, topic in _STRIPS.items()),
     ]
 
 
-def _pixels(message: Image, sequence: int) -> Packet:
-    pixels = np.ascontiguousarray(pixels_from(message))
-    return Packet("image", sequence, _header(message, "mono8"), pixels.tobytes())
+def _pixels(message: Image, sequence: int, flip: bool) -> Packet:
+    return Packet("image", sequence, _header(message, "mono8"), _grey(message, flip).tobytes())
 
 
-def _grey_jpeg(message: Image, sequence: int) -> Packet:
-    return _jpeg(message, "image_jpeg", sequence, pixels_from(message))
+def _grey_jpeg(message: Image, sequence: int, flip: bool) -> Packet:
+    return _jpeg(message, "image_jpeg", sequence, _grey(message, flip))
+
+
+def _grey(message: Image, flip: bool) -> NDArray[np.uint8]:
+    pixels = pixels_from(message)
+    return np.ascontiguousarray(pixels[:, ::-1] if flip else pixels)
+
+
+def _flipped(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+    """From (column, row, 0, 1) of the image whose left and right are exchanged."""
+    exchange = np.diag([-1.0, 1.0, 1.0, 1.0])
+    exchange[0, 3] = columns - 1
+    return matrix @ exchange
 
 
 def _colour_jpeg(kind: str) -> Make:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from us_sim.slicing.drawing.colour_bar import ColourBar
 from us_sim.slicing.drawing.label_outlines import label_outlines
 from us_sim.slicing.drawing.lettering import Colour, Label, lettering
+from us_sim.slicing.drawing.overlay import mirrored
 
 if TYPE_CHECKING:
     from us_sim.slicing.drawing.overlay import Overlay
@@ -52,11 +53,17 @@ class Annotation:
     Args:
         probe: its ``image_to_probe``, columns, rows and focus are read.
         structures: name and colour (red, green, blue, 0 to 1) of each label to be outlined.
+        is_flipped: exchange left and right of all but what is written, which says so then.
     """
 
     def __init__(
-        self, probe: Probe, structures: Mapping[int, tuple[str, tuple[float, float, float]]]
+        self,
+        probe: Probe,
+        structures: Mapping[int, tuple[str, tuple[float, float, float]]],
+        *,
+        is_flipped: bool = False,
     ) -> None:
+        self.is_flipped = is_flipped
         self._rows, self._columns = probe.rows, probe.columns
         self._picture: Box = (0, 0, self._columns, self._rows)
         self._text = int(np.clip(round(min(self._rows, self._columns) / 40), 8, 48))
@@ -75,6 +82,9 @@ class Annotation:
         if probe.focus is not None:
             self._lay_out_focus(round((probe.focus - matrix[2, 3]) / matrix[2, 1]))
         self._lay_out_width(matrix[0, 3], matrix[0, 0])
+        if is_flipped:
+            label = lettering("flipped", self._text, _FOCUS)
+            self._place(label, self._columns - 6 * self._text - label.width, self._frame)
 
     def draw(
         self,
@@ -92,7 +102,14 @@ class Annotation:
             badge: for an image that is not live.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
+
+        All as in an image that is not flipped.
         """
+        if self.is_flipped:
+            pixels = np.ascontiguousarray(pixels[:, ::-1])
+            labels = None if labels is None else np.ascontiguousarray(labels[:, ::-1])
+            overlay = None if overlay is None else overlay.flipped()
+            lines = [mirrored(line, self._columns) for line in lines]
         picture = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
         bar = None
         if overlay is not None:
@@ -138,11 +155,15 @@ class Annotation:
     def _lay_out_width(self, first: float, spacing: float) -> None:
         """Lay out ticks and labels of lateral distance from the middle along the bottom."""
         widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
-        step, between = _steps(spacing, self._columns, 1.5 * widest)
+        if self.is_flipped:
+            first = first + (self._columns - 1) * spacing
+            spacing = -spacing
+        step, between = _steps(abs(spacing), self._columns, 1.5 * widest)
         edge = self._rows - 1
         above = edge - self._text
         beside_depth = self._columns - 2 * self._text
-        for x in _multiples(between, first, first + (self._columns - 1) * spacing):
+        last = first + (self._columns - 1) * spacing
+        for x in _multiples(between, min(first, last), max(first, last)):
             column = round((x - first) / spacing)
             if column >= beside_depth or _is_taken((column, above, column, edge), self._occupied):
                 continue

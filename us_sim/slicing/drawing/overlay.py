@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.drawing.lettering import Colour
 
-__all__ = ["ColourScale", "Overlay"]
+__all__ = ["ColourScale", "Overlay", "mirrored"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,13 @@ class Overlay:
     note: str = ""
     outline: NDArray[np.floating] | None = None
 
+    def flipped(self) -> Overlay:
+        """The same with left and right exchanged."""
+        outline = self.outline
+        if outline is not None:
+            outline = mirrored(outline, self.values.shape[1])
+        return replace(self, values=np.ascontiguousarray(self.values[:, ::-1]), outline=outline)
+
     def lay_over(self, picture: NDArray[np.uint8]) -> None:
         """Blend the colours into a (rows, columns, 3) picture of red, green and blue."""
         levels = cv2.cvtColor(self.scale.levels(self.values), cv2.COLOR_GRAY2RGB)
@@ -82,3 +89,8 @@ class Overlay:
         blended = cv2.addWeighted(colours, self.opacity, picture, 1.0 - self.opacity, 0.0)
         there = np.equal(self.values, self.values).view(np.uint8)  # not NaN
         cv2.copyTo(blended, there, picture)
+
+
+def mirrored(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
+    """Column and row (N, 2) in an image of so many columns whose left and right are exchanged."""
+    return np.column_stack([columns - 1 - line[:, 0], line[:, 1]])

@@ -26,7 +26,10 @@ const waiting = Object.assign(document.createElement("p"), {
 });
 const badge = Object.assign(document.createElement("p"), { className: "us-stale", hidden: true });
 badge.setAttribute("role", "status");
-place.append(canvas, scale, waiting, badge);
+/** On the side where the mark of the probe is: its -x. */
+const mark = Object.assign(document.createElement("span"), { className: "us-mark", hidden: true });
+mark.setAttribute("role", "img");
+place.append(canvas, scale, mark, waiting, badge);
 canvas.setAttribute("role", "img");
 canvas.setAttribute("aria-label", "Ultrasound image");
 const context = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
@@ -214,6 +217,15 @@ function drawScale() {
     width: `${box.width}px`,
     height: `${box.height}px`,
   });
+  mark.hidden = !geometry || !hasImage();
+  if (geometry) {
+    const isLeft = geometry[0] > 0;
+    const side = isLeft ? "left" : "right";
+    mark.title = `The probe's mark, the notch on its housing, is at the image's ${side}`;
+    mark.setAttribute("aria-label", mark.title);
+    const x = isLeft ? box.left : box.left + box.width - 12;
+    Object.assign(mark.style, { left: `${x}px`, top: `${box.top - 16}px` });
+  }
   const { width, height } = place.getBoundingClientRect();
   const ratio = devicePixelRatio;
   scale.width = Math.round(width * ratio);

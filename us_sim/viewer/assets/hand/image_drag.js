@@ -33,6 +33,12 @@ function metresPerPixel() {
   return ((to[1] - from[1]) * imageCanvas().height) / imageBox().height / 1000;
 }
 
+/** Whether the probe's x goes to the left. */
+function isFlipped() {
+  const from = pixelToMillimetres(0, 0);
+  return Boolean(from) && pixelToMillimetres(1, 0)[0] < from[0];
+}
+
 place.addEventListener("pointerdown", (event) => {
   if (isTaken || event.button !== 0 || event.defaultPrevented || event.target.closest("button")) return;
   if (fingers.count === 0) {
@@ -61,7 +67,8 @@ place.addEventListener("pointermove", (event) => {
     if (Math.hypot(...travelled) < DECIDED) return;
     mode = Math.abs(travelled[1]) >= Math.abs(travelled[0]) ? "press" : "slide";
   }
-  const by = mode === "press" ? { press: down * scale } : { slide: [right * scale, 0] };
+  const across = isFlipped() ? -right : right;
+  const by = mode === "press" ? { press: down * scale } : { slide: [across * scale, 0] };
   hand.ask({ by }, event.timeStamp);
 });
 

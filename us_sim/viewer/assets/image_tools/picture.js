@@ -38,7 +38,8 @@ export async function picture(frame = frameShown()) {
   const first = pixelToMillimetres(-0.5, -0.5, matrix);
   const last = pixelToMillimetres(columns - 0.5, rows - 0.5, matrix);
   const scale = Math.max(LEAST, rows) / (last[1] - first[1]); // pixels a mm
-  const width = Math.round((last[0] - first[0]) * scale);
+  const side = Math.sign(last[0] - first[0]); // of the probe's x; -1 where the image is flipped
+  const width = Math.round(Math.abs(last[0] - first[0]) * scale);
   const height = Math.round((last[1] - first[1]) * scale);
   const { measures } = frame;
   const lines = measures.filter((measure) => !(measure instanceof Note));
@@ -59,9 +60,14 @@ export async function picture(frame = frameShown()) {
   for (const [row, text] of [what.join("   "), facts.join("   ")].entries()) {
     draw.fillText(text, LEFT, EDGE + LINE * row, width);
   }
+  draw.beginPath(); // the probe's mark is at its -x
+  draw.arc(LEFT + (side > 0 ? 7 : width - 7), TOP - 9, 6, 0, 2 * Math.PI);
+  draw.fill();
   drawDepths(draw, first[1], last[1], scale);
-  const to = ([x, y]) => [LEFT + (x - first[0]) * scale, TOP + (y - first[1]) * scale];
-  for (const [number, measure] of measures.entries()) drawMeasure(draw, measure, number, to, scale);
+  const to = ([x, y]) => [LEFT + side * (x - first[0]) * scale, TOP + (y - first[1]) * scale];
+  for (const [number, measure] of measures.entries()) {
+    drawMeasure(draw, measure, number, to, scale, side);
+  }
   for (const [row, measure] of lines.entries()) {
     draw.fillStyle = measure.colour;
     const label = `${measures.indexOf(measure) + 1}   ${measure.text}`;
@@ -82,14 +88,14 @@ function drawDepths(draw, first, last, scale) {
   draw.textAlign = "left";
 }
 
-function drawMeasure(draw, measure, number, to, scale) {
+function drawMeasure(draw, measure, number, to, scale, side) {
   const points = measure.points.map(to);
   draw.strokeStyle = draw.fillStyle = measure.colour;
   draw.lineWidth = 2;
   draw.beginPath();
   if (measure instanceof Ellipse) {
     const [a, b] = measure.halves;
-    draw.ellipse(...to(measure.centre), a * scale, b * scale, measure.angle, 0, 2 * Math.PI);
+    draw.ellipse(...to(measure.centre), a * scale, b * scale, side * measure.angle, 0, 2 * Math.PI);
   } else if (points.length === 2) {
     draw.setLineDash([6, 5]);
     draw.moveTo(...points[0]);
