@@ -1,11 +1,13 @@
 """Blood on topics: made for those who subscribe, under the pose's stamp, as the parameters say."""
 
 import math
+import time
 
 import numpy as np
 import pytest
 import yaml
 from bench import pose_at
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -52,9 +54,9 @@ def cloud(points, pose):
     return cloud_message(dict(zip("xyz", points.T, strict=True)), pose.header.stamp, "patient")
 
 
-def tilted(second):
+def tilted(second, depth=0.0):
     """A pose whose beams lean along the artery."""
-    pose = pose_at(0.0, second)
+    pose = pose_at(depth, second)
     pose.pose.orientation.x = math.sin(math.radians(12))
     pose.pose.orientation.w = math.cos(math.radians(12))
     return pose
@@ -75,8 +77,8 @@ def send(bench, scene, arm):
         poses = bench.publisher(PoseStamped, "probe/pose")
         nodes = bench.publisher(PointCloud2, "tissue/nodes")
 
-        def pose(second):
-            poses.publish(tilted(second))
+        def pose(second, depth=0.0):
+            poses.publish(tilted(second, depth))
             nodes.publish(cloud(arm.nodes, tilted(second)))
 
         return node, pose
@@ -134,6 +136,35 @@ def test_colours_and_gates_show_in_the_annotated_image_when_they_are_asked_for(b
     bench.collect(Image, "ultrasound/spectrum")
     bench.spin_until(lambda: node._streams[-2].is_wanted)
     assert np.count_nonzero(colourful(12) & ~plain) > 3
+
+
+def test_why_an_image_shows_no_flow_is_on_diagnostics_at_once(bench, scene, send):
+    scene.write_text(yaml.safe_dump(yaml.safe_load(scene.read_text()) | {"skin": None}))
+    node, pose = send(contact=True, overlay="velocity")
+    told = bench.collect(DiagnosticArray, "diagnostics")
+    bench.collect(Image, "ultrasound/image_annotated")
+    bench.collect(Image, "ultrasound/spectrum")
+    bench.spin_until(lambda: node._annotated.is_wanted and node._streams[-2].is_wanted)
+
+    def says(second, **wanted):
+        told.clear()
+        began = time.monotonic()
+        pose(second, -0.01 if wanted["contact"] == "none" else 0.002)
+        bench.spin_until(
+            lambda: any(
+                wanted.items() <= {v.key: v.value for v in each.status[0].values}.items()
+                for each in told
+            )
+        )
+        return time.monotonic() - began
+
+    no_contact, no_vessel = "no_contact", "no_vessel"
+    waits = says(3, contact="none", no_colour=no_contact, no_spectrum=no_contact)
+    waits += says(4, contact="good", no_colour="", no_spectrum=no_vessel)
+    beside = [Parameter("colour.lateral", value=0.5), Parameter("colour.width", value=0.05)]
+    assert all(result.successful for result in node.set_parameters(beside))
+    waits += says(5, contact="good", no_colour=no_vessel, no_spectrum=no_vessel)
+    assert waits < 2.0  # else it comes once a second
 
 
 def test_nothing_is_computed_for_nobody(bench, send):

@@ -1,5 +1,6 @@
 """The bar above the image: what it sets, what it watches, and what it does when it is refused."""
 
+import time
 from concurrent.futures import Future
 from typing import Any
 
@@ -13,6 +14,7 @@ from us_sim.viewer.packet import Packet
 from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
 from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.status import Level, NodeStatus
 
 NODE = "slice_interpolator"
 PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from("
@@ -127,6 +129,49 @@ def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simul
     page.get_by_role("button", name="Outlines", pressed=True).wait_for()
     simulator.nodes.tell(known("strain"))
     page.get_by_role("button", name="Strain", exact=True, pressed=True).wait_for()
+
+
+@pytest.mark.usefixtures("asked")
+def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
+    probe = Feed("probe")
+    simulator.add(probe)
+
+    def press(newton: float, age: float = 0.0) -> None:
+        header = {"stamp": "1", "position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
+        header |= {"force": [0.0, 0.0, -newton], "force_age": age, "force_stamp": "1"}
+        probe.offer(lambda sequence: Packet("probe", sequence, header, b""))
+
+    def see(**values: str) -> None:
+        simulator.status.tell(NodeStatus(NODE, Level.WELL, "imaging", values), time.monotonic())
+
+    def is_said(*words: str) -> None:
+        page.wait_for_function(
+            "words => { const said = document.querySelector('.us-stale');"
+            " const lines = said.hidden ? [] : said.textContent.split('\\n');"
+            " return lines.length === words.length"
+            " && words.every((word, i) => lines[i].includes(word)); }",
+            arg=list(words),
+        )
+
+    page.goto(page.address)
+    see(contact="none", no_colour="no_contact")
+    is_said("No contact")
+    see(contact="good", no_colour="across_flow")
+    is_said()
+    page.get_by_role("button", name="Outlines").click()
+    page.get_by_role("button", name="Outlines", pressed=True).wait_for()
+    simulator.nodes.tell(known("velocity"))
+    is_said("No colour: the beams cross")
+    see(contact="poor", no_colour="no_contact", no_spectrum="no_vessel")
+    is_said("Poor contact")
+    page.get_by_role("button", name="Spectrum").click()
+    is_said("Poor contact", "No spectrum: no vessel")
+    see(contact="good", no_colour="", no_spectrum="")
+    is_said()
+    press(24.0)
+    is_said("Too much force: 24 N")
+    press(24.0, age=0.8)  # of a pose before
+    is_said()
 
 
 @pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])

@@ -27,11 +27,16 @@ from us_sim.nodes.skin_shapes import SkinShapes
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
 __all__ = ["SliceInterpolator", "main"]
 
 _BEYOND = 1e-3  # m, by which an image may be too deep before that is said
+
+_NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
+_SEEN = ("contact", "no_colour", "no_spectrum")
+"""Diagnostics that are sent at once when they change: they say why an image shows nothing."""
 
 REMEMBERED = 256
 """Poses kept for the deformed nodes that carry their stamps."""
@@ -61,6 +66,7 @@ class SliceInterpolator(SceneNode):
         self._carried = False
         self._poses: dict[int, Pose] = {}
         self._is_said = False  # that the image is too deep
+        self._seen: dict[str, str] = {}  # `_SEEN` in the diagnostics that were sent
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
         self._skin: SkinShapes | None = None
@@ -163,7 +169,12 @@ class SliceInterpolator(SceneNode):
         self.health.values |= {
             "probe_pose": self._annotated.state,
             "skipped_tetrahedra": str(self._scanner.skipped),
+            **_contact(frame),
         }
+        seen = {key: self.health.values.get(key, "") for key in _SEEN}
+        if seen != self._seen:
+            self._seen = seen
+            self.health.report()
 
     def _reach(self, pose: Pose) -> dict[str, str]:
         """Say once, and in diagnostics, that the image is deeper than what there is to see."""
@@ -178,6 +189,15 @@ class SliceInterpolator(SceneNode):
                 f"shown as it is without tissue, and black beyond the volume; set a smaller depth"
             )
         return {"beyond_mm": f"{1e3 * too_deep:.0f}"}
+
+
+def _contact(frame: Frame) -> dict[str, str]:
+    """How the face meets the skin, where that is modelled."""
+    if frame.contact is None:
+        return {}
+    coupling = float(frame.contact[0].mean())
+    word = "none" if coupling < _NONE else "poor" if coupling < _POOR else "good"
+    return {"contact": word, "coupling": f"{coupling:.2f}"}
 
 
 def _nanoseconds(message: PoseStamped | PointCloud2) -> int:

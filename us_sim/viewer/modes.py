@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
+from collections.abc import Mapping
 from typing import Any
 
 from nicegui import ui
@@ -26,6 +28,17 @@ STRIPS = {
     "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
 }
 FLIP_TOLD = "Exchange left and right, on all pages; the dot is at the side of the probe's mark"
+_CONTACT = {
+    "none": "No contact: press the probe onto the skin",
+    "poor": "Poor contact: press more, or tilt less",
+}
+_ABSENT = {
+    "no_contact": "no contact there: press more, or tilt less",
+    "no_vessel": "no vessel with a flow there: drag it over one",
+    "no_flow": "the vessel is closed: press less",
+    "across_flow": "the beams cross the flow at a right angle: tilt the probe, or steer the beams",
+    "too_slow": "the flow is slower than the wall filter lets through",
+}
 _LOOK_S = 0.3
 
 
@@ -45,9 +58,12 @@ class _Modes:
                 self._buttons[kind] = _button(label, tooltip, lambda kind=kind: self._toggle(kind))
             self._buttons[FLIP] = _button("Flip", FLIP_TOLD, self._flip)
         self._mark()
-        board = simulator.nodes
+        self._remarks: list[str] = []
+        board, status = simulator.nodes, simulator.status
         board.watch(NODE)
+        status.watch(pages=1)
         ui.context.client.on_delete(lambda: board.unwatch(NODE))
+        ui.context.client.on_delete(lambda: status.watch(pages=-1))
         ui.timer(_LOOK_S, self._look)
 
     async def _choose(self, mode: str) -> None:
@@ -86,12 +102,28 @@ class _Modes:
         self._mark()
 
     def _look(self) -> None:
-        """Follow a change that was made elsewhere."""
+        """Follow a change that was made elsewhere, and what the node says of its images."""
+        remarks = self._said()
+        if remarks != self._remarks:
+            self._remarks = remarks
+            told = f"m.setRemarks({json.dumps(remarks)})"
+            ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {told})")
         parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
             self._show(known)
         self._mark()
+
+    def _said(self) -> list[str]:
+        """Why the images that are shown show little, for a person."""
+        status = self._simulator.status.node(NODE, time.monotonic())
+        values = status.values if status else {}
+        remarks = [_CONTACT.get(values.get("contact", ""), "")]
+        if self._mode == "velocity":
+            remarks.append(_absent("No colour", values.get("no_colour", ""), values))
+        if self._strips["spectrum"]:
+            remarks.append(_absent("No spectrum", values.get("no_spectrum", ""), values))
+        return [remark for remark in remarks if remark]
 
     def _mark(self) -> None:
         shown = {**self._strips, self._mode: True, FLIP: self._is_flipped}
@@ -105,6 +137,13 @@ def _button(label: str, tooltip: str, on_click: Any) -> ui.button:
     with ui.button(label, color=None, on_click=on_click).props("flat dense no-caps") as button:
         ui.tooltip(tooltip)
     return button
+
+
+def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
+    """Why there is no flow; nothing where that is said of the whole image already."""
+    if why not in _ABSENT or (why == "no_contact" and values.get("contact") != "good"):
+        return ""
+    return f"{what}: {_ABSENT[why]}"
 
 
 def build_modes(simulator: Simulator) -> None:

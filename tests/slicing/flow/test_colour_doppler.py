@@ -12,6 +12,7 @@ from tubes import ARTERY, SIDES, block, tube_vessel, tube_volume
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.flow.absence import Absence
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
 from us_sim.slicing.flow.colour_settings import ColourSettings
@@ -106,6 +107,31 @@ def test_much_gain_shows_noise_and_little_shows_nothing(scanner, blood):
             assert np.isnan(estimate).all()
     assert counts[1] == 0
     assert counts[2] > 0.5 * np.count_nonzero(np.isnan(truth))
+
+
+@pytest.mark.parametrize(
+    ("why", "fan", "given"),
+    [
+        (Absence.NOTHING, TILT, {}),
+        (Absence.NO_CONTACT, TILT, {}),
+        (Absence.NO_VESSEL, TILT, {"width": 0.1, "lateral": 0.4}),
+        (Absence.NO_FLOW, TILT, {}),
+        (Absence.ACROSS_FLOW, np.radians(1), {"wall_filter": 0.05}),
+        (Absence.TOO_SLOW, np.radians(8), {"wall_filter": 0.2, "nyquist_velocity": 0.6}),
+    ],
+)
+def test_why_no_colour_is_shown_is_told(scanner, why, fan, given):
+    pose = Pose([0.0, 0.0, 0.0], [np.sin(fan / 2), 0.0, 0.0, np.cos(fan / 2)])
+    frame = scanner.frame(pose, block().nodes, time=SYSTOLE)
+    blood = Blood([tube_vessel(ARTERY)]).at(frame)
+    air = why is Absence.NO_CONTACT
+    frame.contact = np.full(PROBE.lines, 0.0 if air else 1.0), np.zeros(PROBE.lines)
+    if why is Absence.NO_FLOW:
+        blood.vessels[0].axis_velocity[:] = 0.0
+    doppler = ColourDoppler(PROBE, dataclasses.replace(WIDE, **given))
+    shown = doppler.estimate(blood, frame)
+    assert np.isfinite(shown).any() == (why is Absence.NOTHING)
+    assert doppler.absence(blood, frame, shown) is why
 
 
 def test_the_resolution_spreads_colour_beyond_the_wall_by_less_than_itself(scanner, blood):

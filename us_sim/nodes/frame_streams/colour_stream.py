@@ -51,6 +51,9 @@ class ColourStream(SettableStream[ColourDoppler]):
     def _estimate(self, frame: Frame) -> NDArray[np.float32]:
         """Made once, since frames before it count, too."""
         if frame is not self._frame:
-            self._shown = self.for_frame(frame).estimate(self._blood, frame)
+            doppler = self.for_frame(frame)
+            self._shown = doppler.estimate(self._blood, frame)
             self._frame = frame
+            why = doppler.absence(self._blood, frame, self._shown)
+            self._node.health.values["no_colour"] = why.value
         return self._shown

@@ -39,5 +39,7 @@ class SpectrumStream(SettableStream[Spectrum]):
         return Spectrum(probe, settings)
 
     def _message(self, frame: Frame, stamp: Time) -> Image:
-        picture = self.for_frame(frame).show(self._blood, frame)
+        spectrum = self.for_frame(frame)
+        picture = spectrum.show(self._blood, frame)
+        self._node.health.values["no_spectrum"] = spectrum.absence(self._blood, frame).value
         return colour_image_message(picture, stamp, "probe")

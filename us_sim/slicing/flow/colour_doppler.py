@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ProbeError
 from us_sim.kernels import njit
 from us_sim.slicing.drawing.overlay import ColourScale
+from us_sim.slicing.flow.absence import Absence, absence
 from us_sim.slicing.flow.blood import Blood, Window
 from us_sim.slicing.flow.colour_settings import ColourSettings
 from us_sim.slicing.flow.noise import normal_pair
@@ -55,6 +56,7 @@ _COLOURS = (
 )
 """From the fastest away from the probe to the fastest towards it: blue away, red towards."""
 
+_COLOURED = 0.002  # of the box: less is noise
 _FORGOTTEN = 0.5  # s after which the frames before do not count
 _EDGE = 24  # points along each side of the box
 
@@ -141,6 +143,12 @@ class ColourDoppler:
             shown[row : row + rows, column : column + columns],
         )  # fmt: skip
         return shown
+
+    def absence(self, blood: Blood, frame: Frame, shown: NDArray[np.float32]) -> Absence:
+        """Why an estimate of this frame shows no colour; nothing where it does."""
+        if np.count_nonzero(np.isfinite(shown)) > _COLOURED * self._within.sum():
+            return Absence.NOTHING
+        return absence(blood, frame, self._window, self._lines, self.settings.wall_filter)
 
     @cached_property
     def _whole(self) -> Window:

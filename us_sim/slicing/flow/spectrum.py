@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from us_sim.errors import ProbeError
 from us_sim.kernels import njit
 from us_sim.slicing.drawing.sweep_picture import SweepPicture
+from us_sim.slicing.flow.absence import Absence, absence
 from us_sim.slicing.flow.blood import Blood, Window
 from us_sim.slicing.flow.noise import uniform
 from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
@@ -96,6 +97,11 @@ class Spectrum:
         moments = self._picture.moments(frame.time)
         self._picture.add(self.columns(blood, frame, moments))
         return self._picture.drawn()
+
+    def absence(self, blood: Blood, frame: Frame) -> Absence:
+        """Why this frame has no flow at the gate; nothing where it has."""
+        lines = np.full(self._window.shape, self._line)
+        return absence(blood, frame, self._window, lines, self.settings.wall_filter)
 
     def columns(
         self, blood: Blood, frame: Frame, moments: NDArray[np.float64]
