@@ -335,15 +335,14 @@ def _with_chunk(file, packed, says):
 def test_a_chunk_is_unpacked_up_to_what_it_says_and_a_limit(tmp_path):
     packed = zstandard.ZstdCompressor().compress(bytes(64 << 20))
     assert len(packed) < 10_000
-    with pytest.raises(BagError, match="it says that it holds 4000000000 bytes"):
-        read_bag(_with_chunk(tmp_path / "a.mcap", packed, 4_000_000_000))
-    tracemalloc.start()
-    try:
-        bag = read_bag(_with_chunk(tmp_path / "b.mcap", packed, 1000))
-        assert tracemalloc.get_traced_memory()[1] < 8 << 20
-    finally:
-        tracemalloc.stop()
-    assert "breaks off" in bag.note
+    for says in (4_000_000_000, 1000):
+        tracemalloc.start()
+        try:
+            bag = read_bag(_with_chunk(tmp_path / "a.mcap", packed, says))
+            assert tracemalloc.get_traced_memory()[1] < 8 << 20
+        finally:
+            tracemalloc.stop()
+        assert "is damaged (bytes 25 to" in bag.note
 
 
 def test_a_packed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatch):

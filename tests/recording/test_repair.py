@@ -52,7 +52,7 @@ def test_a_cut_recording_is_made_whole(session, tmp_path):
     cut.write_bytes(content[: content.index(b"needle in") + 200])
     made = repair(cut, tmp_path / "whole")
     assert len(made.faults) == 1
-    assert "was not ended properly" in made.faults[0]
+    assert "was not ended properly" in made.faults[0].text
     whole = read_bag(tmp_path / "whole")
     assert whole.complete
     assert list(whole.messages()) == list(read_bag(cut).messages())
@@ -73,7 +73,47 @@ def test_a_damaged_chunk_is_left_out_and_said(session, tmp_path):
     assert [m.log_time for m in read_bag(made.path).messages()] == [
         EPOCH + k * 10**8 for k in range(11, 20)
     ]
-    assert "is damaged in its chunk" in made.faults[0]
+    assert "is damaged in its chunk" in made.faults[0].text
+    assert made.faults[0].messages == 11
+
+
+@pytest.mark.parametrize("at", [1, 5, 9, 25, 33, 37, 41, 60])  # from length to records
+def test_without_an_index_it_goes_on_at_the_next_sound_chunk(session, tmp_path, at):
+    with session.open("rb") as stream:
+        first, *_ = make_reader(stream).get_summary().chunk_indexes
+    content = bytearray(session.read_bytes())
+    content[first.chunk_start_offset + at] ^= 16
+    session.write_bytes(content[: content.rindex(b"\x0f\x04")])
+    made = repair(session, tmp_path / "whole")
+    lost = sum(fault.messages for fault in made.faults)
+    assert (made.message_count, lost) == ((9, 11) if at in (33, 37, 60) else (20, 0))
+
+
+def test_an_attached_recording_that_is_cut_is_not_taken_for_the_recording(session, tmp_path):
+    file = tmp_path / "other.mcap"
+    with BagWriter(file, sidecar=False) as bag:
+        bag.add_topic("/other", STRING)
+        bag.attach("session.mcap", "application/octet-stream", session.read_bytes(), EPOCH)
+    content = file.read_bytes()
+    for damaged in (
+        content[: content.index(b"needle in") + 200],
+        content.replace(b"needle", b"noodle"),
+    ):
+        file.write_bytes(damaged)
+        assert read_bag(file).message_count == 0
+
+
+def test_a_damaged_attachment_is_left_out_and_said(session, tmp_path, capsys):
+    content = session.read_bytes().replace(b"width: 640", b"width: 641", 1)
+    session.write_bytes(content)
+    made = repair(session, tmp_path / "whole")
+    assert read_bag(made.path).attachments().keys() == {"scene.yaml"}
+    assert "camera.yaml" in made.faults[0].text
+    assert main(["bag", "extract", str(session), "--out", str(tmp_path / "out")]) != 0
+    assert "camera.yaml" in capsys.readouterr().err
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["scene.yaml"]
+    with pytest.raises(BagError, match=r"camera\.yaml"):
+        read_bag(session).attachments()
 
 
 def test_the_files_of_a_restarted_recorder_become_one_bag(session, tmp_path):

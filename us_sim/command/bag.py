@@ -62,7 +62,7 @@ def _repair(args: argparse.Namespace) -> int:
     file: Path = args.file
     made = repair(file, args.out or file.with_name(f"{file.stem}_repaired"))
     for fault in made.faults:
-        print(fault)
+        print(fault.text)
     print(f"{made.message_count} messages are in {made.path}")
     return 0
 

@@ -21,7 +21,7 @@ from us_sim.nodes.player_services import offer_player_services
 from us_sim.nodes.process import run_node
 from us_sim.nodes.session_settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
-from us_sim.recording.topic import BagMessage, BagTopic
+from us_sim.recording.topic import BagMessage, BagTopic, Fault
 
 __all__ = ["SessionPlayer", "main"]
 
@@ -62,7 +62,7 @@ class SessionPlayer(GuardedNode):
         if self._bag.note:
             self.get_logger().warning(self._bag.note)
         self._count = sum(self._bag.topic(name).message_count for name in self._topics)
-        self._damage: list[str] = []
+        self._damage: list[Fault] = []
         self._sent = 0
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
@@ -136,7 +136,7 @@ class SessionPlayer(GuardedNode):
             self.finished.set_exception(
                 BagError(
                     f"{self._sent} of {self._count} messages of {self._bag.path} were played"
-                    + "".join(f"; {sentence}" for sentence in self._damage[:1])
+                    + "".join(f"; {fault.text}" for fault in self._damage[:1])
                 )
             )
         else:
@@ -177,10 +177,10 @@ class SessionPlayer(GuardedNode):
         try:
             message = next(self._messages, None)
         except BagError as error:
-            self._damage.append(str(error))
+            self._damage.append(Fault(str(error)))
             message = None
-        for sentence in self._damage[known:]:
-            self.health.problem("damage", sentence)
+        for fault in self._damage[known:]:
+            self.health.problem("damage", fault.text)
         return message
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
+from us_sim.recording.topic import Fault
 
 __all__ = ["extract", "versions"]
 
@@ -18,10 +19,12 @@ def extract(bag: Path, folder: Path) -> list[Path]:
     """Write the files that are attached to a bag; their paths.
 
     Raises:
-        BagError: it has none, a name is no file's, a file is there already, or cannot be written.
+        BagError: it has none, a name is no file's, a file is there already, or cannot be written;
+            or one is damaged, and all others are written.
     """
-    attached = read_bag(bag).attachments()
-    if not attached:
+    damage: list[Fault] = []
+    attached = read_bag(bag).attachments(damage)
+    if not attached and not damage:
         raise BagError(f"{bag} has no files attached: nothing to extract")
     for name in attached:
         parts = name.split("/")  # of a bag in a folder
@@ -39,6 +42,9 @@ def extract(bag: Path, folder: Path) -> list[Path]:
         except OSError as error:
             raise BagError(f"{file} cannot be written: {error.strerror}") from None
         files.append(file)
+    if damage:
+        written = f"; the other {len(files)} are written" if files else ""
+        raise BagError("; ".join(fault.text for fault in damage) + written)
     return files
 
 

@@ -1,8 +1,10 @@
-"""Reading one MCAP file. Of a file that was cut off, what was written before the cut is recovered.
+"""Reading one MCAP file. Of a file that was cut or damaged, what can be read is recovered.
 
 A whole file is read by the index in its summary. Without one (the recorder was killed, the disk
-ran full, the copy broke off) the records are walked from the start up to the first that is not
-there in full, and of a chunk that is cut its leading messages are kept.
+ran full, the copy broke off) the records are walked from the start. From a place where they are
+not sound, it goes on at the next sound one, and of a chunk that is cut its leading messages are
+kept. How many messages are lost is known from the summary, or else from the tables that follow
+each chunk.
 
 The format: https://mcap.dev/spec.
 """
@@ -15,56 +17,59 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from mcap.summary import Summary
 
 from us_sim.errors import BagError
+from us_sim.recording.mcap_records import (
+    AFTER_THE_DATA,
+    DAMAGE,
+    HEADER,
+    Chunk,
+    Record,
+    attachment,
+    cut_chunk_at,
+    next_sound,
+    parsed,
+    record_at,
+    records_in,
+)
 from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
-from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 
 __all__ = ["MAGIC", "McapFile"]
 
 MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
-_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of compression name
+_TIME = struct.Struct("<Q8x")  # log time, place in its chunk
+_CHANNEL = struct.Struct("<H4x")  # and the length of the table that follows
 
 _LARGEST_OVERLAP = 1 << 30
 """Bytes of messages that wait until no earlier one can come."""
-
-_DAMAGE = (
-    McapError,
-    EOFError,
-    OverflowError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    KeyError,
-    RuntimeError,
-    StopIteration,
-    MemoryError,
-)
-"""Errors that the parsers raise for damaged bytes."""
+_PLACES_TOLD = 3
 
 
 class _Run(NamedTuple):
-    """A stretch of the file that holds messages: a chunk, or records outside of chunks."""
+    """A stretch of the file that holds messages: a chunk, or a message outside of chunks."""
 
     start: int  # ns, lowest log time in it
     offset: int  # bytes, of its first record's opcode
+    chunk: Chunk | None
+
+
+class _Place(NamedTuple):
+    """Where a record is that holds no messages."""
+
+    offset: int  # bytes
     length: int  # bytes
+    name: str
 
 
 class McapFile:
@@ -81,13 +86,13 @@ class McapFile:
     def __init__(self, path: Path, label: str = "") -> None:
         self._path = path
         self._label = label or str(path)
-        self.note = ""
+        self.faults: list[Fault] = []
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()
         self._runs: list[_Run] = []
-        self._attachments: list[tuple[int, int]] = []  # offset and length of each record
-        self._notes: list[tuple[int, int]] = []
+        self._attachments: list[_Place] = []
+        self._notes: list[_Place] = []
         self.start: int | None = None
         self.end: int | None = None
         with path.open("rb") as stream:
@@ -100,28 +105,43 @@ class McapFile:
                 self._scan(stream)
         self.topics = self._topics()
 
-    def attachments(self) -> Iterator[BagAttachment]:
-        """The files within this one; those that are damaged are left out."""
-        for content in self._contents(self._attachments):
-            with contextlib.suppress(*_DAMAGE):
-                record = Attachment.read(_data_stream(content))
+    def attachments(self, damage: list[Fault] | None = None) -> Iterator[BagAttachment]:
+        """The files within this one.
+
+        Args:
+            damage: takes a fault for each that is damaged, which is then left out.
+
+        Raises:
+            BagError: one is damaged, and ``damage`` is None.
+        """
+        for place in self._attachments:
+            try:
+                record = attachment(self._content(place))
+            except DAMAGE as error:
+                self._tell(damage, f"its attached file {place.name}: {error}")
+            else:
                 yield BagAttachment(record.name, record.media_type, record.log_time, record.data)
 
-    def notes(self) -> Iterator[BagNote]:
-        """The metadata records; those that are damaged are left out."""
-        for content in self._contents(self._notes):
-            with contextlib.suppress(*_DAMAGE):
-                record = Metadata.read(_data_stream(content))
+    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:
+        """The metadata records; ``damage`` and errors are as those of `attachments`."""
+        for place in self._notes:
+            try:
+                record = parsed(Metadata, self._content(place))
+                if record.name != place.name:
+                    raise ValueError("the index calls it differently")
+            except DAMAGE as error:
+                self._tell(damage, f"its metadata record {place.name}: {error}")
+            else:
                 yield BagNote(record.name, record.metadata)
 
     def messages(
-        self, topics: Collection[str], damage: list[str] | None = None
+        self, topics: Collection[str], damage: list[Fault] | None = None
     ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
         Args:
             topics: their names.
-            damage: takes a sentence for each damaged chunk, which is then left out.
+            damage: takes at the end what is wrong with chunks that were left out.
 
         Raises:
             BagError: a chunk is damaged, and ``damage`` is None.
@@ -131,6 +151,9 @@ class McapFile:
             for id, channel in self._channels.items()
             if channel.topic in topics
         }
+        total = sum(self._counts[id] for id in wanted)
+        read = 0
+        broken: list[Fault] = []
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
         # Of messages with the same log time the one that is earlier in the file comes first.
         pending: list[tuple[int, int, int, BagMessage]] = []
@@ -141,12 +164,19 @@ class McapFile:
                     message = heapq.heappop(pending)[-1]
                     held -= len(message.data)
                     yield message
-                for index, content in enumerate(self._run_messages(stream, run, damage)):
-                    channel, log_time, publish_time, data = content
-                    if channel in wanted:
-                        message = BagMessage(*wanted[channel], log_time, publish_time, bytes(data))
+                try:
+                    for index, content in enumerate(_messages(stream, run)):
+                        channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
+                        if channel not in wanted:
+                            continue
+                        read += 1
+                        data = bytes(content[_MESSAGE.size :])
+                        message = BagMessage(*wanted[channel], log_time, publish_time, data)
                         heapq.heappush(pending, (log_time, run.offset, index, message))
-                        held += len(message.data)
+                        held += len(data)
+                except DAMAGE as error:
+                    where = f"its chunk at byte {run.offset}: {error}"
+                    self._tell(broken if damage is not None else None, where)
                 if held > _LARGEST_OVERLAP:
                     raise BagError(
                         f"{self._label} cannot be put into order: more than {_LARGEST_OVERLAP} "
@@ -154,14 +184,31 @@ class McapFile:
                     )
         while pending:
             yield heapq.heappop(pending)[-1]
+        if read < total:
+            lost = f"{total - read} of its {total} messages cannot be read"
+            told = [fault.text for fault in broken[:_PLACES_TOLD]]
+            more = len(broken) - len(told)
+            if more:
+                told.append(f"and {more} more places")
+            text = "; ".join([*told, f"{self._label}: {lost}"])
+            if damage is None:
+                raise BagError(text)
+            damage.append(Fault(text, total - read))
+        elif damage is not None:
+            damage += broken
 
-    def _contents(self, places: list[tuple[int, int]]) -> Iterator[memoryview]:
-        """The records at these places, without opcode and length."""
+    def _tell(self, damage: list[Fault] | None, what: str) -> None:
+        """Note damage, or raise it as a BagError."""
+        text = f"{self._label} is damaged in {what}"
+        if damage is None:
+            raise BagError(text) from None
+        damage.append(Fault(text))
+
+    def _content(self, place: _Place) -> memoryview:
+        """A record without opcode and length."""
         with self._path.open("rb") as stream:
-            for offset, length in places:
-                with contextlib.suppress(*_DAMAGE):
-                    for _, content in _records(stream, offset, length, self._label):
-                        yield content
+            stream.seek(place.offset + HEADER.size)
+            return memoryview(stream.read(place.length - HEADER.size))
 
     def _take(self, summary: Summary) -> None:
         """Believes the summary of a whole file."""
@@ -170,11 +217,11 @@ class McapFile:
         self._channels = summary.channels
         self._counts.update(summary.statistics.channel_message_counts)
         self._runs = sorted(
-            _Run(chunk.message_start_time, chunk.chunk_start_offset, chunk.chunk_length)
-            for chunk in summary.chunk_indexes
+            _Run(each.message_start_time, each.chunk_start_offset, _indexed(each))
+            for each in summary.chunk_indexes
         )
-        self._attachments = [(each.offset, each.length) for each in summary.attachment_indexes]
-        self._notes = [(each.offset, each.length) for each in summary.metadata_indexes]
+        self._attachments = [_Place(e.offset, e.length, e.name) for e in summary.attachment_indexes]
+        self._notes = [_Place(e.offset, e.length, e.name) for e in summary.metadata_indexes]
         if summary.statistics.message_count:
             self.start = summary.statistics.message_start_time
             self.end = summary.statistics.message_end_time
@@ -183,75 +230,114 @@ class McapFile:
         """Walks the records of a file that has no usable summary."""
         size = stream.seek(0, 2)
         position = len(MAGIC)
-        ended = False
-        while not ended:
-            stream.seek(position)
-            header = stream.read(_RECORD.size)
-            if len(header) < _RECORD.size:
-                break
-            opcode, length = _RECORD.unpack(header)
-            whole = position + _RECORD.size + length <= size
-            if opcode == 0 or not (whole or opcode == Opcode.CHUNK):
-                break  # a zero is what file systems fill a lost block with
-            ended = opcode == Opcode.DATA_END
-            if opcode in (Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-                run_length = _RECORD.size + min(length, size - position - _RECORD.size)
-                try:
-                    self._scan_run(stream, position, run_length)
-                except _DAMAGE:
+        gaps: list[tuple[int, int]] = []
+        tables: dict[int, tuple[int, int]] = {}  # of the last chunk: messages, lowest log time
+        missing: Counter[int] = Counter()
+        follows_gap = ended = False
+        while not ended and position < size:
+            record = record_at(stream, position, size)
+            if record is None or not self._suits(record):
+                after = next_sound(stream, position, size)
+                if after is None:
                     break
-            if not whole:
-                break
-            if opcode == Opcode.ATTACHMENT:
-                self._attachments.append((position, _RECORD.size + length))
-            elif opcode == Opcode.METADATA:
-                self._notes.append((position, _RECORD.size + length))
-            position += _RECORD.size + length
+                gaps.append((position, after))
+                position, follows_gap = after, True
+                continue
+            if record.opcode == Opcode.MESSAGE_INDEX:
+                channel, table = _table(record.content)
+                # Of a chunk that was passed over, else of the last one.
+                if follows_gap and table[0] and tables.get(channel) != table:
+                    missing[channel] += table[0]
+            elif record.chunk is not None:
+                tables, follows_gap = self._take_chunk(stream, record.chunk), False
+            else:
+                self._take_record(record)
+            position = record.end
+            ended = record.opcode in AFTER_THE_DATA
+        if ended:
+            self._learn_types(stream, position, size)
+        elif (chunk := cut_chunk_at(stream, position, size)) is not None:
+            self._take_chunk(stream, chunk)
         self._runs.sort()
+        for id in self._counts.keys() - self._channels.keys():
+            missing[id] += self._counts.pop(id)  # of a topic whose name is lost
         stream.seek(max(0, size - len(MAGIC)))
         if not (ended and stream.read() == MAGIC):
             count = sum(self._counts.values())
             seconds = (self.end - self.start) / 1e9 if self.start and self.end else 0.0
-            self.note = (
+            text = (
                 f"{self._label} was not ended properly (it breaks off at byte {position} of "
                 f"{size}): {count} messages over {seconds:.1f} s were recovered"
             )
+            self.faults.append(Fault(text))
+        if gaps or missing:
+            places = [f"{first} to {last}" for first, last in gaps[:_PLACES_TOLD]]
+            more = f" and {len(gaps) - len(places)} more stretches" if gaps[_PLACES_TOLD:] else ""
+            where = f" (bytes {', '.join(places)}{more} cannot be understood)" if gaps else ""
+            lost = f"{missing.total()} messages are" if missing else "no message is known to be"
+            text = f"{self._label} is damaged{where}: {lost} lost"
+            self.faults.append(Fault(text, missing.total()))
 
-    def _scan_run(self, stream: BinaryIO, offset: int, length: int) -> None:
-        """Learns schemas, channels, counts and times of one record or chunk."""
-        first: int | None = None
-        for opcode, content in _records(stream, offset, length, self._label):
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(_data_stream(content))
-                self._schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_data_stream(content))
-                self._channels[channel.id] = channel
-            elif opcode == Opcode.MESSAGE:
-                id, _, log_time, _ = _MESSAGE.unpack_from(content)
-                if id not in self._channels:
-                    continue
-                self._counts[id] += 1
-                first = log_time if first is None else min(first, log_time)
-                self.start = log_time if self.start is None else min(self.start, log_time)
-                self.end = log_time if self.end is None else max(self.end, log_time)
-        if first is not None:
-            self._runs.append(_Run(first, offset, length))
+    def _suits(self, record: Record) -> bool:
+        """Whether such a record may be there: messages are in chunks, or all outside of them."""
+        if record.opcode != Opcode.MESSAGE:
+            return True
+        channel, *_ = _MESSAGE.unpack_from(record.content)
+        return channel in self._channels and not any(run.chunk for run in self._runs[-1:])
 
-    def _run_messages(
-        self, stream: BinaryIO, run: _Run, damage: list[str] | None = None
-    ) -> Iterator[tuple[int, int, int, memoryview]]:
-        """Channel, log time, publish time and data of each message of a run."""
-        try:
-            for opcode, content in _records(stream, run.offset, run.length, self._label):
+    def _take_chunk(self, stream: BinaryIO, chunk: Chunk) -> dict[int, tuple[int, int]]:
+        """Learns what is in a chunk; for each channel the messages and their lowest log time."""
+        tables: dict[int, tuple[int, int]] = {}
+        with contextlib.suppress(*DAMAGE):  # of one that is cut
+            for opcode, content in records_in(stream, chunk):
                 if opcode == Opcode.MESSAGE:
-                    channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
-                    yield channel, log_time, publish_time, content[_MESSAGE.size :]
-        except _DAMAGE as error:
-            sentence = f"{self._label} is damaged in its chunk at byte {run.offset}: {error}"
-            if damage is None:
-                raise BagError(sentence) from None
-            damage.append(sentence)
+                    channel, time = self._count(content)
+                    count, lowest = tables.get(channel, (0, time))
+                    tables[channel] = count + 1, min(lowest, time)
+                else:
+                    self._learn(opcode, content)
+        if tables:
+            self._runs.append(_Run(min(time for _, time in tables.values()), chunk.offset, chunk))
+        return tables
+
+    def _take_record(self, record: Record) -> None:
+        """Learns what a record outside of chunks says."""
+        opcode, content = record.opcode, record.content
+        length = record.end - record.offset
+        if opcode == Opcode.ATTACHMENT:
+            self._attachments.append(_Place(record.offset, length, attachment(content).name))
+        elif opcode == Opcode.METADATA:
+            self._notes.append(_Place(record.offset, length, parsed(Metadata, content).name))
+        elif opcode == Opcode.MESSAGE:
+            self._runs.append(_Run(self._count(content)[1], record.offset, None))
+        else:
+            self._learn(opcode, content)
+
+    def _count(self, message: memoryview) -> tuple[int, int]:
+        """Count a message; its channel and log time."""
+        channel, _, time, _ = _MESSAGE.unpack_from(message)
+        self._counts[channel] += 1
+        self.start = time if self.start is None else min(self.start, time)
+        self.end = time if self.end is None else max(self.end, time)
+        return channel, time
+
+    def _learn(self, opcode: int, content: memoryview) -> None:
+        """Take what a record says of types and topics."""
+        if opcode == Opcode.SCHEMA:
+            schema = parsed(Schema, content)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = parsed(Channel, content)
+            self._channels[channel.id] = channel
+
+    def _learn_types(self, stream: BinaryIO, position: int, size: int) -> None:
+        """Take what a summary says of types and topics, though its checksum does not hold."""
+        while (record := record_at(stream, position, size)) is not None:
+            if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind = parsed(Schema if record.opcode == Opcode.SCHEMA else Channel, record.content)
+                known = self._schemas if record.opcode == Opcode.SCHEMA else self._channels
+                known.setdefault(kind.id, kind)
+            position = record.end
 
     def _topics(self) -> tuple[BagTopic, ...]:
         topics: dict[str, BagTopic] = {}
@@ -291,7 +377,7 @@ def _summary(stream: BinaryIO) -> Summary | None:
     stream.seek(0)
     try:
         summary = SeekingReader(stream).get_summary()
-    except _DAMAGE:
+    except DAMAGE:
         return None
     if summary is None or summary.statistics is None:
         return None
@@ -302,57 +388,30 @@ def _summary(stream: BinaryIO) -> Summary | None:
     return summary if indexed and within and described else None
 
 
-def _records(
-    stream: BinaryIO, offset: int, length: int, label: str
-) -> Iterator[tuple[int, memoryview]]:
-    """Opcode and content of a record outside of chunks, or of each that a chunk holds."""
-    if length > LARGEST_CHUNK:
-        raise BagError(
-            f"{label} cannot be read: its chunk at byte {offset} has {length} bytes, and "
-            f"{LARGEST_CHUNK} are read at most: record with smaller chunks"
-        )
-    stream.seek(offset)
-    content = memoryview(stream.read(length))
-    opcode, declared = _RECORD.unpack_from(content)
-    content = content[_RECORD.size :]
-    if opcode != Opcode.CHUNK:
-        yield opcode, content
+def _indexed(index: ChunkIndex) -> Chunk:
+    """A chunk as the summary tells of it."""
+    end = index.chunk_start_offset + index.chunk_length
+    packed = end - index.compressed_size
+    return Chunk(index.chunk_start_offset, packed, end, index.compression, index.uncompressed_size)
+
+
+def _messages(stream: BinaryIO, run: _Run) -> Iterator[memoryview]:
+    """The content of each message of a run."""
+    if run.chunk is not None:
+        for opcode, content in records_in(stream, run.chunk):
+            if opcode == Opcode.MESSAGE:
+                yield content
         return
-    content = _chunk_records(content, whole=len(content) == declared, label=label)
-    position = 0
-    while position + _RECORD.size <= len(content):
-        opcode, declared = _RECORD.unpack_from(content, position)
-        begin = position + _RECORD.size
-        position = begin + declared
-        if position > len(content):
-            return
-        yield opcode, content[begin:position]
+    stream.seek(run.offset)
+    _, length = HEADER.unpack(stream.read(HEADER.size))
+    yield memoryview(stream.read(length))
 
 
-def _chunk_records(content: memoryview, *, whole: bool, label: str) -> memoryview:
-    """The records in a chunk, decompressed; of a chunk that is cut, those before the cut."""
-    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
-    begin = _CHUNK.size + name_length + 8
-    if begin > len(content):
-        raise ValueError("its header is cut")
-    compression = bytes(content[_CHUNK.size : _CHUNK.size + name_length]).decode()
-    packed = content[begin:]
-    if compression == "":
-        records = packed
-    elif compression in ("zstd", "lz4"):
-        try:
-            records = memoryview(unpack(packed, compression, size))
-        except BagError as error:
-            raise BagError(f"{label} cannot be read: of a chunk {error}") from None
-    else:
-        raise BagError(f"{label} is compressed with {compression!r}: use zstd, lz4 or none")
-    if whole and (len(records) != size or (crc and zlib.crc32(records) != crc)):
-        raise ValueError("its checksum does not match")
-    return records
-
-
-def _data_stream(content: memoryview) -> ReadDataStream:
-    return ReadDataStream(BytesIO(content))
+def _table(content: memoryview) -> tuple[int, tuple[int, int]]:
+    """Of the table that follows a chunk: its channel, its messages and their lowest log time."""
+    (channel,) = _CHANNEL.unpack_from(content)
+    times = [time for (time,) in _TIME.iter_unpack(content[_CHANNEL.size :])]
+    return channel, (len(times), min(times, default=0))
 
 
 def _type_name(schema: Schema | None) -> str:

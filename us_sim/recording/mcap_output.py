@@ -209,7 +209,9 @@ class McapOutput:
             *(first, last, len(records), zlib.crc32(records), len(name)),
         )
         header += name + _LENGTH.pack(len(packed))
-        start = self._size
+        # Types and topics are there twice: one damaged chunk does not make later ones unreadable.
+        types = b"".join(declared.values())
+        start = self._size + len(types)
         offsets, tables, position = {}, [], start + len(header) + len(packed)
         for topic, entries in index.items():
             id = self._channels[topic].id
@@ -217,11 +219,11 @@ class McapOutput:
             offsets[id] = position
             position += len(tables[-1])
         try:
-            self._append([header, packed, *tables])
+            self._append([types, header, packed, *tables])
         except OSError:
             self._drop(counts)
             raise
-        self._declared |= declared
+        self._declared |= declared.keys()
         written = ChunkIndex(
             message_start_time=first,
             message_end_time=last,
@@ -294,7 +296,7 @@ class McapOutput:
         self._parts: list[bytes] = []
         self._pending = 0  # bytes
         self._index: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-        self._declared_here: set[str] = set()
+        self._declared_here: dict[str, bytes] = {}  # and their records
 
     def _put(self, data: bytes) -> None:
         self._parts.append(data)
@@ -304,9 +306,8 @@ class McapOutput:
         """Put the records of a topic's type and channel before its first message."""
         channel = self._channels[topic]
         schema = next(each for each in self._schemas.values() if each.id == channel.schema_id)
-        self._put(_bytes_of(schema))
-        self._put(_bytes_of(channel))
-        self._declared_here.add(topic)
+        self._declared_here[topic] = _bytes_of(schema) + _bytes_of(channel)
+        self._put(self._declared_here[topic])
 
     def _append(self, parts: Iterable[bytes]) -> None:
         """Write at the end, all or nothing."""

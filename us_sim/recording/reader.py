@@ -27,7 +27,7 @@ from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
 from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
-from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic
+from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 __all__ = ["Bag", "read_bag"]
@@ -83,16 +83,32 @@ class Bag:
 
     @property
     def note(self) -> str:
-        """The fault of a bag that was not closed properly; empty when whole."""
-        notes = [storage.note for storage in self._storages if storage.note]
+        """The faults that were found when the bag was opened; empty when there are none."""
+        return "; ".join(fault.text for fault in self.found_at_once)
+
+    @property
+    def found_at_once(self) -> list[Fault]:
+        """The faults that were found when the bag was opened."""
+        found = [fault for storage in self._storages for fault in storage.faults]
         if self.metadata is not None:
             said, held = self.metadata.message_count, self.message_count
             if said > held:
-                notes.append(
-                    f"{self.path} has {held} messages where its metadata.yaml says {said}: "
-                    f"{said - held} were lost"
-                )
-        return "; ".join(notes)
+                text = f"{self.path} has {held} messages where its metadata.yaml says {said}"
+                untold = max(said - held - sum(fault.messages for fault in found), 0)
+                found.append(Fault(f"{text}: {said - held} were lost", untold))
+        return found
+
+    def faults(self) -> list[Fault]:
+        """Everything that is wrong with the bag, for which all of it is read."""
+        found = [*self.found_at_once]
+        self.attachments(found)
+        self.notes(found)
+        try:
+            for _ in self.messages(damage=found):
+                pass
+        except BagError as error:
+            found.append(Fault(str(error)))
+        return found
 
     def topic(self, name: str) -> BagTopic:
         """The topic of this name, with or without its leading slash.
@@ -107,35 +123,43 @@ class Bag:
             f"{self.path} has no topic {name}; it has {', '.join(sorted(self._topics)) or 'none'}"
         )
 
-    def attachments(self) -> dict[str, BagAttachment]:
-        """The files within the bag, such as the scene that was recorded, by their names."""
-        return {each.name: each for storage in self._storages for each in storage.attachments()}
+    def attachments(self, damage: list[Fault] | None = None) -> dict[str, BagAttachment]:
+        """The files within the bag, such as the scene that was recorded, by their names.
 
-    def notes(self) -> list[BagNote]:
-        """The texts that the bag holds beside its messages."""
-        return [note for storage in self._storages for note in storage.notes()]
+        Args:
+            damage: takes a fault for each that is damaged, which is then left out.
+
+        Raises:
+            BagError: one is damaged, and ``damage`` is None.
+        """
+        held = (each for storage in self._storages for each in storage.attachments(damage))
+        return {each.name: each for each in held}
+
+    def notes(self, damage: list[Fault] | None = None) -> list[BagNote]:
+        """The texts that the bag holds beside its messages; as `attachments`."""
+        return [note for storage in self._storages for note in storage.notes(damage)]
 
     def markers(self) -> list[tuple[int, str]]:
         """The moments that a person marked: ns since the epoch, and the text."""
-        marked = [note.values for note in self.notes() if note.name == MARKER]
+        marked = [note.values for note in self.notes([]) if note.name == MARKER]
         return [(_count(values.get("time", "")), values.get("text", "")) for values in marked]
 
     def lost(self) -> Counter[str]:
         """How many messages the recorder says that it lost, by topic."""
-        counts = [note.values for note in self.notes() if note.name == LOST]
+        counts = [note.values for note in self.notes([]) if note.name == LOST]
         lost: Counter[str] = Counter()
         for count in counts:
             lost.update({topic: _count(text) for topic, text in count.items()})
         return lost
 
     def messages(
-        self, topics: Collection[str] | None = None, damage: list[str] | None = None
+        self, topics: Collection[str] | None = None, damage: list[Fault] | None = None
     ) -> Iterator[BagMessage]:
         """The messages of all topics or of these, in the order of their log times.
 
         Args:
             topics: their names; None for all.
-            damage: takes a sentence for each damaged chunk, which is then left out.
+            damage: takes the faults of what is damaged, which is then left out.
 
         Raises:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
@@ -179,12 +203,14 @@ class Bag:
             ) from None
 
     def summary(self) -> dict[str, Any]:
-        """The content of ``us-sim bag info`` in JSON's types; times in ns since the epoch."""
+        """The content of ``us-sim bag info`` in JSON's types; times in ns since the epoch.
+
+        All of the bag is read, for ``faults``.
+        """
         start, end = self.start, self.end
         return {
             "path": str(self.path),
-            "complete": self.complete,
-            "note": self.note,
+            "faults": [fault._asdict() for fault in self.faults()],
             "start": start,
             "end": end,
             "duration": end - start if start is not None and end is not None else 0,
@@ -193,7 +219,7 @@ class Bag:
             "markers": [{"time": time, "text": text} for time, text in self.markers()],
             "attachments": [
                 {"name": each.name, "media_type": each.media_type, "size": len(each.data)}
-                for each in self.attachments().values()
+                for each in self.attachments([]).values()
             ],
             "topics": [
                 {

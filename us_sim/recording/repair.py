@@ -24,6 +24,7 @@ from pathlib import Path
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
+from us_sim.recording.topic import BagTopic, Fault
 from us_sim.recording.writer import BagWriter
 
 __all__ = ["Repaired", "repair"]
@@ -35,7 +36,7 @@ class Repaired:
 
     path: Path  # the new file
     message_count: int
-    faults: tuple[str, ...]  # what was wrong with the bag, in sentences; none if it was whole
+    faults: tuple[Fault, ...]  # what was wrong with the bag; none if it was whole
 
 
 def repair(path: str | Path, out: str | Path) -> Repaired:
@@ -50,16 +51,16 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
             cannot be written.
     """
     bag = read_bag(path)
-    damage: list[str] = []
+    damage = [*bag.found_at_once]
     with BagWriter(out) as writer:
-        for attached in bag.attachments().values():
+        for attached in bag.attachments(damage).values():
             writer.attach(attached.name, attached.media_type, attached.data, attached.time)
-        for note in bag.notes():
+        for note in bag.notes(damage):
             if note.name != "rosbag2":  # which the writer makes anew
                 writer.note(*note)
         for topic in bag.topics:
             if topic.encoding != "cdr":
-                damage.append(f"{topic.name} is left out: {topic.encoding} is not CDR")
+                damage.append(_left_out(topic, f"{topic.encoding} is not CDR"))
                 continue
             try:
                 writer.add_topic(
@@ -71,7 +72,11 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
                     defined=False,
                 )
             except BagError as error:
-                damage.append(f"{topic.name} is left out: {error}")
+                damage.append(_left_out(topic, str(error)))
         for message in bag.messages(writer.topics, damage):
             writer.write(message.topic, message.data, message.log_time, message.publish_time)
-    return Repaired(writer.path, writer.message_count, (*filter(None, [bag.note]), *damage))
+    return Repaired(writer.path, writer.message_count, tuple(damage))
+
+
+def _left_out(topic: BagTopic, why: str) -> Fault:
+    return Fault(f"{topic.name} is left out: {why}", topic.message_count)

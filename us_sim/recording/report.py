@@ -17,8 +17,7 @@ def describe(bag: Bag) -> str:
     summary = bag.summary()
     seconds = summary["duration"] * 1e-9
     lines = [f"file      {summary['path']}"]
-    if not summary["complete"]:
-        lines.append(f"note      {summary['note']}")
+    lines += [f"note      {fault['text']}" for fault in summary["faults"]]
     if summary["start"] is not None:
         lines.append(f"start     {_date(summary['start'])}")
     lines += [f"duration  {seconds:.3f} s", f"messages  {summary['message_count']}", ""]

@@ -11,7 +11,7 @@ from pathlib import Path
 from us_sim.errors import BagError
 from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 
 __all__ = ["MAGIC", "SqliteFile"]
 
@@ -44,31 +44,35 @@ class SqliteFile:
         except _DAMAGE as error:
             raise BagError(f"{self._label} cannot be read as a rosbag2 database: {error}") from None
         usable = sum(topic.message_count for topic in self.topics)
-        notes = [unread] if unread else []
+        self.faults = [Fault(unread)] if unread else []
         if usable < rows:
-            notes.append(
+            text = (
                 f"{rows - usable} of the {rows} messages of {self._label} have no whole number as "
                 f"their time, no data or no topic, and are left out"
             )
+            self.faults.append(Fault(text, rows - usable))
         if last is not None and last > rows:  # rosbag2 numbers them from 1
-            notes.append(
+            text = (
                 f"{self._label} holds {rows} messages, and the last one has the number {last}: "
                 f"{last - rows} were lost"
             )
-        self.note = "; ".join(notes)
+            self.faults.append(Fault(text, last - rows))
 
-    def attachments(self) -> Iterator[BagAttachment]:
+    def attachments(
+        self,
+        damage: list[Fault] | None = None,  # noqa: ARG002
+    ) -> Iterator[BagAttachment]:
         """None: rosbag2 keeps no files in a database."""
         return iter(())
 
-    def notes(self) -> Iterator[BagNote]:
+    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:  # noqa: ARG002
         """None."""
         return iter(())
 
     def messages(
         self,
         topics: Collection[str],
-        damage: list[str] | None = None,  # noqa: ARG002 (what SQLite finds damaged ends it)
+        damage: list[Fault] | None = None,  # noqa: ARG002 (what SQLite finds damaged ends it)
     ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 

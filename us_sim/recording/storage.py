@@ -16,7 +16,7 @@ from us_sim.recording import mcap_file, sqlite_file
 from us_sim.recording.mcap_file import McapFile
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.sqlite_file import SqliteFile
-from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import unpack_file
 
 __all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
@@ -33,19 +33,19 @@ class Storage(Protocol):
     topics: tuple[BagTopic, ...]
     start: int | None  # ns, lowest log time; None without messages
     end: int | None  # ns, highest log time
-    note: str  # the fault of a file that was not closed properly; empty when whole
+    faults: list[Fault]  # that are found without reading its messages
 
     def messages(
-        self, topics: Collection[str], damage: list[str] | None = None
+        self, topics: Collection[str], damage: list[Fault] | None = None
     ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times."""
         ...
 
-    def attachments(self) -> Iterator[BagAttachment]:
+    def attachments(self, damage: list[Fault] | None = None) -> Iterator[BagAttachment]:
         """The files within it."""
         ...
 
-    def notes(self) -> Iterator[BagNote]:
+    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:
         """The texts beside its messages."""
         ...
 

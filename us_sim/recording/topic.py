@@ -8,7 +8,7 @@ from typing import NamedTuple
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile
 
-__all__ = ["LOST", "MARKER", "BagAttachment", "BagMessage", "BagNote", "BagTopic"]
+__all__ = ["LOST", "MARKER", "BagAttachment", "BagMessage", "BagNote", "BagTopic", "Fault"]
 
 LOST = "messages_lost"
 """The note that says how many messages of each topic are missing since the note before."""
@@ -72,3 +72,10 @@ class BagNote(NamedTuple):
 
     name: str
     values: dict[str, str]
+
+
+class Fault(NamedTuple):
+    """Something that is wrong with a bag."""
+
+    text: str  # a sentence
+    messages: int = 0  # that are lost by it, as far as is known
