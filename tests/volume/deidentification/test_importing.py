@@ -131,9 +131,106 @@ def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
     assert np.array_equal(first[80:], frames[0, 80:])
 
 
+def written_on(shape=(140, 300, 6)):
+    """Voxels (rows, columns, images) with a name in every image."""
+    voxels = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
+    voxels[:60] = 0
+    for k in range(shape[2]):
+        image = np.ascontiguousarray(voxels[:, :, k])
+        cv2.putText(image, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
+        voxels[:, :, k] = image
+    return voxels
+
+
+@pytest.mark.parametrize("kind", [".nrrd", ".mha", ".nii.gz", ".dcm", "turned.nrrd"])
+def test_what_may_be_text_wants_a_decision_in_files_of_every_kind(tmp_path, kind):
+    voxels = written_on().transpose(1, 0, 2)  # (i, j, k)
+    path, out = tmp_path / f"a{kind}", tmp_path / "o.nrrd"
+    if kind == ".dcm":
+        write(path, enhanced(voxels, turned()))
+    else:  # "turned": the axes are stored in another order
+        order = (0, 1, 2) if kind[0] == "t" else (2, 1, 0)
+        image = sitk.GetImageFromArray(np.ascontiguousarray(voxels.transpose(order)))
+        sitk.WriteImage(image, str(path))
+    with pytest.raises(VolumeError, match=r"may be text.*--keep-whole-image"):
+        import_files([path], out)
+    assert not out.exists()
+    import_files([path], out, ImportSettings(keep_whole_image=True))
+    assert np.ptp(read_volume(out).intensities) > 200
+    if kind[0] == ".":
+        import_files([path], tmp_path / "b.nrrd", ImportSettings(blank_text=True))
+        assert not read_volume(tmp_path / "b.nrrd").intensities[:, :55].any()
+        import_files([path], tmp_path / "c.nrrd", ImportSettings(crop="0,70,299,139"))
+
+
+def test_nothing_is_promised_that_was_not_looked_at(tmp_path):
+    path = tmp_path / "a.nrrd"
+    sitk.WriteImage(sitk.GetImageFromArray(VOXELS.astype(np.int16)), str(path))
+    found = look_at([path], None, ImportSettings()).imported
+    assert "12 of 30 images" in found.blanked
+    assert any("spread over 0 to 255" in each for each in found.conversions)
+
+
+@pytest.mark.parametrize(
+    ("values", "options", "size"),
+    [
+        ({"PixelSpacing": [0.2, 0.25]}, {}, (0.25, 0.2)),
+        ({"NominalScannedPixelSpacing": [0.2, 0.25]}, {}, (0.25, 0.2)),
+        ({"PixelAspectRatio": [4, 5]}, {}, (1.0, 0.8)),
+        ({}, {}, (1.0, 1.0)),
+        ({}, {"spacing": "0.3,0.4"}, (0.3, 0.4)),
+    ],
+)
+def test_the_size_of_pixels_is_what_the_header_or_a_person_says(tmp_path, values, options, size):
+    path, out = (
+        write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values)),
+        tmp_path / "a.mha",
+    )
+    made = import_files([path], out, ImportSettings(keep_whole_image=True, **options))
+    assert sitk.ReadImage(str(out)).GetSpacing()[:2] == size
+    stated = "Spacing" in " ".join(values)
+    assert stated != any("is not stated" in each for each in made.conversions)
+    if stated:
+        with pytest.raises(VolumeError, match="leave out"):
+            look_at([path], tmp_path / "b.mha", ImportSettings(spacing="1,1"))
+
+
+def test_a_volume_without_spacing_is_imported_with_that_of_a_person(tmp_path):
+    path = tmp_path / "a.mha"
+    header = "NDims = 3\nDimSize = 4 5 6\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n"
+    path.write_bytes(header.encode() + bytes(range(120)))
+    with pytest.raises(VolumeError, match="--spacing"):
+        import_files([path], tmp_path / "o.nrrd")
+    import_files([path], tmp_path / "o.nrrd", ImportSettings(spacing="0.5,0.25,2"))
+    there = read_volume(tmp_path / "o.nrrd").index_to_patient
+    np.testing.assert_allclose(np.diag(there)[:3] * 1e3, (0.5, 0.25, 2))
+
+
+def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
+    path = tmp_path / "a.nii.gz"
+    sitk.WriteImage(
+        sitk.JoinSeries([sitk.Image([4, 5, 6], sitk.sitkUInt8) + n for n in (3, 7)]), path
+    )
+    import_files([path], tmp_path / "o.nrrd", ImportSettings(volume=2))
+    assert (read_volume(tmp_path / "o.nrrd").intensities == 7).all()
+
+
+def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_data, tmp_path):
+    folder = shared_data / "foreign-files"
+    if not folder.exists():
+        pytest.skip(f"no {folder}")
+    with pytest.raises(VolumeError, match="may be text"):
+        import_files([folder / "burned_in_stack.nrrd"], tmp_path / "a.nrrd")
+    whole = ImportSettings(keep_whole_image=True)
+    import_files([folder / "us1_pixelspacing.dcm"], tmp_path / "a.igs.mha", whole)
+    assert sitk.ReadImage(str(tmp_path / "a.igs.mha")).GetSpacing()[:2] == (0.25, 0.2)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
+        (["--spacing", "0"], "two or three numbers"),
+        (["--spacing", "1,1,1"], "two for 2D images"),
         (["--crop", "0,0,80,59"], "last column is 79"),
         (["--crop", "5,5,4,9"], "holds no pixel"),
         (["--crop", "5;5;4;9"], "is no rectangle"),

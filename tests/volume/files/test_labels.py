@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from us_sim.errors import VolumeError
 from us_sim.volume.files.label_grid import on_grid
 from us_sim.volume.files.labels import read_labels
+from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.structure_terms import is_anatomical, problem_with
 from us_sim.volume.volume import Volume
@@ -265,3 +266,13 @@ def test_no_name_of_a_patient_is_in_the_sentences(tmp_path):
     fields = segments(("Doe Jane", 1, 0), ("Roe Jim", 1, 0))
     read = read_labels(written(tmp_path / "a.seg.nrrd", np.ones(SHAPE, np.uint8), fields), VOLUME)
     assert not re.search("Doe|Roe|Jane|Jim", f"{read.names} {read.remarks}")
+
+
+def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_data):
+    folder = shared_data / "foreign-files"
+    if not folder.exists():
+        pytest.skip(f"no {folder}")
+    like = open_image(folder / "Segmentation.seg.nrrd")
+    volume = Volume(np.zeros(like.shape, np.uint8), like.placement())
+    read = read_labels(folder / "SegmentationOverlapping.seg.nrrd", volume)
+    assert {"ribs", "right lung"} <= set(read.names.values())

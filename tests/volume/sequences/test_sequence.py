@@ -5,6 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
 from us_sim.volume.sequences.frame_transforms import in_metres
@@ -109,6 +110,37 @@ def test_colours_are_made_grey_by_their_brightness(tmp_path, write):
     assert sequence.are_colours
     # Rec. 601, luma: 0.299 R + 0.587 G + 0.114 B.
     assert [int(image[1, 2]) for image in sequence.images()] == [76, 150, 90]
+
+
+@pytest.mark.parametrize("kind", ["<u2", ">i2", "<f4"])
+def test_images_of_more_than_8_bits_are_spread_over_all_frames(tmp_path, kind):
+    deep = (GREY.astype(float) * 100).astype(kind)
+    order = "True" if kind[0] == ">" else "False"
+    element = {"u2": "MET_USHORT", "i2": "MET_SHORT", "f4": "MET_FLOAT"}[kind[1:]]
+    more = {"ElementType": element, "BinaryDataByteOrderMSB": order}
+    sequence = read_sequence(metaimage(tmp_path / "a.mha", deep, **more))
+    scaled = (GREY - float(GREY.min())) / np.ptp(GREY) * 255.0
+    np.testing.assert_array_equal(list(sequence.images()), np.floor(scaled + 0.5))
+
+
+def test_a_flat_sequence_of_two_dimensions_is_that_of_three(tmp_path):
+    path = nrrd(tmp_path / "a.igs.nrrd", GREY, kinds="domain domain list", sizes="5 4 3")
+    flat = "space dimension: 2\nspace directions: (1,0) (0,1) none\nspace origin: (0,0)\n"
+    content = path.read_bytes().replace(b"encoding: ", f"{flat}encoding: ".encode())
+    old = content.replace(b"UltrasoundImageOrientation:=MFA", b"ultrasound image orientation:=UFA")
+    path.write_bytes(old)
+    np.testing.assert_array_equal(list(read_sweep(path).images()), GREY[:, :, ::-1])
+
+
+def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_data):
+    path = shared_data / "foreign-files" / "NwirePhantomFreehand.igs.nrrd"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    sequence = read_sequence(path)
+    assert (sequence.columns, sequence.rows, len(sequence)) == (820, 616, 97)
+    stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))  # (row, column, frame)
+    (image,) = sequence.images([50])
+    np.testing.assert_array_equal(image, stored[:, :, 50])
 
 
 def test_plus_rule_for_names():

@@ -132,9 +132,9 @@ def test_frames_that_the_header_does_not_describe_are_counted(tmp_path):
         ({"DimSize": "0 0 3"}, "poses without images"),
         ({"DimSize": "5 -4 3"}, "poses without images"),
         ({"DimSize": "5 2 2 3"}, "sequence of volumes"),
-        ({"ElementType": "MET_SHORT"}, "save it as 8-bit grey values"),
-        ({"ElementType": None}, "save it as 8-bit grey values"),
-        ({"ElementNumberOfChannels": "2"}, "holds 2 × MET_UCHAR per pixel"),
+        ({"ElementType": "MET_SHORT"}, "holds 60 bytes of image data where its header says 120"),
+        ({"ElementType": None}, "no ElementType"),
+        ({"ElementNumberOfChannels": "2"}, "holds 2 numbers per pixel"),
         ({"UltrasoundImageOrientation": "AMF"}, "in the orientation 'AMF'"),
     ],
 )
@@ -159,12 +159,12 @@ def test_damaged_compression_is_noticed_where_the_images_are_read(tmp_path):
     fields = {"CompressedData": "True", "CompressedDataSize": str(len(data))}
     data[20:40] = bytes(20)
     sweep = read_sweep(_sequence(tmp_path / "a.mha", bytes(data), **fields))
-    with pytest.raises(VolumeError, match="compressed images are damaged"):
+    with pytest.raises(VolumeError, match="compression is broken"):
         list(sweep.images())
     short = zlib.compress(GREY[:2].tobytes())
     fields["CompressedDataSize"] = str(len(short))
     sweep = read_sweep(_sequence(tmp_path / "b.mha", short, **fields))
-    with pytest.raises(VolumeError, match="compressed images are damaged"):
+    with pytest.raises(VolumeError, match="holds 40 bytes"):
         list(sweep.images())
 
 
@@ -209,7 +209,7 @@ def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_data):
         ),
         (
             "plus-tracker-recordings/WaterTankBottomTranslationVideoBuffer.igs.mha",
-            "the known ones are none",
+            "no transforms",
         ),
         ("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha", "holds no tracked frames"),
         ("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha", "is a volume"),

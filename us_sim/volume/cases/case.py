@@ -38,8 +38,7 @@ from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
-from us_sim.volume.files.readers import read_placement, read_volume
-from us_sim.volume.files.stored_size import check_stored_size
+from us_sim.volume.files.readers import open_image, read_placement, read_volume
 from us_sim.volume.volume import Volume
 
 __all__ = ["CASE", "LABELS", "SURFACES", "TISSUE", "VOLUME", "Case", "is_case", "read_case"]
@@ -129,7 +128,7 @@ class Case:
         """
         placement, shape = self.placement()
         of_labels, other = _placement(self.folder / LABELS)
-        if check_stored_size(self.folder / LABELS).value != 1:
+        if open_image(self.folder / LABELS).voxels.type.itemsize != 1:
             raise CaseError(
                 f"{self.folder / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
                 f"as unsigned char"
@@ -206,10 +205,9 @@ def _settings(path: Path) -> CaseSettings:
 
 
 def _placement(path: Path) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
-    stored = check_stored_size(path)
-    if stored.file != path:
+    image = open_image(path)
+    if image.voxels.file != path:
         raise VolumeError(
             f"{path}: keeps its voxels in another file, which a case must not: save it as one file"
         )
-    i, j, k = stored.size[-3:]
-    return read_placement(path), (i, j, k)
+    return read_placement(path), image.shape

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.header_names import dicom_names
 from us_sim.volume.deidentification.kept_part import (
     Regions,
@@ -30,12 +31,15 @@ __all__ = ["dicom_source"]
 _ASSUMED = 0.04  # s, between images of which nothing says it
 
 
-def dicom_source(paths: Sequence[Path], volume: int, *, needs_volume: bool) -> Source:
+def dicom_source(
+    paths: Sequence[Path], volume: int, spacing: tuple[float, ...], *, needs_volume: bool
+) -> Source:
     """The images of DICOM files.
 
     Args:
         paths: files of one series.
         volume: which one where there are several in time.
+        spacing: mm, width and height of pixels of images that do not state it; or empty.
         needs_volume: refuse images that are no volume, and say why they are none.
 
     Raises:
@@ -49,9 +53,15 @@ def dicom_source(paths: Sequence[Path], volume: int, *, needs_volume: bool) -> S
     times = _times(images)
     if placed is None and times is None:
         conversions.append("times of images are not stated: one every 40 ms is assumed")
-    pixel = pixel_size(images.files[0], regions)
-    if placed is None and pixel is None:
-        conversions.append("size of pixels is not stated: 1 mm is written")
+    pixel, is_stated = pixel_size(images.files[0], regions)
+    if spacing and (placed or is_stated):
+        raise VolumeError(f"{paths[0]}: states the size of its pixels: leave out --spacing")
+    if placed is None and not is_stated:
+        pixel = (spacing[0], spacing[1]) if spacing else pixel
+        said = "as was said" if spacing else "say it with --spacing X,Y"
+        conversions.append(
+            f"size of pixels is not stated: {pixel[0]:g} × {pixel[1]:g} mm is written ({said})"
+        )
     if placed is not None and placed.volumes > 1:
         conversions.append(f"volume {volume} of {placed.volumes} in time")
 
@@ -66,17 +76,18 @@ def dicom_source(paths: Sequence[Path], volume: int, *, needs_volume: bool) -> S
         kept=_values(images),
         conversions=tuple(conversions),
         regions=regions,
-        trusted=all(never_holds_text(file) or is_cartesian(file) for file in images.files),
         placement=placed.placement if placed else None,
         times=[n * _ASSUMED for n in range(len(which))] if times is None else times,
-        pixel_mm=pixel or (1.0, 1.0),
+        pixel_mm=pixel,
         voxels=placed.voxels if placed else None,
         images=read,
     )
 
 
 def _regions(images: GreyImages) -> Regions:
-    """The regions on which all files agree."""
+    """The regions on which all files agree; of kinds of volumes that need none, all of it."""
+    if all(never_holds_text(file) or is_cartesian(file) for file in images.files):
+        return Regions(())
     rows, columns = images.form.rows, images.form.columns
     every = [ultrasound_regions(file, rows, columns) for file in images.files]
     doubtful = next((regions for regions in every if regions.doubt), None)

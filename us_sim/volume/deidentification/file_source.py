@@ -15,50 +15,56 @@ from numpy.typing import NDArray
 from us_sim.volume.deidentification.header_names import other_names
 from us_sim.volume.deidentification.kept_part import Regions
 from us_sim.volume.deidentification.source import Progress, Source, spread
-from us_sim.volume.files.readers import read_volume
+from us_sim.volume.files.readers import grey_voxels, open_image
 
-__all__ = ["ENDINGS", "file_source"]
+__all__ = ["file_source"]
 
-ENDINGS = {
-    ".mha": "MetaImage volume",
-    ".mhd": "MetaImage volume",
-    ".nrrd": "NRRD volume",
-    ".nhdr": "NRRD volume",
-    ".nii": "NIfTI volume",
-    ".nii.gz": "NIfTI volume",
-}
+_KINDS = {"m": "MetaImage volume", "nr": "NRRD volume", "nh": "NRRD volume"}
+"""By the beginning of a name's ending; all others are NIfTI."""
 
 
-def file_source(path: Path) -> Source:
+def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> Source:
     """The slices of a volume along its last axis.
+
+    Args:
+        path: of the file.
+        volume: which one where there are several.
+        spacing: (3,) mm, of a file that does not state it.
 
     Raises:
         VolumeError: as `read_volume`.
     """
-    volume = read_volume(path)
-    voxels = volume.intensities
+    image = open_image(path, spacing=spacing)
+    placement = image.placement()
+    voxels, conversions = grey_voxels(image, volume)
+    count = voxels.shape[2]
 
     def blanked(keep: NDArray[np.bool_] | None, _: Progress | None) -> NDArray[np.uint8]:
         return voxels if keep is None else np.where(keep.T[:, :, None], voxels, np.uint8(0))
 
     def slices(keep: NDArray[np.bool_] | None) -> Iterator[NDArray[np.uint8]]:
-        for k in range(volume.shape[2]):
+        for k in range(count):
             image = np.ascontiguousarray(voxels[:, :, k].T)
             yield image if keep is None else np.where(keep, image, np.uint8(0))
 
-    name = path.name.lower()
+    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
+    kinds = (kind for start, kind in _KINDS.items() if ending.startswith(start))
     return Source(
-        kind=next(kind for ending, kind in ENDINGS.items() if name.endswith(ending)),
-        shape=volume.shape,
-        samples=[np.ascontiguousarray(voxels[:, :, k].T) for k in spread(volume.shape[2])],
+        kind=next(kinds, "NIfTI volume"),
+        shape=image.shape,
+        samples=[np.ascontiguousarray(voxels[:, :, k].T) for k in spread(count)],
         names=other_names(path),
         kept={},
-        conversions=(),
+        conversions=conversions,
         regions=Regions(()),
-        trusted=True,
-        placement=volume.index_to_patient,
+        placement=placement,
         times=[],
         pixel_mm=(1.0, 1.0),
         voxels=blanked,
         images=slices,
+        # A program may have stored the axes of a scanner's images in another order.
+        sides=tuple(
+            [np.ascontiguousarray(np.take(voxels, n, axis)) for n in spread(voxels.shape[axis])]
+            for axis in (0, 1)
+        ),
     )

@@ -19,14 +19,13 @@ private element (0009,0010) 1
 from __future__ import annotations
 
 import re
-import struct
-import zlib
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from us_sim.volume.files.dicom.values import quiet
 from us_sim.volume.files.metaimage import metaimage_header
+from us_sim.volume.files.nifti import NIFTI_TEXTS, nifti_fields
 
 __all__ = ["dicom_names", "other_names"]
 
@@ -120,10 +119,6 @@ _COMMON = frozenset(
 )
 """Names of fields that many programs write; any other name may be somebody's own."""
 
-_NIFTI = {"data_type": (4, 10), "db_name": (14, 18), "descrip": (148, 80), "aux_file": (228, 24)}
-_NIFTI |= {"intent_name": (328, 16)}
-"""Texts of a NIfTI-1 header: first byte and length."""
-
 
 def dicom_names(header: Any) -> dict[str, int]:
     """How often each element is there, those within sequences by the way to them."""
@@ -144,7 +139,8 @@ def other_names(path: Path) -> dict[str, int]:
         return _shown(key for key in fields if key not in _METAIMAGE)
     if ending.endswith((".nrrd", ".nhdr")):
         return _shown(_nrrd_fields(path))
-    return _nifti_texts(path)
+    texts = nifti_fields(path)
+    return {name: 1 for name in NIFTI_TEXTS if texts.get(name, b"").strip(b"\0 ")}
 
 
 def _count(header: Any, before: str, found: Counter[str], depth: int) -> None:
@@ -199,22 +195,3 @@ def _nrrd_fields(path: Path) -> list[str]:
             if file.tell() > 1 << 24:
                 break
     return keys
-
-
-def _nifti_texts(path: Path) -> dict[str, int]:
-    """Texts and extensions that a header holds."""
-    with path.open("rb") as file:
-        start = file.read(1 << 12)
-    if start[:2] == b"\x1f\x8b":
-        try:
-            start = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(start, 1 << 12)
-        except zlib.error:
-            return {}
-    found = {
-        name: 1
-        for name, (at, length) in _NIFTI.items()
-        if start[at : at + length].strip(b"\0 ") and start[:4] != struct.pack("<i", 540)
-    }
-    if len(start) > 352 and start[348:352].strip(b"\0"):
-        found["header extension"] = 1
-    return found

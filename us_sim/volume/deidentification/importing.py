@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.deidentification.file_source import ENDINGS, file_source
+from us_sim.volume.deidentification.file_source import file_source
 from us_sim.volume.deidentification.imported import Imported
 from us_sim.volume.deidentification.kept_part import Regions
 from us_sim.volume.deidentification.kept_values import sorted_out
@@ -32,7 +32,8 @@ from us_sim.volume.deidentification.rectangle import Rectangle
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.deidentification.source import Progress, Source
 from us_sim.volume.deidentification.text_detection import find_text
-from us_sim.volume.files.dicom.header import is_dicom
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom
+from us_sim.volume.files.readers import ENDINGS
 
 __all__ = ["Import", "import_files", "look_at"]
 
@@ -62,7 +63,7 @@ class Import:
         assert self.out is not None
         if self.imported.undecided:
             raise VolumeError(
-                f"{self.paths[0]}: {self.imported.undecided}; {_advice(self.imported)}"
+                f"{self.paths[0]}: {self.imported.undecided}; {_advice(self.source, self.imported)}"
             )
         if self.source.placement is None:
             write_images(self.out, self.source, self.keep, self.settings.part, progress)
@@ -111,11 +112,7 @@ def _listed(files: Sequence[str | os.PathLike[str]]) -> list[Path]:
     paths: list[Path] = []
     for each in map(Path, files):
         if each.is_dir():
-            inside = sorted(path for path in each.iterdir() if path.is_file() and is_dicom(path))
-            inside = [path for path in inside if path.name.upper() != "DICOMDIR"]
-            if not inside:
-                raise VolumeError(f"{each}: has no DICOM files in it; name files")
-            paths += inside
+            paths += dicom_files(each)
         elif not each.is_file():
             raise VolumeError(f"{each}: there is no such file")
         else:
@@ -124,9 +121,15 @@ def _listed(files: Sequence[str | os.PathLike[str]]) -> list[Path]:
 
 
 def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
-    others = [path for path in paths if path.name.lower().endswith(tuple(ENDINGS))]
+    others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
+    spacing = settings.spacing_mm
+    needs_volume = out is not None and not is_images(out)
+    if spacing and len(spacing) != (3 if others or needs_volume else 2):
+        raise VolumeError(
+            "--spacing: write three numbers for a volume, X,Y,Z, and two for 2D images, X,Y"
+        )
     if len(paths) == 1 and others:
-        return file_source(paths[0])
+        return file_source(paths[0], settings.volume, spacing or None)
     strange = [*others, *(path for path in paths if path not in others and not is_dicom(path))]
     if strange:
         raise VolumeError(
@@ -136,7 +139,7 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
     # Imported where it is needed: DICOM is an extra.
     from us_sim.volume.deidentification.dicom_source import dicom_source
 
-    return dicom_source(paths, settings.volume, needs_volume=out is not None and not is_images(out))
+    return dicom_source(paths, settings.volume, spacing, needs_volume=needs_volume)
 
 
 def _looked_at(
@@ -150,6 +153,12 @@ def _looked_at(
     marked = [line for line in found if keep[line.slices].any()] if settings.blank_text else []
     for line in marked:
         keep[line.grown(_MARGIN).slices] = False
+    remaining = tuple(line for line in found if keep[line.slices].any())
+    across = 0 if settings.blank_text else sum(len(find_text(side)) for side in source.sides)
+    is_told = settings.part is not None or settings.keep_whole_image
+    if (remaining or across) and not undecided and not is_told:
+        others = f", and {across} in slices across its other axes" if across else ""
+        undecided = f"{len(remaining)} places that would go on may be text{others}"
     used, dropped = sorted_out(source.names, source.kept)
     imported = Imported(
         kind=source.kind,
@@ -159,11 +168,11 @@ def _looked_at(
         used=used,
         dropped=dropped,
         conversions=source.conversions,
-        blanked=_blanked(regions, settings, undecided, len(marked)),
+        blanked=_blanked(source, regions, settings, undecided, len(marked)),
         first=source.samples[0],
         regions=regions.kept,
         text=tuple(found),
-        remaining=tuple(line for line in found if keep[line.slices].any()),
+        remaining=remaining,
         undecided=undecided,
         proposal=proposed_part(source.samples, found) if undecided else None,
     )
@@ -181,7 +190,7 @@ def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
                 f"and last row {rows - 1}"
             )
         return Regions((part,)), ""
-    if settings.keep_whole_image or source.trusted:
+    if settings.keep_whole_image:
         return Regions(()), ""
     if source.regions.doubt:
         return Regions(()), (
@@ -191,11 +200,12 @@ def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
     return source.regions, ""
 
 
-def _advice(imported: Imported) -> str:
+def _advice(source: Source, imported: Imported) -> str:
+    blank = "" if source.regions.doubt else "--blank-text, "
     proposed = f"{imported.proposal} (a proposal)" if imported.proposal else "X0,Y0,X1,Y1"
     return (
-        f"look at the picture of --report, then give --crop {proposed}, or --keep-whole-image if "
-        f"there is nothing to hide"
+        f"look at the picture of --report, then give --crop {proposed}, {blank}or "
+        f"--keep-whole-image if there is nothing to hide"
     )
 
 
@@ -211,14 +221,17 @@ def _what(source: Source, part: Rectangle | None) -> str:
     return f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"
 
 
-def _blanked(regions: Regions, settings: ImportSettings, undecided: str, lines: int) -> str:
+def _blanked(
+    source: Source, regions: Regions, settings: ImportSettings, undecided: str, lines: int
+) -> str:
     if undecided:
         return "nothing yet: it has to be said what is kept"
     marked = f"; {lines} places that may be text" if lines else ""
     if settings.part is not None:
         return f"all but columns and rows {settings.part} is cut off{marked}"
     if not regions.kept:
-        said = "as was said" if settings.keep_whole_image else "its kind has nothing burned in"
+        said = f"no text was found in {len(source.samples)} of {source.shape[2]} images"
+        said = "as was said" if settings.keep_whole_image else said
         return f"{lines} places that may be text" if lines else f"nothing ({said})"
     kept = ", ".join(map(str, regions.kept))
     others = f", and {regions.blanked} of other kinds" if regions.blanked else ""

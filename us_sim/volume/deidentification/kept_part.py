@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.volume.deidentification.rectangle import Rectangle
 from us_sim.volume.files.dicom.header import DicomFile
-from us_sim.volume.files.dicom.values import items, number, whole
+from us_sim.volume.files.dicom.values import items, number, numbers, text, whole
 
 __all__ = ["Regions", "never_holds_text", "pixel_size", "ultrasound_regions"]
 
@@ -92,20 +92,33 @@ def never_holds_text(file: DicomFile) -> bool:
 
     That is the Enhanced US Volume (PS3.3, C.8.24.3: Burned In Annotation is NO).
     """
-    from us_sim.volume.files.dicom.values import text
-
     return (
         text(file.header, "SOPClassUID") == _ENHANCED_US_VOLUME
         and text(file.header, "BurnedInAnnotation") != "YES"
     )
 
 
-def pixel_size(file: DicomFile, regions: Regions) -> tuple[float, float] | None:
-    """Width and height of a pixel, mm, where all kept regions agree about it."""
+def pixel_size(file: DicomFile, regions: Regions) -> tuple[tuple[float, float], bool]:
+    """Width and height of a pixel in mm, and whether the header states them.
+
+    Where all kept regions agree about it that counts, then `PixelSpacing` and what secondary
+    captures have in its place. Of images that state their `PixelAspectRatio` alone the width is
+    taken for 1 mm.
+    """
     found = set()
-    for region in items(file.header, "SequenceOfUltrasoundRegions") if regions.kept else ():
+    header = file.header
+    for region in items(header, "SequenceOfUltrasoundRegions") if regions.kept else ():
         units = (whole(region, "PhysicalUnitsXDirection"), whole(region, "PhysicalUnitsYDirection"))
         delta = (number(region, "PhysicalDeltaX"), number(region, "PhysicalDeltaY"))
         if _holds_echoes(region) and units == (_CENTIMETRES, _CENTIMETRES) and all(delta):
             found.add((abs(delta[0] or 0.0) * 10.0, abs(delta[1] or 0.0) * 10.0))
-    return found.pop() if len(found) == 1 else None
+    if len(found) == 1:
+        return found.pop(), True
+    for key in ("PixelSpacing", "NominalScannedPixelSpacing"):
+        stated = numbers(header, key, 2)  # between rows, then between columns (PS3.3, 10.7.1.3)
+        if stated and all(1e-4 <= each <= 100.0 for each in stated):
+            return (stated[1], stated[0]), True
+    ratio = numbers(header, "PixelAspectRatio", 2)  # vertical, then horizontal
+    if ratio and min(ratio) > 0.0:
+        return (1.0, ratio[0] / ratio[1]), False
+    return (1.0, 1.0), False

@@ -125,6 +125,7 @@ USED = frozenset(
         "FloatPixelData",
         "DoubleFloatPixelData",
         "PixelSpacing",
+        "NominalScannedPixelSpacing",
         "PixelAspectRatio",
         "SpacingBetweenSlices",
         "ImagePositionPatient",

@@ -34,6 +34,10 @@ class ImportSettings(Settings):
     volume: int = setting(
         Quantity("number", 1, 10000), "which one where there are several in time", default=1
     )
+    spacing: str | None = setting(
+        description="X,Y,Z: mm between voxels, or X,Y between pixels, of files that do not say it",
+        default=None,
+    )
     name: str | None = setting(
         description="of a new case; never the patient's; not given: the name of its folder",
         default=None,
@@ -48,6 +52,19 @@ class ImportSettings(Settings):
                 Rectangle.read(self.crop)
             except VolumeError as error:
                 raise self.refused("crop", str(error).removeprefix("crop: ")) from error
+
+        if self.spacing is not None and not self.spacing_mm:
+            raise self.refused("spacing", "is no two or three numbers of mm; write 0.3,0.3,1")
+
+    @property
+    def spacing_mm(self) -> tuple[float, ...]:
+        """(3,) or (2,) mm, of files that do not state it; empty where it is not given."""
+        words = (self.spacing or "").split(",")
+        try:
+            found = tuple(float(word) for word in words)
+        except ValueError:
+            return ()
+        return found if len(found) in (2, 3) and all(1e-4 <= each <= 100 for each in found) else ()
 
     @property
     def part(self) -> Rectangle | None:

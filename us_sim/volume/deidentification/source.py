@@ -44,12 +44,12 @@ class Source:
     kept: Mapping[str, str]  # values that may go on, by their fields
     conversions: tuple[str, ...]  # what is made of stored values
     regions: Regions  # of echoes, as the header says
-    trusted: bool  # nothing is burned in, by the standard or the nature of the format
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
     times: list[float]  # s, of images that are no volume
     pixel_mm: tuple[float, float]  # their width and height
     voxels: Voxels | None
     images: Images | None
+    sides: tuple[list[NDArray[np.uint8]], ...] = ()  # some slices across other axes of a volume
 
 
 def spread(count: int) -> list[int]:

@@ -25,16 +25,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.anatomical_colours import Colour
 from us_sim.volume.files.label_grid import on_grid
 from us_sim.volume.files.label_table import read_label_table
-from us_sim.volume.files.nrrd import nrrd_header
-from us_sim.volume.files.readers import open_image, stored_voxels_of
+from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.segments import Segment, check_representation, segments_of
+from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.label_map import LabelMap
 from us_sim.volume.structure_terms import is_anatomical, readable
 from us_sim.volume.volume import Volume
@@ -70,13 +69,13 @@ def read_labels(
             grid is another one and ``resample`` is not given.
     """
     path = Path(path)
-    header, placement = open_image(path, layers=True)
-    pairs = nrrd_header(path)[1] if path.suffix.lower() in (".nrrd", ".nhdr") else {}
+    image = open_image(path, layers=True)
+    placement = image.placement()
     remarks: list[str] = []
     try:
-        check_representation(pairs)
-        segments = segments_of(pairs)
-        layers = _layers(header, path)
+        check_representation(image.texts)
+        segments = segments_of(image.texts)
+        layers = _layers(image)
         if segments:
             labels, known = _from_segments(layers, segments, remarks)
         else:
@@ -104,12 +103,12 @@ def read_labels(
 _Known = dict[int, tuple[str, Colour | None]]
 
 
-def _layers(header: sitk.ImageFileReader, path: Path) -> NDArray[np.generic]:
+def _layers(image: StoredImage) -> NDArray[np.generic]:
     """Stored values (layer, i, j, k), whole numbers from 0 on."""
-    stored = sitk.GetArrayFromImage(stored_voxels_of(path, header))
-    if header.GetNumberOfComponents() == 1:
-        stored = stored[..., None]
-    layers = stored.transpose(3, 2, 1, 0)
+    if image.volumes > 1:
+        raise VolumeError(f"holds {image.volumes} volumes; give one of labels")
+    stored = np.stack(list(image.slices()))
+    layers = (stored if image.components > 1 else stored[..., None]).transpose(3, 2, 1, 0)
     if layers.dtype.kind == "f":
         for layer in layers:
             if not (np.isfinite(layer).all() and (layer == np.rint(layer)).all()):

@@ -1,4 +1,4 @@
-"""Headers of MetaImage files: their fields, and what they say of the voxels.
+"""Headers of MetaImage files: their fields, and what they say of the image.
 
 >>> import pathlib, tempfile
 >>> from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
@@ -7,8 +7,8 @@
 ...     path = pathlib.Path(folder, "volume.mha")
 ...     _ = path.write_bytes(f"{header}ElementDataFile = LOCAL\\n".encode() + bytes(240))
 ...     voxels = metaimage_voxels(path, *metaimage_header(path))
->>> voxels.size, voxels.value, voxels.start
-((4, 5, 6), 2, 93)
+>>> voxels.size, voxels.type, voxels.start
+((4, 5, 6), dtype('int16'), 93)
 """
 
 from __future__ import annotations
@@ -17,37 +17,44 @@ import math
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from us_sim.errors import VolumeError
-from us_sim.volume.files.stored_voxels import StoredVoxels
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["metaimage_header", "metaimage_voxels"]
+from us_sim.errors import VolumeError
+from us_sim.volume.files.placement import checked_placement, millimetres
+from us_sim.volume.files.stored_image import StoredImage
+from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
+
+__all__ = ["metaimage_header", "metaimage_image", "metaimage_voxels"]
 
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""
 
 _LONGEST_LINE = 1 << 16
 
-_ELEMENT_BYTES = {
-    "MET_CHAR": 1,
-    "MET_UCHAR": 1,
-    "MET_SHORT": 2,
-    "MET_USHORT": 2,
-    "MET_INT": 4,
-    "MET_UINT": 4,
-    "MET_LONG": 4,
-    "MET_ULONG": 4,
-    "MET_LONG_LONG": 8,
-    "MET_ULONG_LONG": 8,
-    "MET_FLOAT": 4,
-    "MET_DOUBLE": 8,
+_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
 }
-"""MetaImage's element types and their bytes (MetaIO, metaTypes.h)."""
+"""MetaImage's element types (MetaIO, metaTypes.h)."""
 
-_VECTORS = ("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "CenterOfRotation")
+_SPACINGS = ("ElementSpacing", "ElementSize")
+_ORIGINS = ("Offset", "Position", "Origin")
 _MATRICES = ("TransformMatrix", "Rotation", "Orientation")
-"""Fields of numbers; where one is none, MetaIO takes 0 or what it has read so far."""
+"""Names of the same, of which the first that is there counts."""
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
@@ -94,26 +101,14 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
             f"{path}: its DimSize is {fields['DimSize']!r} where NDims says {dimension} numbers; "
             f"export it again"
         )
-    for keys, count in ((_VECTORS, dimension), (_MATRICES, dimension**2)):
-        for key in keys:
-            if key in fields and not _are_numbers(fields[key], count):
-                raise VolumeError(
-                    f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers "
-                    f"belong; every one must be a number: export it again"
-                )
     element = fields["ElementType"]
-    if element not in _ELEMENT_BYTES:
+    if element not in _TYPES:
         raise VolumeError(
-            f"{path}: its ElementType is {element[:80]!r}; save it with one of "
-            f"{', '.join(_ELEMENT_BYTES)}"
+            f"{path}: its ElementType is {element[:80]!r}; save it with one of {', '.join(_TYPES)}"
         )
     name = fields["ElementDataFile"]
-    if "BinaryData" in fields and not _is_true(fields["BinaryData"]):
-        raise VolumeError(f"{path}: holds its voxels as text; save it in binary form")
     if name.upper().startswith("LIST") or "%" in name:
         raise VolumeError(f"{path}: keeps its voxels in several files; save it as one .mha file")
-    if fields.get("HeaderSize", "0") != "0":
-        raise VolumeError(f"{path}: has a HeaderSize, which is not read; save it as one .mha file")
     is_local = name.upper() == "LOCAL"
     data = path if is_local else path.parent / name
     if not os.path.isfile(data):
@@ -128,9 +123,78 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
                 f"{path}: holds {there} bytes of image data where its header says {said} "
                 f"compressed ones; copy or export it again"
             )
-    if channels > 1:
-        size = (channels, *size)
-    return StoredVoxels(size, _ELEMENT_BYTES[element], data, path, start, packed=packed)
+    order = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False"))
+    encoding: Encoding = "packed" if packed else "raw"
+    if not _is_true(fields.get("BinaryData", "True")):
+        encoding = "text"
+    stored = StoredVoxels(
+        (channels, *size) if channels > 1 else size,
+        np.dtype(f"{'>' if _is_true(order) else '<'}{_TYPES[element]}"),
+        data,
+        path,
+        start,
+        encoding=encoding,
+    )
+    before = fields.get("HeaderSize", "0")
+    if before == "-1" and encoding == "raw":  # the last bytes of the file
+        return replace(stored, start=max(data.stat().st_size - stored.expected, 0))
+    if not re.fullmatch(r"[0-9]{1,9}", before):
+        raise VolumeError(f"{path}: its HeaderSize is {before[:80]!r}; export it again")
+    return replace(stored, start=start + int(before))
+
+
+def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
+    """What a header says of its image.
+
+    Args:
+        path: of the file.
+        given: (3,) mm, the spacing of a file that does not state it.
+
+    Raises:
+        VolumeError: as `metaimage_header` and `metaimage_voxels`.
+    """
+    fields, header_bytes = metaimage_header(path)
+    voxels = metaimage_voxels(path, fields, header_bytes)
+    components = voxels.size[0] if len(voxels.size) > len(fields["DimSize"].split()) else 1
+    return StoredImage(voxels, components, lambda: _placement(path, fields, given))
+
+
+def _placement(
+    path: Path, fields: Mapping[str, str], given: ArrayLike | None
+) -> NDArray[np.float64]:
+    """(4, 4) m of the first three axes; the matrix has one axis after another."""
+    count = len(fields["DimSize"].split())
+    unit = millimetres(path, fields.get("DistanceUnits", "mm"))
+    spacing = _numbers(path, fields, _SPACINGS, count)
+    origin = _numbers(path, fields, _ORIGINS, count)
+    matrix = _numbers(path, fields, _MATRICES, count**2)
+    axes = np.eye(count) if matrix is None else matrix.reshape(count, count).T
+    return checked_placement(
+        path,
+        None if spacing is None else unit * spacing[:3],
+        axes[:3, :3],
+        np.zeros(3) if origin is None else unit * origin[:3],
+        given,
+    )
+
+
+def _numbers(
+    path: Path, fields: Mapping[str, str], keys: tuple[str, ...], count: int
+) -> NDArray[np.float64] | None:
+    """The finite numbers of the first field that is there."""
+    key = next((key for key in keys if key in fields), None)
+    if key is None:
+        return None
+    try:
+        numbers = np.array([float(word) for word in fields[key].split()])
+    except ValueError:
+        numbers = np.array([math.nan])
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise VolumeError(
+            f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong; every "
+            f"one must be a number: export it again"
+        )
+    return numbers
 
 
 def _whole_numbers(
@@ -149,14 +213,6 @@ def _whole_numbers(
 def _is_whole(word: str) -> bool:
     # int() would also take 1_000 and the digits of other scripts.
     return re.fullmatch(r"0*[1-9][0-9]{0,17}", word) is not None
-
-
-def _are_numbers(text: str, count: int) -> bool:
-    words = text.split()
-    try:
-        return len(words) == count and all(math.isfinite(float(word)) for word in words)
-    except ValueError:
-        return False
 
 
 def _is_true(text: str) -> bool:

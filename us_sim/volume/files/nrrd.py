@@ -1,4 +1,5 @@
-"""What the header of an NRRD file says of its voxels (teem.sourceforge.net/nrrd/format.html).
+"""Headers of NRRD files: their fields, and what they say of the image
+(teem.sourceforge.net/nrrd/format.html).
 
 >>> import pathlib, tempfile
 >>> from us_sim.volume.files.nrrd import nrrd_voxels
@@ -7,55 +8,68 @@
 ...     path = pathlib.Path(folder, "volume.nrrd")
 ...     _ = path.write_bytes(header + bytes(240))
 ...     voxels = nrrd_voxels(path)
->>> voxels.size, voxels.value, voxels.start
-((4, 5, 6), 2, 62)
+>>> voxels.size, voxels.type, voxels.start
+((4, 5, 6), dtype('int16'), 62)
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
-from us_sim.errors import VolumeError
-from us_sim.volume.files.stored_voxels import StoredVoxels
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["nrrd_header", "nrrd_voxels"]
+from us_sim.errors import VolumeError
+from us_sim.volume.files.placement import checked_placement, millimetres
+from us_sim.volume.files.stored_image import StoredImage
+from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
+
+__all__ = ["nrrd_header", "nrrd_image", "nrrd_voxels"]
 
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""
 
 _LONGEST_LINE = 1 << 16
 
-_LONGEST_FIELD = 1000
-"""Characters: what ITK's reader says of a line that it cannot use is written to a place of about
-two thousand."""
-
 _TYPES = {
-    1: "signed char|int8|int8_t|uchar|unsigned char|uint8|uint8_t",
-    2: "short|short int|signed short|signed short int|int16|int16_t"
-    "|ushort|unsigned short|unsigned short int|uint16|uint16_t",
-    4: "int|signed int|int32|int32_t|uint|unsigned int|uint32|uint32_t|float",
-    8: "longlong|long long|long long int|signed long long|signed long long int|int64|int64_t"
-    "|ulonglong|unsigned long long|unsigned long long int|uint64|uint64_t|double",
+    "i1": "signed char|int8|int8_t",
+    "u1": "uchar|unsigned char|uint8|uint8_t",
+    "i2": "short|short int|signed short|signed short int|int16|int16_t",
+    "u2": "ushort|unsigned short|unsigned short int|uint16|uint16_t",
+    "i4": "int|signed int|int32|int32_t",
+    "u4": "uint|unsigned int|uint32|uint32_t",
+    "i8": "longlong|long long|long long int|signed long long|signed long long int|int64|int64_t",
+    "u8": "ulonglong|unsigned long long|unsigned long long int|uint64|uint64_t",
+    "f4": "float",
+    "f8": "double",
 }
-_BYTES = {name: size for size, names in _TYPES.items() for name in names.split("|")}
+_TYPE = {name: kind for kind, names in _TYPES.items() for name in names.split("|")}
 
-_PER_AXIS = {
-    *("space directions", "spacings", "thicknesses", "axis mins", "axismins", "axis maxs"),
-    *("axismaxs", "centers", "centerings", "kinds", "labels", "units"),
+_ENCODINGS: dict[str, Encoding] = {"raw": "raw", "gzip": "packed", "gz": "packed"}
+_ENCODINGS |= {"bzip2": "bzip2", "bz2": "bzip2", "ascii": "text", "text": "text", "txt": "text"}
+
+_TO_LPS = {
+    "left-posterior-superior": (1, 1, 1),
+    "right-anterior-superior": (-1, -1, 1),
+    "left-anterior-superior": (1, -1, 1),
 }
+_TO_LPS |= {"lps": (1, 1, 1), "ras": (-1, -1, 1), "las": (1, -1, 1)}
+"""Signs that turn a space's axes to left-posterior-superior; others are taken for that."""
 
-_PACKED = {"raw": False, "gzip": True, "gz": True}
+_PLACES = {"domain", "space"}  # kinds of axes along which the body extends
+_UNSTATED = {"???", "none", ""}
 
 
 def nrrd_voxels(path: Path) -> StoredVoxels:
-    """What an NRRD header says of its voxels.
+    """What an NRRD header says of its numbers.
 
     Raises:
-        VolumeError: it is no such header, its data file is missing, or the voxels are stored in a
-            way that cannot be checked.
+        VolumeError: it is no such header, its data file is missing, or they are stored in a way
+            that is not read.
     """
     fields, _, header_bytes = nrrd_header(path)
     size = fields.get("sizes", "").split()
@@ -65,60 +79,169 @@ def nrrd_voxels(path: Path) -> StoredVoxels:
             f"{path}: cannot be read as an image: its sizes are {' '.join(size)[:80]!r} and its "
             f"dimension {dimension[:80]!r} where as many whole numbers above zero belong"
         )
-    _check_axes(path, fields, len(size))
     kind, encoding = fields.get("type", "").lower(), fields.get("encoding", "").lower()
-    if kind not in _BYTES or encoding not in _PACKED:
+    if kind not in _TYPE or encoding not in _ENCODINGS:
         raise VolumeError(
             f"{path}: holds voxels of type {kind[:80]!r} in the encoding {encoding[:80]!r}; save "
-            f"it as whole or floating-point numbers, raw or gzip"
+            f"it as whole or floating-point numbers: raw, gzip, bzip2 or ascii"
         )
-    for skipped in ("line skip", "lineskip", "byte skip", "byteskip"):
-        if fields.get(skipped, "0") != "0":
-            raise VolumeError(f"{path}: has a {skipped}, which is not read; save it as one .nrrd")
     name = fields.get("data file") or fields.get("datafile")
-    if name is None:
-        file, start = path, header_bytes
-    else:
+    file, start = path, header_bytes
+    if name is not None:
         file, start = path.parent / name, 0
         if name.startswith("LIST") or "%" in name:
             raise VolumeError(f"{path}: keeps its voxels in several files; save it as one .nrrd")
         if not os.path.isfile(file):
             raise VolumeError(f"{path}: names the data file {name}, which is not there")
-    return StoredVoxels(
-        tuple(map(int, size)), _BYTES[kind], file, path, start, packed=_PACKED[encoding]
+    lines, skip = (_skipped(path, fields, unit) for unit in ("line", "byte"))
+    with file.open("rb") as data:
+        data.seek(start)
+        for _ in range(lines):
+            data.readline(_LONGEST_LINE)
+        start = data.tell()
+    order = ">" if fields.get("endian", "").lower() == "big" else "<"
+    voxels = StoredVoxels(
+        tuple(map(int, size)),
+        np.dtype(f"{order}{_TYPE[kind]}"),
+        file,
+        path,
+        start,
+        max(skip, 0),
+        _ENCODINGS[encoding],
+    )
+    if skip == -1 and encoding == "raw":  # the last bytes of the file
+        return replace(voxels, start=max(file.stat().st_size - voxels.expected, start))
+    if skip < 0:
+        raise VolumeError(f"{path}: its byte skip is {skip}, which goes with raw data only")
+    return voxels
+
+
+def _skipped(path: Path, fields: Mapping[str, str], unit: str) -> int:
+    said = fields.get(f"{unit} skip", fields.get(f"{unit}skip", "0"))
+    if not re.fullmatch(r"[0-9]{1,9}" if unit == "line" else r"-1|[0-9]{1,9}", said):
+        raise VolumeError(f"{path}: its {unit} skip is {said[:80]!r}; export it again")
+    return int(said)
+
+
+def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
+    """What a header says of its image, whose first axis may be numbers of a voxel and whose last
+    one several volumes.
+
+    Args:
+        path: of the file.
+        given: (3,) mm, the spacing of a file that does not state it.
+
+    Raises:
+        VolumeError: as `nrrd_voxels`, or its axes are no volume's.
+    """
+    fields, pairs, _ = nrrd_header(path)
+    voxels = nrrd_voxels(path)
+    places = _places(path, fields, len(voxels.size))
+    first, last = (places[0], places[-1] + 1) if places else (0, 0)
+    if len(places) != last - first or len(voxels.size) - last > 1 or first > 1:
+        raise VolumeError(
+            f"{path}: of its {len(voxels.size)} axes these are of space: "
+            f"{', '.join(str(n + 1) for n in places) or 'none'}; save it with three in a row"
+        )
+    if last - first != 3:
+        raise VolumeError(f"{path}: is {last - first}-dimensional; a volume has three dimensions")
+    return StoredImage(
+        voxels,
+        voxels.size[0] if first else 1,
+        lambda: _placement(path, fields, places, given),
+        texts=pairs,
     )
 
 
-def _check_axes(path: Path, fields: dict[str, str], dimension: int) -> None:
-    """Refuse fields of more or fewer axes; ITK's reader writes beyond its memory for them."""
-    pieces = {key: re.findall(r"\([^()]*\)|\"[^\"]*\"|[^\s()]+", fields[key]) for key in fields}
-    for key, found in pieces.items():
-        if key in _PER_AXIS and len(found) != dimension:
-            raise VolumeError(
-                f"{path}: its {key} has {len(found)} entries where the image has {dimension} axes; "
-                f"export it again"
-            )
-    vectors = [*pieces.get("space directions", ()), *pieces.get("space origin", ())]
-    vectors += pieces.get("measurement frame", ())
-    if not all(vector == "none" or _is_vector(vector) for vector in vectors) or (
-        len(pieces.get("space origin", [""])) != 1
-        or len(pieces.get("measurement frame", "xyz")) != 3
-        or len(pieces.get("space units", "xyz")) > 3
-    ):
+def _entries(path: Path, fields: Mapping[str, str], key: str, dimension: int) -> list[str] | None:
+    """The entries of a field that has one for each axis."""
+    if key not in fields:
+        return None
+    found = re.findall(r"\([^()]*\)|\"[^\"]*\"|[^\s()]+", fields[key])
+    if len(found) != dimension:
         raise VolumeError(
-            f"{path}: its space directions, origin or units are not made of vectors of three "
-            f"finite numbers; export it again"
+            f"{path}: its {key} has {len(found)} entries where the image has {dimension} axes; "
+            f"export it again"
         )
+    return [word.strip('"') for word in found]
 
 
-def _is_vector(text: str) -> bool:
-    if not (text.startswith("(") and text.endswith(")")):
-        return False
-    words = text[1:-1].split(",")
+def _places(path: Path, fields: Mapping[str, str], dimension: int) -> list[int]:
+    """Which axes are of space: those with a direction, or of a kind that is; else the first 3."""
+    if directions := _entries(path, fields, "space directions", dimension):
+        return [n for n, each in enumerate(directions) if each != "none"]
+    kinds = _entries(path, fields, "kinds", dimension)
+    if kinds and any(kind.lower() in _PLACES for kind in kinds):
+        return [n for n, kind in enumerate(kinds) if kind.lower() in _PLACES]
+    return list(range(min(dimension, 3)))
+
+
+def _placement(
+    path: Path, fields: Mapping[str, str], places: list[int], given: ArrayLike | None
+) -> NDArray[np.float64]:
+    """(4, 4) m of the axes of space."""
+    dimension = len(fields["sizes"].split())
+    space = fields.get("space", "").lower()
+    turn = np.array(_TO_LPS.get(space, (1, 1, 1)), np.float64)
+    directions = _entries(path, fields, "space directions", dimension)
+    units = _entries(
+        path, fields, "space units" if directions else "units", 3 if directions else dimension
+    )
+    if directions is None:
+        spacings = _entries(path, fields, "spacings", dimension)
+        starts = _entries(path, fields, "axis mins", dimension) or ["0"] * dimension
+        scale = [millimetres(path, _unit(units[n])) if units else 1.0 for n in places]
+        spacing = [_number(path, "spacings", spacings[n]) for n in places] if spacings else None
+        if spacing and np.isnan(spacing).all():
+            spacing = None
+        origin = np.nan_to_num([_number(path, "axis mins", starts[n]) for n in places])
+        return checked_placement(
+            path,
+            None if spacing is None else np.array(spacing) * scale,
+            np.eye(3),
+            origin * scale,
+            given,
+        )
+    to_lps = turn * [millimetres(path, _unit(unit)) for unit in units or ("", "", "")]
+    axes = np.column_stack([_vector(path, "space directions", directions[n]) for n in places])
+    origin = _vector(path, "space origin", fields.get("space origin", "(0,0,0)"))
+    axes = axes * to_lps[:, None]
+    spacing = np.linalg.norm(axes, axis=0)
+    return checked_placement(
+        path, spacing, axes / np.where(spacing > 0.0, spacing, 1.0), origin * to_lps, given
+    )
+
+
+def _unit(text: str) -> str:
+    return "" if text.lower() in _UNSTATED else text
+
+
+def _number(path: Path, key: str, text: str) -> float:
     try:
-        return len(words) == 3 and all(math.isfinite(float(word)) for word in words)
+        return float(text)
     except ValueError:
-        return False
+        raise VolumeError(
+            f"{path}: its {key} has {text[:80]!r} where a number belongs; export it again"
+        ) from None
+
+
+def _vector(path: Path, key: str, text: str) -> NDArray[np.float64]:
+    """(3,) of ``(x,y,z)``."""
+    words = text.strip().removeprefix("(").removesuffix(")").split(",")
+    vector = np.array([_number(path, key, word) for word in words])
+    if len(vector) != 3 or not np.isfinite(vector).all():
+        raise VolumeError(
+            f"{path}: its {key} is not made of vectors of three finite numbers; export it again"
+        )
+    return vector
+
+
+def _text(line: bytes) -> str:
+    """A line, which most programs write as UTF-8."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
@@ -127,7 +250,7 @@ def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     The fields' names are in lower case; keys are as they were written (``key:=value``).
 
     Raises:
-        VolumeError: it is no NRRD header, has a field twice or a line too long, or does not end.
+        VolumeError: it is no NRRD header, has a field twice, or does not end.
     """
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
@@ -137,7 +260,7 @@ def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
                 f"{path}: cannot be read as an image: it does not begin as NRRD does; give an "
                 f"MHA, NRRD, NIfTI or DICOM volume"
             )
-        while line := file.readline(_LONGEST_LINE).decode("latin-1").rstrip("\r\n"):
+        while line := _text(file.readline(_LONGEST_LINE)).rstrip("\r\n"):
             if file.tell() > _LARGEST_HEADER:
                 raise VolumeError(f"{path}: cannot be read as an image: its header does not end")
             if line.startswith("#"):
@@ -146,11 +269,6 @@ def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             if value.startswith("="):
                 pairs[key.strip()] = value[1:].strip()
                 continue
-            if len(line) > _LONGEST_FIELD:
-                raise VolumeError(
-                    f"{path}: its header has a line of {len(line)} characters, {line[:30]!r} and "
-                    f"on; export it again"
-                )
             key = key.strip().lower()
             if colon and value.startswith(" "):
                 if key in fields:

@@ -1,4 +1,4 @@
-"""Volume files into frame ``patient``: MetaImage, NRRD and NIfTI through SimpleITK, and DICOM.
+"""Volume files into frame ``patient``: MetaImage, NRRD, NIfTI and DICOM.
 
 >>> import tempfile, SimpleITK
 >>> from us_sim.volume.files.readers import read_volume
@@ -13,50 +13,52 @@
 
 from __future__ import annotations
 
-import math
 import os
-import re
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.axis_order import fill_from_slices
-from us_sim.volume.files.dicom.header import is_dicom
-from us_sim.volume.files.frame_sequence import holds_sequence
-from us_sim.volume.files.placement import checked_placement
-from us_sim.volume.files.stored_size import check_stored_size
-from us_sim.volume.files.stored_voxels import check_claim
+from us_sim.volume.files.axis_order import volume_of_slices
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom
+from us_sim.volume.files.frame_sequence import sequence_remedy
+from us_sim.volume.files.grey_levels import GreyLevels
+from us_sim.volume.files.metaimage import metaimage_image
+from us_sim.volume.files.nifti import nifti_image
+from us_sim.volume.files.nrrd import nrrd_image
+from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.volume import Volume
 
-__all__ = ["open_image", "read_placement", "read_volume", "stored_voxels_of"]
+__all__ = ["ENDINGS", "grey_voxels", "open_image", "read_placement", "read_volume"]
 
-# Not what else SimpleITK reads: a damaged DICOM file ends the process in which it reads one.
 _READERS = {
-    "mha": "MetaImageIO",
-    "mhd": "MetaImageIO",
-    "nrrd": "NrrdImageIO",
-    "nhdr": "NrrdImageIO",
-    "nii": "NiftiImageIO",
+    "mha": metaimage_image,
+    "mhd": metaimage_image,
+    "nrrd": nrrd_image,
+    "nhdr": nrrd_image,
+    "nii": nifti_image,
+    "hdr": nifti_image,
+    "img": nifti_image,
 }
+_PACKED = (".nii.gz", ".hdr.gz", ".img.gz")
 
-
-_SLAB = 1 << 23  # bytes that are turned at a time
+ENDINGS = (*(f".{ending}" for ending in _READERS), *_PACKED)
+"""Of the files of these formats; all others are DICOM, or none."""
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
-    """A scalar three-dimensional image file as a volume without labels.
+    """A scalar three-dimensional image file, or a DICOM series' folder, as a volume without labels.
 
     Frame ``patient`` is the file's own: DICOM's left-posterior-superior axes, in metres. Spacing,
-    origin and direction matrix are all respected. uint8 is taken as it is; every other type is
-    mapped linearly so that its smallest finite value becomes 0 and its largest 255 (a constant
-    image becomes 0, and so does NaN, which some programs write where nothing was scanned).
+    its unit, origin and direction matrix are all respected. uint8 is taken as it is; every other
+    type is mapped linearly so that its smallest finite value becomes 0 and its largest 255 (a
+    constant image becomes 0, and so does NaN, which some programs write where nothing was scanned).
 
-    DICOM needs the extra ``dicom``: an Enhanced US Volume, or another file of several images that
-    states where they lie; of several volumes in time the first is taken. Colour becomes grey. The
-    axes are those that the file states: for an Enhanced US Volume its own frame of reference.
+    DICOM needs the extra ``dicom``: an Enhanced US Volume, another file of several images that
+    states where they lie, or a folder with the files of one series; of several volumes in time the
+    first is taken. Colour becomes grey. The axes are those that the file states: for an Enhanced US
+    Volume its own frame of reference.
 
     Raises:
         VolumeError: the file is missing or no image, holds fewer or more bytes than its header
@@ -65,18 +67,15 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
             origin or direction that places no volume.
     """
     path = Path(path)
-    if _is_dicom(path):
+    if files := _dicom_files(path):
         from us_sim.volume.files.dicom.placed_images import placed_images
 
-        placed = placed_images([path])
+        placed = placed_images(files)
         return Volume(placed.voxels(), placed.placement)
-    header, index_to_patient = open_image(path)
-    plain = _plain_voxels(path, header)
-    if plain is not None:
-        return Volume(plain, index_to_patient)
-    image = stored_voxels_of(path, header)
-    stored = sitk.GetArrayViewFromImage(image)  # (k, j, i)
-    return Volume(_grey_values(path, stored), index_to_patient)
+    image = open_image(path)
+    _refuse_several(image)
+    placement = image.placement()
+    return Volume(grey_voxels(image)[0], placement)
 
 
 def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
@@ -86,147 +85,89 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         VolumeError: as `read_volume`, except for faults of the voxels.
     """
     path = Path(path)
-    if _is_dicom(path):
+    if files := _dicom_files(path):
         from us_sim.volume.files.dicom.placed_images import placed_images
 
-        return placed_images([path]).placement
-    return open_image(path)[1]
-
-
-def _plain_voxels(path: Path, header: sitk.ImageFileReader) -> NDArray[np.uint8] | None:
-    """The voxels (i, j, k) of a file that holds them as they are, without a second copy of them."""
-    stored = check_stored_size(path)
-    if stored.packed or header.GetPixelID() != sitk.sitkUInt8:
-        return None
-    i, j, k = header.GetSize()
-    voxels = np.empty((i, j, k), np.uint8)
-    slab = max(1, _SLAB // (i * j))
-    with stored.file.open("rb") as file:
-        file.seek(stored.start + stored.skip)
-        for first in range(0, k, slab):
-            count = min(slab, k - first)
-            data = np.fromfile(file, np.uint8, i * j * count)
-            if data.size != i * j * count:
-                raise VolumeError(f"{path}: became shorter while it was read; try again")
-            fill_from_slices(voxels, first, data.reshape(count, j, i))
-    return voxels
-
-
-def _is_dicom(path: Path) -> bool:
-    """Whether it is a DICOM file; one with another format's name is taken for what it says."""
-    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
-    return ending not in _READERS and path.is_file() and is_dicom(path)
-
-
-def stored_voxels_of(path: Path, header: sitk.ImageFileReader) -> sitk.Image:
-    """The image of a file that `open_image` has opened.
-
-    Raises:
-        VolumeError: its data cannot be read.
-    """
-    try:
-        return header.Execute()
-    except RuntimeError as error:
-        raise VolumeError(
-            f"{path}: its image data cannot be read, as it is damaged, incomplete or too large for "
-            f"this machine's memory; copy or export it again"
-        ) from error
+        return placed_images(files).placement
+    image = open_image(path)
+    _refuse_several(image)
+    placement = image.placement()
+    image.voxels.check_bytes()
+    return placement
 
 
 def open_image(
-    path: Path, *, layers: bool = False
-) -> tuple[sitk.ImageFileReader, NDArray[np.float64]]:
-    """The reader of a file, its header read, and the placement of its voxels, (4, 4) m.
+    path: Path, *, layers: bool = False, spacing: ArrayLike | None = None
+) -> StoredImage:
+    """What the header of a MetaImage, NRRD or NIfTI file says of its image.
 
     Args:
         path: of the file.
         layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
+        spacing: (3,) mm, of a file that does not state it.
 
     Raises:
-        VolumeError: as `read_volume`, except for faults of the voxels.
+        VolumeError: as `read_volume`, except for faults of the voxels and of where they lie.
     """
     if not os.path.exists(path):
         raise VolumeError(f"{path}: there is no such file")
     if not os.path.isfile(path):
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
-    if holds_sequence(path):
+    if not path.name.lower().endswith(ENDINGS):
         raise VolumeError(
-            f"{path}: is a sequence of tracked frames, not a volume; make one of it with "
-            f"`us-sim reconstruct {path.name} --out volume.nrrd`"
+            f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which "
+            f"3D Slicer makes of others"
         )
-    stored = check_stored_size(path)
-    header = sitk.ImageFileReader()
-    header.SetImageIO(_READERS[path.name.lower().removesuffix(".gz").rpartition(".")[2]])
-    header.SetFileName(str(path))
-    try:
-        header.ReadImageInformation()
-    except RuntimeError as error:
-        raise VolumeError(
-            f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume"
-        ) from error
-    placement = _placement(path, header, layers=layers)
-    value = int(re.findall(r"\d+", sitk.GetPixelIDValueAsString(header.GetPixelID()))[0]) // 8
-    numbers = math.prod(header.GetSize()) * header.GetNumberOfComponents()
-    if _is_scaled(path, header) and stored.expected == numbers * stored.value:
-        check_claim(path, stored.size, value)
-    elif stored.expected != numbers * value:
-        raise VolumeError(
-            f"{path}: its header says more than one thing about its size; export it again"
-        )
-    return header, placement
+    if remedy := sequence_remedy(path):
+        raise VolumeError(f"{path}: is no volume but {remedy}")
+    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
+    image = _READERS[ending](path, spacing)
+    image.check(layers=layers)
+    return image
 
 
-def _is_scaled(path: Path, header: sitk.ImageFileReader) -> bool:
-    """Whether a NIfTI file stores whole numbers for others: ITK makes them floating-point ones.
+def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+    """The grey values (i, j, k) of an image, and what was made of its numbers, for a person.
 
-    Its ``scl_slope`` is then neither 0 nor 1, or its ``scl_inter`` not 0.
+    Args:
+        image: as `open_image` returns it.
+        volume: which one where there are several.
+
+    Raises:
+        VolumeError: its data cannot be read, or there is no such volume.
     """
-    floating = header.GetPixelID() in (sitk.sitkFloat32, sitk.sitkFloat64)
-    return floating and path.name.lower().endswith((".nii", ".nii.gz"))
-
-
-def _placement(path: Path, header: sitk.ImageFileReader, *, layers: bool) -> NDArray[np.float64]:
-    """(4, 4) m, from the header alone, so that nothing unusable is read."""
-    dimension, size = header.GetDimension(), header.GetSize()
-    if dimension != 3:
-        raise VolumeError(f"{path}: is {dimension}-dimensional; a volume has three dimensions")
-    if min(size) < 2:
+    if not 1 <= volume <= image.volumes:
         raise VolumeError(
-            f"{path}: has {' × '.join(map(str, size))} voxels; a volume needs two or more along "
-            f"each axis"
+            f"{image.voxels.header}: holds {image.volumes} volumes; number {volume} is none of them"
         )
-    pixel = sitk.GetPixelIDValueAsString(header.GetPixelID())
-    if (header.GetNumberOfComponents() != 1 and not layers) or "complex" in pixel:
+    levels, said = GreyLevels(), []
+    if image.voxels.type != np.uint8 or image.scaling != (1.0, 0.0):
+        levels = GreyLevels.over(image.voxels.header, image.slices(volume))
+        said = levels.said(8 * image.voxels.type.itemsize)
+    if image.volumes > 1:
+        said.append(f"volume {volume} of {image.volumes}")
+    slices = (levels(plane) for plane in image.slices(volume))
+    return volume_of_slices(slices, image.shape[2]), tuple(said)
+
+
+def _refuse_several(image: StoredImage) -> None:
+    if image.volumes > 1:
+        path = image.voxels.header
         raise VolumeError(
-            f"{path}: holds {header.GetNumberOfComponents()} numbers per voxel ({pixel}); "
-            f"convert it to one grey value"
+            f"{path}: holds {image.volumes} volumes; make one of them a file with `us-sim import "
+            f"{path.name} --volume 1 --out volume.nrrd`"
         )
-    direction = header.GetDirection()
-    return checked_placement(path, header.GetSpacing(), direction, header.GetOrigin())
 
 
-def _grey_values(path: Path, stored: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Stored values (k, j, i) of any scalar type as (i, j, k) uint8."""
-    grey = np.empty(stored.shape[::-1], dtype=np.uint8)
-    if stored.dtype == np.uint8:
-        fill_from_slices(grey, 0, np.asarray(stored, np.uint8))
-        return grey
-    ranges = [_finite_range(plane) for plane in stored]
-    low = min(lower for lower, _ in ranges)
-    high = max(upper for _, upper in ranges)
-    if low > high:
-        raise VolumeError(f"{path}: holds no finite value")
-    # Plane by plane: a whole volume in float64 would take eight times the memory of the file's.
-    for k, plane in enumerate(stored):
-        # Halves, since the whole range of a float64 image may exceed what float64 can hold.
-        height = plane.astype(np.float64) / 2 - low / 2
-        level = height / (high / 2 - low / 2) if high > low else np.zeros_like(height)
-        level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-        grey[:, :, k] = np.floor(level * 255.0 + 0.5).T
-    return grey
+def _dicom_files(path: Path) -> list[Path]:
+    """The DICOM files that a path names; none where it is of another format.
 
+    A file with another format's name is taken for what that says.
 
-def _finite_range(plane: NDArray[np.generic]) -> tuple[float, float]:
-    values = plane.astype(np.float64)
-    finite = values[np.isfinite(values)]
-    return (float(finite.min()), float(finite.max())) if finite.size else (np.inf, -np.inf)
+    Raises:
+        VolumeError: it is a folder without DICOM files.
+    """
+    if path.is_dir():
+        return dicom_files(path)
+    named = path.name.lower().endswith(ENDINGS)
+    return [] if named or not path.is_file() or not is_dicom(path) else [path]

@@ -11,7 +11,6 @@ of Slicer before 5 have a layer for each segment, in which it is 1
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 from collections.abc import Mapping
@@ -73,7 +72,7 @@ def check_representation(pairs: Mapping[str, str]) -> None:
 def _segment(number: int, at: int, fields: Mapping[str, str], shared: bool) -> Segment:
     layer = _whole(number, fields, "Layer", 0 if shared else at, least=0)
     return Segment(
-        _utf8(fields.get("Name", "")) or f"structure {number + 1}",
+        _printable(fields.get("Name", "")) or f"structure {number + 1}",
         _whole(number, fields, "LabelValue", 1, least=1),
         layer,
         _colour(fields.get("Color", "")),
@@ -116,8 +115,5 @@ def _extent(number: int, text: str | None) -> tuple[int, ...] | None:
     return tuple(map(int, words))
 
 
-def _utf8(text: str) -> str:
-    """A text whose bytes were taken for Latin-1, as those of all NRRD headers are here."""
-    with contextlib.suppress(UnicodeError):
-        text = text.encode("latin-1").decode("utf-8")
+def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()

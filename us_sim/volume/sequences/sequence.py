@@ -172,10 +172,9 @@ def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
             f"{path}: says it holds {file.count} images of {size}; {_LARGEST_IMAGE} pixels are "
             f"read at most: export a part of it"
         )
-    if not file.is_bytes or file.channels not in (1, 3):
+    if file.channels not in (1, 3):
         return VolumeError(
-            f"{path}: holds {file.channels} × {file.element or 'nothing known'} per pixel; save it "
-            f"as 8-bit grey values or colours"
+            f"{path}: holds {file.channels} numbers per pixel; save it as grey values or colours"
         )
     if not is_orientation(file.orientation):
         return VolumeError(
@@ -184,7 +183,7 @@ def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
         )
     try:
         voxels = file.voxels()
-        if not voxels.packed:  # packed images are checked as they are read
+        if voxels.encoding == "raw":  # packed images are checked as they are read
             voxels.check_bytes()
     except VolumeError as error:
         return error

@@ -43,7 +43,6 @@ SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 _GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"
 _MOST_FRAMES = 1 << 20  # four hours at 60 Hz
 _NUMBER = re.compile(r"-?[0-9]{1,18}")
-_BYTES = ("MET_UCHAR", "uchar", "unsigned char", "uint8", "uint8_t")
 _COLOURS = {"vector", "rgb-color", "3-color", "list"}
 
 
@@ -56,15 +55,9 @@ class SequenceFile:
     rows: int
     channels: int  # numbers a pixel
     count: int  # frames
-    element: str  # the type of a pixel's numbers, as the file has it
     orientation: str
     frames: Mapping[int, Mapping[str, str]]  # fields by the frame's number
     voxels: Callable[[], StoredVoxels]  # where the images are; raises VolumeError
-
-    @property
-    def is_bytes(self) -> bool:
-        """Whether a pixel's numbers are whole ones from 0 to 255."""
-        return self.element in _BYTES
 
 
 def read_sequence_file(path: Path) -> SequenceFile:
@@ -102,8 +95,7 @@ def _metaimage(path: Path) -> SequenceFile:
     return SequenceFile(
         path,
         *_size(path, columns, rows, between, channels, count),
-        header.get("ElementType", ""),
-        header.get("UltrasoundImageOrientation", "MF"),
+        _orientation(header),
         _frames(path, header.get("Kinds", ""), header),
         lambda: metaimage_voxels(path, header, header_bytes),
     )
@@ -112,16 +104,16 @@ def _metaimage(path: Path) -> SequenceFile:
 def _nrrd(path: Path) -> SequenceFile:
     fields, pairs, _ = nrrd_header(path)
     kinds = fields.get("kinds", "").lower().split()
+    if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
+        raise VolumeError(
+            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
+            f"export it as Plus does: domain domain domain list"
+        )
     frames = _frames(path, " ".join(kinds), pairs)
     said = fields.get("sizes", "")
     sizes = _whole_numbers(path, "sizes", said)
     if not kinds:
         kinds = ["domain"] * (len(sizes) - 1) + ["list"]
-    if kinds[-1] not in ("list", "time"):
-        raise VolumeError(
-            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
-            f"export it as Plus does: domain domain domain list"
-        )
     channels = 1
     if kinds[0] in _COLOURS:
         channels, kinds, sizes = sizes[0], kinds[1:], sizes[1:]
@@ -131,11 +123,15 @@ def _nrrd(path: Path) -> SequenceFile:
     return SequenceFile(
         path,
         *_size(path, columns, rows, between, channels, count),
-        fields.get("type", "").lower(),
-        pairs.get("UltrasoundImageOrientation", "MF"),
+        _orientation(pairs),
         frames,
         lambda: nrrd_voxels(path),
     )
+
+
+def _orientation(keys: Mapping[str, str]) -> str:
+    """How images lie; older versions of Plus write the key in small letters with blanks."""
+    return keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
 
 
 def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:

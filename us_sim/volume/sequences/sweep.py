@@ -114,6 +114,11 @@ def sweep_of(
     sequence.require_images()
     count = len(sequence)
     known = dict(sequence.transforms)
+    if not known:
+        raise VolumeError(
+            f"{sequence.path}: its frames have no transforms, so nothing says where the images "
+            f"lie; record it again with a tracked probe"
+        )
     for name, matrix in (calibration or {}).items():
         known[name] = FrameTransforms(np.broadcast_to(matrix, (count, 4, 4)), ("",) * count)
     chain = shortest_chain(known, image, reference)

@@ -28,6 +28,7 @@ from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.image_format import ImageFormat, image_format
 from us_sim.volume.files.dicom.palette import WEIGHTS, grey_palette
 from us_sim.volume.files.dicom.values import items, number
+from us_sim.volume.files.grey_levels import GreyLevels
 
 __all__ = ["GreyImages"]
 
@@ -90,17 +91,13 @@ class GreyImages:
             VolumeError: an image is damaged, or its decoder is missing.
         """
         which = self.all if which is None else which
-        low, high = (0.0, 255.0) if self._plain else self._range(which, keep)
+        levels = GreyLevels()
+        if not self._plain:
+            kept = (each if keep is None else each[keep] for each in self._brightness(which))
+            levels = GreyLevels.over(self.files[0].path, kept)
         blank = None if keep is None else ~keep
         for image in self._brightness(which):
-            if self._plain:
-                grey = np.array(image, dtype=np.uint8)
-            else:
-                # Halves, since the whole range may exceed what float64 can hold.
-                height = image.astype(np.float64) / 2 - low / 2
-                level = height / ((high / 2 - low / 2) or 1.0)
-                level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-                grey = np.floor(level * 255.0 + 0.5).astype(np.uint8)
+            grey = levels(image)
             if self._inverted:
                 np.subtract(255, grey, out=grey)
             if blank is not None:
@@ -129,20 +126,6 @@ class GreyImages:
             group if group and items(group[0], "PixelValueTransformationSequence") else []
             for group in groups
         ]
-
-    def _range(
-        self, which: Sequence[tuple[int, int]], keep: NDArray[np.bool_] | None
-    ) -> tuple[float, float]:
-        """The least and the greatest finite value of what is kept."""
-        low, high = np.inf, -np.inf
-        for image in self._brightness(which):
-            values = (image if keep is None else image[keep]).astype(np.float64)
-            values = values[np.isfinite(values)]
-            if values.size:
-                low, high = min(low, float(values.min())), max(high, float(values.max()))
-        if low > high:
-            raise VolumeError(f"{self.files[0].path}: holds no finite value")
-        return low, high
 
     def _brightness(self, which: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
         """One number a pixel: a grey value where `_plain`, else the rescaled value."""

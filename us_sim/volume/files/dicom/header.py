@@ -24,7 +24,7 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.values import quiet, text, whole
 from us_sim.volume.files.stored_voxels import check_claim
 
-__all__ = ["EXTRA", "DicomFile", "PixelPlace", "is_dicom", "open_dicom"]
+__all__ = ["EXTRA", "DicomFile", "PixelPlace", "dicom_files", "is_dicom", "open_dicom"]
 
 EXTRA = "pip install 'us_sim[dicom]'"
 
@@ -82,6 +82,19 @@ def is_dicom(path: Path) -> bool:
     except OSError:
         return False
     return start[128:] == b"DICM" or path.suffix.lower() in _NAMES
+
+
+def dicom_files(folder: Path) -> list[Path]:
+    """The DICOM files in a folder.
+
+    Raises:
+        VolumeError: there are none.
+    """
+    found = [path for path in sorted(folder.iterdir()) if path.is_file() and is_dicom(path)]
+    found = [path for path in found if path.name.upper() != "DICOMDIR"]
+    if not found:
+        raise VolumeError(f"{folder}: has no DICOM files in it; name a file")
+    return found
 
 
 def open_dicom(path: str | os.PathLike[str]) -> DicomFile:

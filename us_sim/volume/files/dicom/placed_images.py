@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.axis_order import fill_from_slices
+from us_sim.volume.files.axis_order import volume_of_slices
 from us_sim.volume.files.dicom.grey import GreyImages
 from us_sim.volume.files.dicom.header import DicomFile, open_dicom
 from us_sim.volume.files.dicom.planes import Plane, grid_of
@@ -35,7 +35,6 @@ from us_sim.volume.files.dicom.vendors import (
 
 __all__ = ["PlacedImages", "is_flat", "opened_images", "placed_images"]
 
-_SLAB = 32  # images that are turned at a time
 _TISSUE = "TISSUE_INTENSITY"
 _MOST_FILES = 1 << 14
 
@@ -68,19 +67,7 @@ class PlacedImages:
         Raises:
             VolumeError: an image is damaged, or its decoder is missing.
         """
-        grey: NDArray[np.uint8] | None = None
-        slab: list[NDArray[np.uint8]] = []
-        # Not before the first image was read: only then is it known that the size is no lie.
-        for k, image in enumerate(self.images.images(self.which, keep), start=1):
-            grey = np.empty(self.shape, np.uint8) if grey is None else grey
-            slab.append(image)
-            if len(slab) == _SLAB or k == len(self.which):
-                fill_from_slices(grey, k - len(slab), np.stack(slab))
-                slab.clear()
-                if progress:
-                    progress(k / len(self.which), f"{k} of {len(self.which)} images")
-        assert grey is not None
-        return grey
+        return volume_of_slices(self.images.images(self.which, keep), len(self.which), progress)
 
 
 def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
