@@ -76,3 +76,34 @@ def test_what_was_removed_before_the_end_is_said_at_the_end(bag, whole_folder):
         bag.close()
     assert bag.lost == {"/note": 1}
     bag.close()
+
+
+@pytest.mark.parametrize("part", [0.0, 0.01, 0.2, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_file_that_was_cut_keeps_what_is_left_and_the_rest_is_said(tmp_path, part, ends):
+    bag = BagWriter(tmp_path / "session.mcap", chunk_size=300)
+    bag.attach("scene.yaml", "text/yaml", b"name: arm", EPOCH)
+    for topic in ("/note", "/other"):
+        bag.add_topic(topic, "std_msgs/msg/String")
+    for k in range(100):
+        bag.write("/note", HI, EPOCH + k)
+    bag.flush()
+    size = bag.path.stat().st_size
+    with bag.path.open("r+b") as file:
+        file.truncate(int(part * size))
+    for k in range(100, 120):
+        bag.write("/other", HI, EPOCH + k)
+        bag.write("/note", HI, EPOCH + k)
+    with pytest.raises(BagError, match="was cut by another process"):
+        (bag.close if ends else bag.flush)()
+    if not ends:
+        bag.write("/note", HI, EPOCH + 200)
+        bag.close()
+    whole = [read_bag(each) for each in sorted(tmp_path.glob("*.mcap"))]
+    assert len(whole) == (1 if ends else 2)
+    assert [each.faults() for each in whole] == [[]] * len(whole)
+    assert [*whole[-1].attachments()] == ["scene.yaml"] or ends
+    kept = sum(each.message_count for each in whole)
+    assert kept + bag.lost.total() == (140 if ends else 141)
+    assert bag.lost["/note"] > 0
+    assert kept >= 40 + 90 * (part > 0.99)

@@ -51,6 +51,7 @@ _LENGTH = struct.Struct("<Q")
 _COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
 
 _COUNT = struct.Struct("<HI")  # channel, messages
+_PLACE = struct.Struct("<25xQQI")  # likewise: where it begins, its length, that of its offsets
 _SPAN = struct.Struct("<9xQQQ")  # of a chunk's index record: start, end, where the chunk begins
 
 
@@ -67,6 +68,13 @@ class _WrittenChunk:
         first, last, begin = _SPAN.unpack_from(self.index)
         return first, last, begin
 
+    @property
+    def end(self) -> int:
+        """Where it ends, with the tables of its messages."""
+        begin, length, offsets = _PLACE.unpack_from(self.index)
+        (tables,) = _LENGTH.unpack_from(self.index, _PLACE.size + offsets)
+        return int(begin + length + tables)
+
 
 class Place(Enum):
     """Where a file is that is being written."""
@@ -74,6 +82,7 @@ class Place(Enum):
     HERE = "where it was made"
     MOVED = "somewhere else"
     REMOVED = "nowhere"
+    CUT = "shorter than it was written"
 
 
 class McapOutput:
@@ -105,11 +114,13 @@ class McapOutput:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._begin_chunk()
+        self._begin = [MAGIC, _bytes_of(Header("ros2", library))]
         self._size = 0  # bytes of whole records in the file
+        self._was_cut = False
         self._file = path.open("xb", buffering=0)
         self._tells_place = self._is_at_path  # some network's folders give no lasting numbers
         try:
-            self._append([MAGIC, _bytes_of(Header("ros2", library))])
+            self._append(self._begin)
         except OSError:
             self._file.close()
             with contextlib.suppress(OSError):
@@ -123,9 +134,9 @@ class McapOutput:
 
     @property
     def place(self) -> Place:
-        """Whether somebody else has taken the file away since it was made."""
+        """Whether somebody else has taken the file away, or a part of it, since it was made."""
         if not self._tells_place or self._is_at_path:
-            return Place.HERE
+            return Place.CUT if self._was_cut or self._is_short else Place.HERE
         return Place.MOVED if os.fstat(self._file.fileno()).st_nlink else Place.REMOVED
 
     @property
@@ -174,7 +185,8 @@ class McapOutput:
         """
         channel = self._channels[topic]
         if topic not in self._declared and topic not in self._declared_here:
-            self._declare(topic)
+            self._put(self._types_of(topic))
+            self._declared_here.add(topic)
         header = _MESSAGE.pack(
             Opcode.MESSAGE, 22 + len(data), channel.id, sequence, log_time, publish_time
         )
@@ -197,7 +209,7 @@ class McapOutput:
         """
         if not self._index:
             return
-        records, index, declared = b"".join(self._parts), self._index, self._declared_here
+        records, index = b"".join(self._parts), self._index
         counts = Counter({topic: len(entries) for topic, entries in index.items()})
         self._begin_chunk()
         times = [time for entries in index.values() for time, _ in entries]
@@ -209,8 +221,14 @@ class McapOutput:
             *(first, last, len(records), zlib.crc32(records), len(name)),
         )
         header += name + _LENGTH.pack(len(packed))
+        try:
+            self._notice_cut()
+        except OSError:
+            self._drop(counts)
+            raise
         # Types and topics are there twice: one damaged chunk does not make later ones unreadable.
-        types = b"".join(declared.values())
+        new = [topic for topic in index if topic not in self._declared]
+        types = b"".join(map(self._types_of, new))
         start = self._size + len(types)
         offsets, tables, position = {}, [], start + len(header) + len(packed)
         for topic, entries in index.items():
@@ -223,7 +241,9 @@ class McapOutput:
         except OSError:
             self._drop(counts)
             raise
-        self._declared |= declared.keys()
+        self._declared.update(new)
+        self.start = first if self.start is None else min(first, self.start)
+        self.end = last if self.end is None else max(last, self.end)
         written = ChunkIndex(
             message_start_time=first,
             message_end_time=last,
@@ -244,6 +264,7 @@ class McapOutput:
         Raises:
             OSError: it cannot be written; the file is as before.
         """
+        self._notice_cut()
         record = _bytes_of(Metadata(name=name, metadata=values))
         index = MetadataIndex(offset=self._size, length=len(record), name=name)
         self._append([record])
@@ -255,6 +276,7 @@ class McapOutput:
         Raises:
             OSError: it cannot be written; the file is as before.
         """
+        self._notice_cut()
         attachment = Attachment(
             create_time=time, log_time=time, name=name, media_type=media_type, data=data
         )
@@ -284,7 +306,9 @@ class McapOutput:
                 self.end_chunk()
             while True:
                 try:
+                    self._notice_cut()
                     self._append(self._summary())
+                    self._file.truncate(self._size)  # of what another process has added
                 except OSError:
                     if not self._chunks:
                         raise
@@ -296,18 +320,40 @@ class McapOutput:
         self._parts: list[bytes] = []
         self._pending = 0  # bytes
         self._index: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-        self._declared_here: dict[str, bytes] = {}  # and their records
+        self._declared_here: set[str] = set()
 
     def _put(self, data: bytes) -> None:
         self._parts.append(data)
         self._pending += len(data)
 
-    def _declare(self, topic: str) -> None:
-        """Put the records of a topic's type and channel before its first message."""
+    def _types_of(self, topic: str) -> bytes:
+        """The records of a topic's type and channel."""
         channel = self._channels[topic]
         schema = next(each for each in self._schemas.values() if each.id == channel.schema_id)
-        self._declared_here[topic] = _bytes_of(schema) + _bytes_of(channel)
-        self._put(self._declared_here[topic])
+        return _bytes_of(schema) + _bytes_of(channel)
+
+    @property
+    def _is_short(self) -> bool:
+        return os.fstat(self._file.fileno()).st_size < self._size
+
+    def _notice_cut(self) -> None:
+        """Where another process has cut the file: go on after the last record that is whole."""
+        size = os.fstat(self._file.fileno()).st_size
+        if size >= self._size:
+            return
+        self._was_cut = True
+        kept = [chunk for chunk in self._chunks if chunk.end <= size]
+        lost, self._chunks = self._chunks[len(kept) :], kept
+        self._attachments = [e for e in self._attachments if e.offset + e.length <= size]
+        self._metadata = [e for e in self._metadata if e.offset + e.length <= size]
+        self._declared.clear()
+        ends = [chunk.end for chunk in kept]
+        ends += [each.offset + each.length for each in self._attachments]
+        ends += [each.offset + each.length for each in self._metadata]
+        self._cut(max(ends, default=0))
+        self._drop(sum(map(self._counts_of, lost), Counter()))
+        if not self._size:
+            self._append(self._begin)
 
     def _append(self, parts: Iterable[bytes]) -> None:
         """Write at the end, all or nothing."""
@@ -345,8 +391,12 @@ class McapOutput:
         self._cut(chunk.span[2])
         self._attachments = [each for each in self._attachments if each.offset < self._size]
         self._metadata = [each for each in self._metadata if each.offset < self._size]
+        self._drop(self._counts_of(chunk))
+
+    def _counts_of(self, chunk: _WrittenChunk) -> Counter[str]:
+        """Messages of a chunk by topic."""
         topics = {channel.id: topic for topic, channel in self._channels.items()}
-        self._drop(Counter({topics[id]: n for id, n in _COUNT.iter_unpack(chunk.counts)}))
+        return Counter({topics[id]: n for id, n in _COUNT.iter_unpack(chunk.counts)})
 
     def _summary(self) -> list[bytes]:
         """What comes after the messages."""

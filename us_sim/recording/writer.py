@@ -41,7 +41,7 @@ class BagWriter:
 
     Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
     one when there is room again, and :attr:`lost` tells what did not fit. Where somebody takes the
-    file away, that is an error as well, and writing goes on in another one at once.
+    file or a part of it away, that is an error as well, and writing goes on in another one at once.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -366,6 +366,12 @@ class BagWriter:
             self.lost += file.dropped
             if place is Place.HERE:
                 self._contents.keep(file)
+            elif place is Place.CUT:
+                self._contents.keep(file)
+                self._taken_away.append(
+                    f"{file.path} was cut by another process while it was recorded: "
+                    f"{file.dropped.total()} messages are lost, and {file.message_count} are in it"
+                )
             elif place is Place.MOVED:
                 self._taken_away.append(
                     f"{file.path} was moved away while it was recorded, with "
