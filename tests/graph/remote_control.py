@@ -1,5 +1,6 @@
 """What a person elsewhere on the ROS domain has: parameters to set, and reports to read."""
 
+import functools
 import subprocess
 import sys
 import time
@@ -8,7 +9,7 @@ import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 
 
 class RemoteControl:
-    """Sets parameters of ``session_control`` and hears what nodes report."""
+    """Sets parameters, of ``session_control`` or another node, and hears what nodes report."""
 
     def __init__(self):
         import rclpy
@@ -25,7 +26,7 @@ class RemoteControl:
         self.node = Node("remote_control", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._client = AsyncParameterClient(self.node, "session_control")
+        self._asking = functools.cache(lambda name: AsyncParameterClient(self.node, name))
         self.reports = {}
         self.states = []
         self.images = 0
@@ -38,22 +39,26 @@ class RemoteControl:
         self.node.create_subscription(DiagnosticArray, "session/scenes", self._listed, kept)
         self.node.create_subscription(CompressedImage, "session/thumbnails", self._pictured, kept)
 
-    def set(self, **values):
+    def set(self, of="session_control", /, **values):
         """Set them together; the reason where that is refused."""
         from rclpy.parameter import Parameter
 
-        self.until(self._client.services_are_ready)
-        asked = self._client.set_parameters_atomically(
+        client = self._asking(of)
+        self.until(client.services_are_ready)
+        asked = client.set_parameters_atomically(
             [Parameter(name, value=value) for name, value in values.items()]
         )
         self.until(asked.done)
         return asked.result().result.reason
 
-    def value(self, name):
+    def value(self, name, of="session_control"):
         """A parameter's value now."""
-        asked = self._client.get_parameters([name])
+        from us_sim.nodes.conversions.parameters import raw_from
+
+        self.until(self._asking(of).services_are_ready)
+        asked = self._asking(of).get_parameters([name])
         self.until(asked.done)
-        return asked.result().values[0].string_value
+        return raw_from(asked.result().values[0])[1]
 
     def until(self, condition, seconds=100):
         """Listen until that is so."""

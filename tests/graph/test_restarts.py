@@ -139,9 +139,7 @@ def test_one_that_was_stopped_ends_by_itself_when_it_is_told_to():
     assert group.stop() == []
 
 
-def test_one_that_stands_by_takes_over_unless_it_was_made_for_something_else(
-    played_scene, tmp_path
-):
+def test_one_that_stands_by_takes_over_as_it_is_wanted_by_then(played_scene, tmp_path):
     skin = NodeProcess("skin_deformer", {"scene": str(played_scene)})
     log = tmp_path / "nodes.log"
     group = ProcessGroup(log)
@@ -160,9 +158,15 @@ def test_one_that_stands_by_takes_over_unless_it_was_made_for_something_else(
             time.sleep(0.05)
         assert b"US_SIM_STANDBY=1" in Path(f"/proc/{taken_over}/environ").read_bytes()
         group.end("skin_deformer")
-        group.stand_by(skin)
-        group.start([NodeProcess("skin_deformer", {"scene": str(played_scene), "threads": 2})])
-        fresh = group.pids["skin_deformer"]
-        assert b"US_SIM_STANDBY" not in Path(f"/proc/{fresh}/environ").read_bytes()
+        while not group.stand_by(skin):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        group.start([NodeProcess("skin_deformer", {"scene": "nowhere"})])
+        taken_over = group.pids["skin_deformer"]
+        assert b"US_SIM_STANDBY=1" in Path(f"/proc/{taken_over}/environ").read_bytes()
+        while group.is_running("skin_deformer"):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert "no scene file nowhere" in str(group.failure("skin_deformer", 1))
     finally:
         group.stop()

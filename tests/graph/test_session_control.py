@@ -41,6 +41,16 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     control.until(lambda: control.state == "running")
     before = nodes_of(run.pid)
 
+    # A node that is ended has what was set of it again.
+    stiffness = "materials.fat.young_modulus"
+    assert control.set("tissue_deformer", **{stiffness: 45e3}) == ""
+    control.until(lambda: "running" in control.state)
+    os.kill(before["tissue_deformer"], signal.SIGKILL)
+    control.until(lambda: control.state.startswith("starting"))
+    control.until(lambda: control.state == "running")
+    assert control.value(stiffness, "tissue_deformer") == 45e3
+    before = nodes_of(run.pid)
+
     # A path is played, and recorded; nobody else is started again.
     assert control.set(record="session.mcap", replay=str(short_path), replay_loop=True) == ""
     control.until(lambda: control.images > 10 and control.report("session_recorder"))
@@ -83,6 +93,11 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     assert control.set(replay=str(tmp_path / "session.mcap"), replay_as="recording") == ""
     control.until(lambda: control.size == (96, 80))
     assert set(nodes_of(run.pid)) == {"session_player"}
+
+    # The first scene, in its place again, has what was set in it.
+    assert control.set(replay="", scene=str(small_scene)) == ""
+    control.until(lambda: control.state == "running" and control.report()["scene"] == "small")
+    assert control.value(stiffness, "tissue_deformer") == 45e3
 
     control.until(lambda: "small" in control.scenes and control.thumbnails)
     listed = control.scenes["upper_arm"]

@@ -1,6 +1,10 @@
 """The monitor counts over restarts, sees other runs, and reports what was lost."""
 
+from array import array
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from us_sim.nodes.session_monitor import TOLD, SessionMonitor
 
@@ -26,6 +30,19 @@ def test_counts_go_on_over_restarts_and_strangers_are_not_kept(bench):
     assert monitor.count("imager", "images") == 105
     assert monitor.heard == {("imager", 7): 2, ("imager", 8): 1, ("imager", 0): 1}
     assert set(monitor.reports) == {"imager"}
+
+
+def test_what_is_set_of_nodes_that_it_follows_is_told_once(bench):
+    monitor = bench.add(SessionMonitor(["imager"], context=bench.context))
+    for name in ("imager", "stranger"):
+        node = bench.add(Node(name, context=bench.context))
+        node.declare_parameters("", [("gain", 1.0), ("gains", [0.0]), ("texts", [""])])
+        bench.spin_until(lambda node=node: node.count_subscribers("/parameter_events"))
+        values = {"gain": 3.0, "gains": array("d", [1.0, 2.0]), "texts": ["a"]}
+        node.set_parameters([Parameter(key, value=value) for key, value in values.items()])
+    bench.spin_until(lambda: len(monitor._set.get("imager", {})) == 3)
+    assert monitor.take_set() == {"imager": {"gain": 3.0, "gains": [1.0, 2.0], "texts": ["a"]}}
+    assert monitor.take_set() == {}
 
 
 def test_two_runs_see_each_other(bench):

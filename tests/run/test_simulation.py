@@ -21,6 +21,7 @@ class Supervisor:
 
     def __init__(self, plan):
         self.plan, self.why, self.waiting, self.kept = plan, "", [], {}
+        self.set, self.dropped = {}, {}
         self.started = set(plan.nodes)
         self.plans = [plan]
 
@@ -40,6 +41,10 @@ class Supervisor:
 
     def keep(self, node, values):
         self.kept[node] = values
+
+    def take_set(self):
+        taken, self.set, self.dropped = (self.set, self.dropped), {}, {}
+        return taken
 
 
 class Control:
@@ -117,6 +122,37 @@ def test_a_whole_recording_takes_the_place_of_the_nodes_until_it_ends(running, t
     control.values = replace(control.values, record=None)
     ask(simulation, control, replay=None)
     assert supervisor.plan.processes == before
+
+
+SET = {"tissue_deformer": {"materials.fat.young_modulus": 45e3, "solver": "xpbd"}}
+
+
+def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
+    simulation, supervisor, control = running
+    of = lambda: {each.node: each.kept for each in supervisor.plan.processes if each.kept}  # noqa: E731
+    problem = lambda: (simulation.look(), control.told[-1][2])[1]  # noqa: E731
+    supervisor.set = SET
+    assert problem() == ""
+    # All as recorded takes the nodes' place, and they come back.
+    ask(simulation, control, replay=PATH, replay_as="recording")
+    assert supervisor.plan.nodes == ["session_player"]
+    ask(simulation, control, replay=None)
+    assert of() == SET
+    # Another scene has its own; it is said, and what was set is there again in the first.
+    for name, kept in (("upper_arm", {}), (simulation._request.scene.origin, SET)):
+        simulation._asked = name, None
+        simulation._begin("")
+        assert of() == kept
+        assert ("is not set in upper_arm" in problem()) is not bool(kept)
+    # What a node cannot run with is kept no longer; to load the scene anew leaves nothing.
+    supervisor.dropped = SET
+    assert "ended twice" in problem()
+    supervisor.set = {"slice_interpolator": {"gain": 3.0}}
+    simulation.look()
+    assert simulation._kept_here == {"slice_interpolator": {"gain": 3.0}}
+    simulation._begin("")
+    assert of() == {}
+    assert "gain" in problem()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The page in a real browser: the image is drawn as it was sent, to scale, and only on demand."""
 
+import dataclasses
 import json
 import socket
 import time
@@ -181,6 +182,10 @@ def test_the_header_says_what_runs_and_what_is_done_with_it(
     done = SessionState(is_there=True, scene="liver", state="running", record="press.mcap")
     simulator.session.tell_state(done)
     page.get_by_text("recording press.mcap").wait_for()
+    simulator.session.tell_state(dataclasses.replace(done, problem="the gain is lost"))
+    lost = page.get_by_role("alert").filter(has_text="the gain is lost")
+    lost.wait_for()
+    assert lost.evaluate("each => getComputedStyle(each).color") == "rgb(229, 115, 92)"
     assert page.evaluate("usSim.scene()") == "liver"
 
 

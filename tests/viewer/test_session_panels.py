@@ -135,19 +135,18 @@ def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session
     until(lambda: asked[-1] == {"record": "mine.mcap"}, "a name of one's own stays", 30.0)
 
 
-def test_it_is_said_what_is_lost_when_all_is_replayed_as_recorded(page, session):
+def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recorded(page, session):
     board, asked = session
     board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
     opened(page, "Session")
     kind = page.get_by_role("button", name="All as recorded")
     kind.hover()
-    page.get_by_text("such as solver, materials and depth, is lost").wait_for()
+    page.get_by_text("start again, with what was set before").wait_for()
     page.get_by_label("recording or path").click()
     page.get_by_role("option", name="hand.mcap").click()
     kind.click()
     page.get_by_role("button", name="Play or pause").click()
-    page.get_by_text("what was set since then is lost").wait_for()
-    assert asked[-1]["replay_as"] == "recording"
+    until(lambda: asked and asked[-1]["replay_as"] == "recording", "it is asked for", 30.0)
     replay = {"replay": "/bags/hand.mcap", "replay_as": "recording", "replay_state": "playing"}
     board.tell_state(dataclasses.replace(RUNNING, **replay))
     until(kind.is_disabled, "it cannot be changed now", 30.0)

@@ -43,8 +43,10 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
     try:
-        if os.environ.get(STANDBY) and not stand_by(create, args):
-            return INTERRUPTED
+        if os.environ.get(STANDBY):
+            args = stand_by(create, args)
+            if args is None:
+                return INTERRUPTED
         rclpy.init(args=args)
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -7,10 +7,13 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import ParameterEvent
 
+from us_sim.nodes.conversions.parameters import raw_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.qos import EVERY
+from us_sim.viewer.parameters import Kind
 
 __all__ = ["SessionMonitor"]
 
@@ -37,6 +40,8 @@ class SessionMonitor(GuardedNode):
         self.health = Health(self, run)
         self.health.state = "following"
         self.create_subscription(DiagnosticArray, "diagnostics", self._take, EVERY)
+        self._set: dict[str, dict[str, object]] = {}
+        self.create_subscription(ParameterEvent, "/parameter_events", self._note_set, EVERY)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -55,6 +60,21 @@ class SessionMonitor(GuardedNode):
                 for key, value in report.items()
                 if key.startswith("published ")
             }
+
+    def _note_set(self, event: ParameterEvent) -> None:
+        space, _, name = event.node.rpartition("/")
+        if name not in self._nodes or space != self.get_namespace().rstrip("/"):
+            return
+        for each in event.changed_parameters:
+            kind, raw = raw_from(each.value)
+            if kind is not Kind.OTHER:
+                value = list(raw) if kind.is_list else raw
+                self._set.setdefault(name, {})[each.name] = value
+
+    def take_set(self) -> dict[str, dict[str, object]]:
+        """Parameters that were set since this was asked last: values by names, by node."""
+        taken, self._set = self._set, {}
+        return taken
 
     def follow(self, nodes: Collection[str]) -> None:
         """Follow these nodes from now on."""

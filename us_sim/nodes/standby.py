@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import json
 import os
 import sys
 import threading
@@ -24,8 +25,8 @@ _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _NICE = 19
 
 
-def stand_by(create: Callable[[], Node], args: list[str] | None) -> bool:
-    """Wait for a line on stdin; whether one came before its end.
+def stand_by(create: Callable[[], Node], args: list[str] | None) -> list[str] | None:
+    """Wait for a line on stdin: the arguments to run with, as JSON; None at the end of stdin.
 
     Meanwhile the node is made once where nobody can discover it, and thrown away: its modules and
     kernels are loaded then. That is done by a thread of low priority, which the nodes that run do
@@ -35,7 +36,8 @@ def stand_by(create: Callable[[], Node], args: list[str] | None) -> bool:
     rehearsal.start()
     rehearsal.join()
     print(STANDING_BY, flush=True)
-    return bool(sys.stdin.readline())
+    line = sys.stdin.readline()
+    return list(json.loads(line)) if line else None
 
 
 def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:

@@ -140,7 +140,7 @@ def video_settings(
 def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
     """Parameters that have a player wait for these topics, and for a recorder to record them."""
     recorded = [topic for topic in topics if recorder and recorder.records(f"/{topic}")]
-    return {"await_topics": topics, "await_recorded": recorded}
+    return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
 
 
 def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from us_sim.nodes.settings import checked_parameters
 from us_sim.run.graph import (
@@ -100,7 +100,10 @@ def plan_of(request: Request) -> Plan:
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
     played = request.by_hand or request.path is not None
-    processes += simulation_nodes(scene, parameters, played=played)
+    processes += [
+        replace(process, kept=dict(request.kept.get(process.node, {})))
+        for process in simulation_nodes(scene, parameters, played=played)
+    ]
     for process in processes:
         if process.node == RECORDER:
             process.parameters["parameters"] = parameters_file(processes)

@@ -35,6 +35,7 @@ class Request:
     view: ViewerSettings | None = None  # address of the page that shows it; None is no page
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
+    kept: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # set as nodes ran
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
     def with_scene(self, scene: Scene) -> Request:

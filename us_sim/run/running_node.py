@@ -34,6 +34,7 @@ class NodeProcess:
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
+    kept: dict[str, object] = field(default_factory=dict)  # and more, which were set as it ran
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
 
     def __post_init__(self) -> None:
@@ -41,15 +42,19 @@ class NodeProcess:
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
-        command = [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", "--ros-args"]
+        return [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", *self.arguments()]
+
+    def arguments(self) -> list[str]:
+        """Those of the command line, by which it gets its parameters."""
+        arguments = ["--ros-args"]
         for name, value in self.all_parameters.items():
-            command += ["-p", f"{name}:={json.dumps(value)}"]
-        return command
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]
+        return arguments
 
     @property
     def all_parameters(self) -> dict[str, object]:
-        """Those that a person gave go before the others."""
-        return self.parameters | self.given
+        """Those that were set last go before the others."""
+        return self.parameters | self.given | self.kept
 
 
 class RunningNode:
@@ -108,14 +113,14 @@ class RunningNode:
                 self._show(line)
 
     def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
-        """Run the node in earnest after standing by; whether it can."""
+        """Run the node in earnest, as it is wanted now, after standing by; whether it can."""
         assert self.process.stdin is not None
-        if self.said != STANDING_BY or node != self.node:
+        if self.said != STANDING_BY:
             self.kill()
             return False
-        self._show = show
+        self.node, self._show = node, show
         try:
-            self.process.stdin.write("\n")
+            self.process.stdin.write(json.dumps(node.arguments()) + "\n")
             self.process.stdin.close()
         except OSError:
             return False

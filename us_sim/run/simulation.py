@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -16,9 +17,9 @@ from us_sim.run.background import Background
 from us_sim.run.bags import bags_in_reach
 from us_sim.run.graph import RECORDER, VIEWER
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import PLAYERS, plan_of
+from us_sim.run.plan import PLAYERS, Plan, plan_of
 from us_sim.run.request import Request
-from us_sim.run.supervision import Supervisor, say
+from us_sim.run.supervision import Kept, Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene
 from us_sim.scene.reading import load_scene
@@ -33,6 +34,9 @@ _BAGS_EVERY_S = 2.0
 _OF_SCENE = {"scene", "volume"}
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
+_LOSS_SHOWN_S = 30.0
+"""How long it is said that what was set is lost, or belongs to another scene."""
+_LISTED = 6
 
 
 class Simulation:
@@ -58,6 +62,9 @@ class Simulation:
         self._bags_at = 0.0
         self._bags: dict[str, str] = {}
         self._problem = ""
+        self._kept: dict[tuple[str, str | None], Kept] = {}  # by scenes and their volumes
+        self._lost = ""  # what was set and is not any more
+        self._lost_until = math.inf  # s, monotonic: when that has been said for long enough
         self._control = monitor.control()
         self._control.obey(self, self._shown())
 
@@ -79,6 +86,7 @@ class Simulation:
         if not self._supervisor.waiting:
             self._settled = self._request
             self._ready_since = self._ready_since or time.monotonic()
+        self._look_at_kept()
         self._look_at_making()
         self._look_at_catalogue()
         self._report()
@@ -159,6 +167,27 @@ class Simulation:
         if values and wanted.replay:
             self._control.tell_player(self._supervisor.plan.player, values)
 
+    @property
+    def _kept_here(self) -> Kept:
+        """What was set of the nodes of this scene: they get it back whenever they start again."""
+        return self._kept.setdefault(_identity(self._request.scene), {})
+
+    def _look_at_kept(self) -> None:
+        """Keep what was set, whoever set it, but for what could not be run with."""
+        kept, dropped = self._supervisor.take_set()
+        for node, values in kept.items():
+            self._kept_here.setdefault(node, {}).update(values)
+        for node in dropped:
+            values = self._kept_here.pop(node, {})
+            if values:
+                self._tell_lost(
+                    f"{node} ended twice, so it runs without what was set since its start: "
+                    f"{_listed(list(values))}"
+                )
+
+    def _tell_lost(self, sentence: str) -> None:
+        self._lost, self._lost_until = sentence, math.inf
+
     def _make(self, name: str, volume: str | None) -> None:
         """Have what a scene needs made, while the one before goes on."""
         if self._making is not None:
@@ -188,9 +217,17 @@ class Simulation:
         if not refused:
             try:
                 scene = load_scene(name, volume=volume)
+                before, kept = self._request.scene, self._kept_here
                 request = self._request.with_scene(scene)
+                if _identity(scene) == _identity(before):
+                    kept = self._kept.pop(_identity(scene))
                 self._change(request, anew=set(self._supervisor.plan.nodes) - {VIEWER})
                 say(f"loading {scene.name}")
+                names = _listed([name for values in kept.values() for name in values])
+                then = f"is not set in {scene.name}, but again when {before.name} is loaded"
+                if _identity(scene) == _identity(before):
+                    then = "is not any more, since it was loaded anew"
+                self._tell_lost(names and f"what was set in {before.name} ({names}) {then}")
             except UsSimError as error:
                 refused = str(error)
         if refused:
@@ -199,10 +236,13 @@ class Simulation:
         self._control.show(self._shown())
 
     def _change(self, request: Request, anew: Collection[str] = ()) -> None:
-        plan = plan_of(request)
+        plan = self._plan(request)
         self._request = request
         if anew or plan.processes != self._supervisor.plan.processes:
             self._supervisor.change(plan, anew)
+
+    def _plan(self, request: Request) -> Plan:
+        return plan_of(replace(request, kept=self._kept.get(_identity(request.scene), {})))
 
     def _go_back(self, why: str) -> None:
         """Run what ran before; a recording and a replay that had ended for it do not come back."""
@@ -212,10 +252,11 @@ class Simulation:
             before = replace(before, record=None, is_changed=True)
         if not set(PLAYERS) & self._supervisor.started:
             before = before.without_replay()
+        self._tell_lost("")
         self._problem = f"{why}; {before.scene.name} runs as before"
         say(self._problem)
         self._settled = self._request = before
-        self._supervisor.change(plan_of(before))
+        self._supervisor.change(self._plan(before))
         self._control.show(self._shown())
 
     def _look_at_catalogue(self) -> None:
@@ -270,7 +311,11 @@ class Simulation:
             "replay_paused": str(self._control.values.replay_paused).lower(),
             **playing,
         }
-        self._control.tell(state, values, self._problem)
+        lost = self._lost if fraction == 1.0 else ""
+        if lost:
+            self._lost_until = min(self._lost_until, time.monotonic() + _LOSS_SHOWN_S)
+            self._lost = lost if time.monotonic() < self._lost_until else ""
+        self._control.tell(state, values, "; ".join(filter(None, (self._problem, lost))))
 
     def _shown(self) -> SessionControlSettings:
         """The control's parameters as things are."""
@@ -289,6 +334,17 @@ class Simulation:
             replay_as="recording" if request.everything else "path",
             **changes,
         )
+
+
+def _listed(names: list[str]) -> str:
+    """So many names as a person reads."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
+
+
+def _identity(scene: Scene) -> tuple[str, str | None]:
+    """What tells a scene from others, for who loads it."""
+    return scene.origin, scene.volume.file
 
 
 def _volume_of(scene: Scene) -> str | None:

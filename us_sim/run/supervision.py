@@ -12,6 +12,7 @@ from tqdm import tqdm
 from us_sim.run.graph import (
     INTERRUPTED,
     RECORDER,
+    VIEWER,
     NodeProcess,
     ProcessGroup,
     ending,
@@ -19,16 +20,20 @@ from us_sim.run.graph import (
 )
 from us_sim.run.losses import Loss, Outcome, images_in
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import Plan, goes_on
+from us_sim.run.plan import PLAYERS, Plan, goes_on
 from us_sim.run.recordings import Recordings
 from us_sim.run.restarts import Restarts, going_on
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import START_LIMIT_S, Watch
 
-__all__ = ["IMAGER", "IMAGES", "Supervisor", "say"]
+__all__ = ["IMAGER", "IMAGES", "Kept", "Supervisor", "say"]
 
 SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
 """Nodes that take long to start, and hold no device that a second process could not have."""
+LIVES_S = 10.0
+"""How long a node that was started again lives if what was set of it is not why it ended."""
+Kept = dict[str, dict[str, object]]
+"""Parameters that were set while nodes ran: values by names, by node."""
 IMAGER, IMAGES = "slice_interpolator", "ultrasound/image"
 
 
@@ -53,6 +58,9 @@ class Supervisor:
         self._group, self._monitor, self._settings = group, monitor, settings
         self._watch = Watch(settings.silence)
         self._away: dict[str, tuple[Loss, float]] = {}  # started again, and when they were lost
+        self._back: dict[str, float] = {}  # when they were back
+        self._set: Kept = {}  # of nodes, while they ran
+        self._dropped: Kept = {}  # of it, what was kept in vain
         self._were_ready: set[str] = set()
         self._processes: dict[str, NodeProcess] = {}  # that were started, by node
         self._due: list[NodeProcess] = []  # that are started when others have ended
@@ -114,7 +122,20 @@ class Supervisor:
         """Parameters that a node was given while it runs: started again, it has them, too."""
         if node in self._processes:
             process = self._processes[node]
-            self._processes[node] = replace(process, given=process.given | dict(values))
+            self._processes[node] = replace(process, kept=process.kept | dict(values))
+
+    def take_set(self) -> tuple[Kept, Kept]:
+        """What was set and is kept, and what is kept no longer: it was why a node ended."""
+        taken = self._set, self._dropped
+        self._set, self._dropped = {}, {}
+        return taken
+
+    def _keep_what_was_set(self) -> None:
+        """But for nodes that are told by others how to go on."""
+        for node, values in self._monitor.node.take_set().items():
+            if node in self._processes and node not in (*PLAYERS, RECORDER, VIEWER):
+                self.keep(node, values)
+                self._set.setdefault(node, {}).update(values)
 
     def look(self) -> None:
         """Take what has come, and see to nodes that have ended or hang.
@@ -124,7 +145,11 @@ class Supervisor:
         """
         self._monitor.spin()
         self._start_due()
-        for node, status in self._group.take_ended().items():
+        ended = self._group.take_ended()
+        for _ in range(2 * len(self._processes) if ended else 0):
+            self._monitor.spin(0.0)  # what they said last, and what was set of them
+        self._keep_what_was_set()
+        for node, status in ended.items():
             self._ended(node, status)
         hung = self._watch.look(self._running(), self._monitor.node.heard)
         for node, how in hung.items():
@@ -197,7 +222,7 @@ class Supervisor:
         """Note it, and start the node again if that may be."""
         loss = self._loss(node, what, said)
         loss.given_up = self._restarts.refused(node)
-        self._note(loss, loss.given_up or "it is started again")
+        self._note(loss, loss.given_up or "it is started again" + self._without_kept(node))
         self._publish()
         if loss.given_up:
             self._away.pop(node, None)
@@ -209,13 +234,25 @@ class Supervisor:
         self._group.start([process])
         self._away[node] = loss, time.monotonic()
 
+    def _without_kept(self, node: str) -> str:
+        """Keep no longer what a node does not live long with; what to say of that."""
+        process = self._processes[node]
+        lived = time.monotonic() - self._back.get(node, -LIVES_S)
+        if not process.kept or (node not in self._away and lived > LIVES_S):
+            return ""
+        self._dropped[node] = process.kept
+        self._set.pop(node, None)
+        self._processes[node] = replace(process, kept={})
+        return f", without what was set since its start: {', '.join(process.kept)}"
+
     def _welcome(self) -> None:
         """Note which nodes have reported for the first time, or again."""
         waiting = self.waiting
         self._were_ready |= self._group.pids.keys() - set(waiting)
         for node in [node for node in self._away if node not in waiting]:
             loss, since = self._away.pop(node)
-            loss.back_after = time.monotonic() - since
+            self._back[node] = time.monotonic()
+            loss.back_after = self._back[node] - since
             self._publish()
             say(f"{node} is back after {loss.back_after:.1f} s")
 

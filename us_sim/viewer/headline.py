@@ -29,8 +29,7 @@ def words_of(state: SessionState) -> tuple[str, str]:
     if state.is_busy:
         done = "" if state.state.endswith("%") else f", {100 * state.fraction:.0f} %"
         return name, f"{state.state}{done}"
-    parts = [state.problem]
-    parts += [f"recording {PurePath(state.record).name}"] if state.record else []
+    parts = [f"recording {PurePath(state.record).name}"] if state.record else []
     if state.replay:
         parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")
     return name, " · ".join(filter(None, parts))
@@ -40,12 +39,14 @@ def build_headline(simulator: Simulator) -> None:
     """Make it inside the header."""
     board = simulator.session
     name = ui.label().classes("us-scene-name").props('id="us-scene"')
-    words = ui.label().classes("us-quiet us-headline").props('role="status"')
+    words = ui.label().classes("us-headline").props('role="status"')
+    problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
 
     def look() -> None:
         scene, told = words_of(board.state)
         name.set_text(scene)
         words.set_text(told)
+        problem.set_text(board.state.problem)
 
     board.watch()
     ui.context.client.on_delete(board.unwatch)

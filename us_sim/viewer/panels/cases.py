@@ -13,6 +13,11 @@ from us_sim.viewer.simulator import Simulator
 
 __all__ = ["build"]
 
+AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
+ANOTHER = (
+    "Ends the scene that runs, and starts this one; what was set in either comes back when it is "
+    "loaded"
+)
 EVERY_S = 0.3
 """How often it is looked whether something has changed."""
 BY_HAND = ("", "pose")
@@ -97,7 +102,7 @@ class _Cases:
                 ).props("flat dense no-caps")
                 button.props["aria-label"] = f"Load {scene.name}"
                 button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
-                button.tooltip(f"Ends the scene that runs, and starts {scene.name}")
+                button.tooltip(AGAIN if is_loaded else ANOTHER)
 
     async def _load(self, scene: LoadableScene) -> None:
         state = self._board.state

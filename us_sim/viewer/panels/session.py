@@ -25,15 +25,9 @@ RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×"
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
 KINDS_TOLD = (
     "The probe's path moves the probe of the simulation. All as recorded takes the simulation's "
-    "place; when you end it the nodes start again with what they were given at the start: what "
-    "was set since then, such as solver, materials and depth, is lost"
+    "place; when you end it the nodes start again, with what was set before"
 )
 KINDS_FIXED = "While something is replayed this cannot be changed: end the replay first"
-STARTED_AGAIN = (
-    "The recording takes the simulation's place. When you end the replay the nodes start again "
-    "with what they were given at the start; what was set since then is lost"
-)
-"""When all is replayed as recorded."""
 
 
 class _Session:
@@ -175,16 +169,13 @@ class _Session:
         elif not chosen:
             ui.notify("choose a recording or a path first", type="info")
         else:
-            kind = self._kind.value
-            taken = await self._ask(
+            await self._ask(
                 replay=chosen,
-                replay_as=kind,
+                replay_as=self._kind.value,
                 replay_paused=False,
                 replay_loop=self._loop.value,
                 replay_rate=float(self._rate.value),
             )
-            if taken and kind == "recording":
-                ui.notify(STARTED_AGAIN, type="info", multi_line=True, timeout=10_000)
 
     def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
         """What does that where a person has changed a control, and nothing while it follows."""
