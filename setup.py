@@ -22,18 +22,14 @@ NODES = [
     "volume_reconstructor",
 ]
 FOLDER = Path(__file__).resolve().parent
+BY_COLCON = bool({"install", "develop"} & set(sys.argv))
+"""colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel."""
 
 
 def console_scripts() -> list[str]:
-    """`us-sim` alone in a wheel; also every node where colcon installs into lib/us_sim.
-
-    colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel, all of whose scripts
-    land on PATH.
-    """
-    scripts = ["us-sim = us_sim.command.main:main"]
-    if {"install", "develop"} & set(sys.argv):
-        scripts += [f"{node} = us_sim.nodes.{node}:main" for node in NODES]
-    return scripts
+    """`us-sim` alone in a wheel, all of whose scripts land on PATH; every node for `ros2 run`."""
+    nodes = [f"{node} = us_sim.nodes.{node}:main" for node in NODES if BY_COLCON]
+    return ["us-sim = us_sim.command.main:main", *nodes]
 
 
 def shared_files(folder: str) -> list[tuple[str, list[str]]]:
@@ -57,23 +53,23 @@ setup(
     packages=find_packages(include=["us_sim", "us_sim.*"]),
     package_data={"us_sim.viewer": ["assets/**/*", "panels/*.js"]},
     python_requires=">=3.11",
-    install_requires=[
-        "cyclonedds>=11.0,<12",
-        "matplotlib>=3.6",
+    install_requires=[  # .ci/ubuntu tests the versions of Ubuntu 24.04, which are the oldest here
+        *([] if BY_COLCON else ["cyclonedds>=11.0,<12"]),  # which stands in for ROS 2
+        "matplotlib>=3.6.3",
         "filelock>=3.12",
         "lz4>=4",
         "mcap>=1.5",
         "numba>=0.59",
-        "numpy>=1.26",
+        "numpy>=1.26.4",
         "opencv-python-headless>=4.8",
         "platformdirs>=4",
-        "PyYAML>=6",
+        "PyYAML>=6.0.1",
         "rosbags>=0.10.9",
-        "scikit-image>=0.20",
-        "scipy>=1.11",
+        "scikit-image>=0.22",
+        "scipy>=1.11.4",
         "SimpleITK>=2.3",
         "threadpoolctl>=3",
-        "tqdm>=4.65",
+        "tqdm>=4.66",
         "zstandard>=0.22",
     ],
     extras_require={

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.sparse import block_array, csr_array
+from scipy.sparse import bmat, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
 from tissue_block import SOFT, block, block_mesh
 
@@ -65,7 +65,7 @@ def test_converges_to_the_direct_solution_of_its_contact_set(collider, tilt):
     free = np.repeat(~model.fixed, 3)
     matrix = stiffness(model.mesh, model.materials).tocsr()[free][:, free]
     constraint = constraint[:, free]
-    system = block_array([[matrix, constraint.T], [constraint, None]], format="csc")
+    system = csc_array(bmat([[matrix, constraint.T], [constraint, None]]))
     right = np.zeros(system.shape[0])
     right[-count:] = constraint @ displacement.ravel()[free]
     solution = spsolve(system, right)

@@ -11,11 +11,10 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse import dia_array
 
-from us_sim.errors import SolverError
 from us_sim.evaluation.block import EXTENT, MESHES
+from us_sim.evaluation.solved import solved
 from us_sim.evaluation.tissue.graded_planes import graded_planes
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
@@ -192,11 +191,8 @@ class Reference:
         free = np.setdiff1d(np.arange(matrix.shape[0]), np.concatenate([held, top]))
         inner = matrix[free][:, free]
         right = -(matrix @ self._unit)[free]
-        over = diags_array(1.0 / inner.diagonal())
-        found, failed = cg(inner, right, rtol=1e-8, maxiter=_ITERATIONS, M=over)
-        if failed:
-            raise SolverError(f"the reference did not converge in {_ITERATIONS} steps")
-        self._unit[free] = found
+        over = dia_array((1.0 / inner.diagonal()[None], [0]), shape=inner.shape)
+        self._unit[free] = solved(inner, right, 1e-8, over, _ITERATIONS)
 
     def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P, 3, 3) the displacement's gradient per m of depth, at points (P, 3) m at rest."""

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse import csr_array, dia_array
+from scipy.sparse.linalg import LinearOperator
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import ddot, div, sym_grad
 
-from us_sim.errors import SolverError
+from us_sim.evaluation.solved import solved
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.model import TissueModel
 
@@ -58,7 +58,8 @@ class LinearEquations:
         quarter = np.repeat(scalars.dx.sum(axis=1) / 4, 4)
         around = csr_array((quarter, (mesh.t.T.ravel(), np.repeat(np.arange(size), 4))))
         volume = around.sum(axis=1)
-        self._average = (diags_array(1 / volume) @ around @ divergence).tocsr()
+        each = dia_array((1 / volume[None], [0]), shape=2 * volume.shape)
+        self._average = (each @ around @ divergence).tocsr()
         self._spread = self._average.T.tocsr()
         self._nodal = float(split.nodal[0]) * volume  # (N,) Pa m3
 
@@ -95,17 +96,13 @@ class LinearEquations:
         right = project(-self._product(prescribed.ravel()))
         diagonal = self._matrix.diagonal() + self._spread.power(2) @ self._nodal
         shape = self._matrix.shape
-        found, failed = cg(
+        found = solved(
             LinearOperator(shape, lambda v: project(self._product(project(v)))),
             right,
-            rtol=1e-11,
-            maxiter=_MAXIMUM_ITERATIONS,
-            M=LinearOperator(shape, lambda v: project(project(v) / diagonal)),
+            1e-11,
+            LinearOperator(shape, lambda v: project(project(v) / diagonal)),
+            _MAXIMUM_ITERATIONS,
         )
-        if failed:
-            raise SolverError(
-                f"the independent linear solution did not converge in {_MAXIMUM_ITERATIONS} steps"
-            )
         displacement = prescribed + found.reshape(-1, 3)
         pushes = np.einsum("ij,ij->i", self.forces(displacement)[touched], normals)
         return displacement, pushes

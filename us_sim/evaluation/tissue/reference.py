@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array, diags_array, eye_array, kron
+from scipy.sparse import bsr_array, coo_array, csr_array, dia_array, kron
 from scipy.spatial import cKDTree
 
 from us_sim.errors import SolverError
@@ -146,8 +146,8 @@ class _Search:
         self.free = _movable(block, block.nodes)
         grid = np.stack(np.meshgrid(*block.planes, indexing="ij"), axis=-1).reshape(-1, 3)
         coarse = np.flatnonzero(_movable(block, grid).ravel())
-        spread = kron(_trilinear(block.planes, block.nodes), eye_array(3)).tocsr()
-        self._mask = diags_array(self.free.ravel().astype(float))
+        spread = csr_array(kron(_trilinear(block.planes, block.nodes), np.eye(3)))
+        self._mask = _diagonal(self.free.ravel().astype(float))
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
     def pressure(
@@ -193,7 +193,7 @@ class _Search:
         """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
         tangent = self._tangent(pose)
         for part in _STIFFENED:
-            diagonal = bsr_array(diags_array(part * tangent.diagonal()), blocksize=(3, 3))
+            diagonal = bsr_array(_diagonal(part * tangent.diagonal()), blocksize=(3, 3))
             system = TwoLevel(tangent + diagonal if part else tangent, self._prolongation)
             step = system(-unbalanced.ravel(), 1e-3).reshape(-1, 3)
             if system.is_definite:
@@ -224,12 +224,12 @@ class _Search:
         values, parts = block.surface_values, []
         for i in range(3):
             for j in range(3):
-                part = (values.T @ diags_array(local[:, i, j]) @ values).tocoo()
+                part = (values.T @ _diagonal(local[:, i, j]) @ values).tocoo()
                 parts.append((part.data, 3 * part.row + i, 3 * part.col + j))
         data, rows, columns = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
         matrix = block.stiffness(self.displacement)
         matrix = matrix.tocsr() + coo_array((data, (rows, columns)), shape=matrix.shape).tocsr()
-        held = diags_array(1.0 - self.free.ravel())
+        held = _diagonal(1.0 - self.free.ravel())
         return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
 
     def _distance(
@@ -251,6 +251,10 @@ class _Search:
             normal @ rotation.T,
             rotation @ curvature @ rotation.T,
         )
+
+
+def _diagonal(entries: NDArray[np.floating]) -> dia_array:
+    return dia_array((entries[None], [0]), shape=2 * entries.shape)
 
 
 def _movable(block: NeoHookeanHexahedra, points: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -5,10 +5,10 @@ smoothed by Chebyshev polynomials of the block-Jacobi iteration (M. Adams, M. Br
 R. Tuminaro, Parallel multigrid smoothing, J. Comput. Phys. 188, 2003).
 
 >>> import numpy as np
->>> from scipy.sparse import bsr_array, eye_array
+>>> from scipy.sparse import bsr_array, csr_array
 >>> from us_sim.evaluation.tissue.two_level import TwoLevel
 >>> matrix = bsr_array(np.diag(np.arange(1.0, 7.0)), blocksize=(3, 3))
->>> solve = TwoLevel(matrix, eye_array(6, 3).tocsr())
+>>> solve = TwoLevel(matrix, csr_array(np.eye(6, 3)))
 >>> solve(np.ones(6), 1e-12).round(3).tolist()
 [1.0, 0.5, 0.333, 0.25, 0.2, 0.167]
 """

@@ -37,7 +37,7 @@ from io import FileIO
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
-from scipy.sparse import block_array, csr_array, dia_array
+from scipy.sparse import bmat, csr_array, dia_array
 
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
@@ -183,7 +183,7 @@ class _Elimination:
         self._pressure = np.cumsum(self._pressed) - 1 + 3 * count
         capacity = dia_array((-system.capacity[None], [0]), shape=2 * system.capacity.shape)
         self._matrix = csr_array(
-            block_array(
+            bmat(
                 [[system.element.tocsr(), system.coupling.T], [system.coupling, capacity]],
                 format="csr",
             )

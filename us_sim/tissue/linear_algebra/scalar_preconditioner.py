@@ -26,7 +26,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array, dia_array
 from scipy.sparse.linalg import splu
 
 __all__ = ["ScalarPreconditioner"]
@@ -59,7 +59,8 @@ class ScalarPreconditioner:
         i, j = edges.T
         entries = np.concatenate([weights, weights, -weights, -weights])
         place = (np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i]))
-        matrix = csc_array((entries, place), shape=(count, count)) + diags_array(diagonal)
+        own = dia_array((diagonal[None], [0]), shape=(count, count))
+        matrix = csc_array((entries, place), shape=(count, count)) + own
         self._free = np.flatnonzero(free)
         self._factor = splu(
             csc_array(matrix)[self._free][:, self._free].tocsc(),

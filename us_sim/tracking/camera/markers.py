@@ -26,8 +26,14 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a name, with or without ``DICT_``.
 
     Raises:
-        TrackingError: there is no such dictionary.
+        TrackingError: there is no such dictionary, or OpenCV is too old to find markers.
     """
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        raise TrackingError(
+            f"fiducial markers need OpenCV 4.8 or newer, and OpenCV {cv2.__version__} is "
+            f"installed: run pip install 'opencv-python-headless>=4.8', where ROS 2 is with "
+            f"--break-system-packages and '<4.12'"
+        )
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{proper_name(name)}"))
 
 

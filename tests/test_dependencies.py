@@ -1,0 +1,122 @@
+"""The libraries that this package builds upon: it asks for what it uses, and has what it uses."""
+
+import ast
+import functools
+import importlib
+import inspect
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import pytest
+
+from us_sim.errors import TrackingError
+from us_sim.tracking.camera.markers import dictionary
+
+ROOT = Path(__file__).resolve().parents[1]
+LIBRARIES = ("cv2", "matplotlib", "numpy", "scipy", "skimage", "tqdm", "yaml")
+"""Those that a distribution has in versions of its own."""
+APT = {"opencv": "opencv-python-headless", "skimage": "scikit-image", "yaml": "pyyaml"}
+"""Names of packages python3-… that are not those of pip."""
+
+
+@functools.cache
+def named(dotted):
+    """What a dotted name stands for, or None."""
+    name, *rest = dotted.split(".")
+    found = importlib.import_module(name)
+    for part in rest:
+        name = f"{name}.{part}"
+        try:
+            found = getattr(found, part)
+        except AttributeError:
+            try:
+                found = importlib.import_module(name)
+            except ImportError:
+                return None
+    return found
+
+
+def uses(tree):
+    """Each dotted name of `LIBRARIES` in a file, with the keywords it is called with."""
+    begins = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                whole = alias.name if alias.asname else alias.name.partition(".")[0]
+                begins[alias.asname or whole] = whole
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for alias in node.names:
+                begins[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+
+    def dotted(node):
+        if isinstance(node, ast.Attribute):
+            return f"{dotted(node.value)}.{node.attr}"
+        return begins.get(node.id, "") if isinstance(node, ast.Name) else ""
+
+    for node in ast.walk(tree):
+        called = isinstance(node, ast.Call)
+        name = dotted(node.func if called else node)
+        if name.startswith(tuple(f"{library}." for library in LIBRARIES)):
+            yield name, {each.arg for each in node.keywords if each.arg} if called else set()
+
+
+def unknown(name, keywords):
+    """Which of the keywords a function does not have; none where it does not tell."""
+    try:
+        parameters = inspect.signature(named(name)).parameters
+    except (ValueError, TypeError):
+        return set()
+    takes_any = any(each.kind == each.VAR_KEYWORD for each in parameters.values())
+    return set() if takes_any else keywords - set(parameters)
+
+
+@pytest.mark.parametrize("folder", ["us_sim", "tests"])
+def test_the_installed_versions_have_all_that_is_used(folder):
+    """Also the oldest versions that `setup.py` allows, with which CI runs this."""
+    missing = set()
+    for file in (ROOT / folder).rglob("*.py"):
+        for name, keywords in uses(ast.parse(file.read_text(encoding="utf-8"))):
+            if named(name) is None:
+                missing.add((file.name, name))
+            else:
+                missing |= {(file.name, name, each) for each in unknown(name, keywords)}
+    either = {("video_source.py", f"cv2.utils.logging{end}") for end in ("", ".setLogLevel")}
+    assert missing - either == set()
+
+
+def requirements(monkeypatch, *command):
+    """What setup.py asks for when it is called so, as names of pip."""
+    given = {}
+    monkeypatch.setattr(sys, "argv", ["setup.py", *command])
+    monkeypatch.setattr(pytest.importorskip("setuptools"), "setup", given.update)
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / "setup.py"))
+    return {plain(each) for each in given["install_requires"]}
+
+
+def plain(requirement):
+    return re.split(r"[<>=]", requirement)[0].lower()
+
+
+def test_a_workspace_of_ros_has_all_that_it_asks_for(monkeypatch):
+    wheel, workspace = (requirements(monkeypatch, verb) for verb in ("bdist_wheel", "install"))
+    assert wheel - workspace == {"cyclonedds"}
+    page = (ROOT / "docs" / "ros2.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^pip install --break-system-packages (.*)$", page, re.MULTILINE)
+    pip = {plain(each) for each in shlex.split(line)}
+    names = [each.text for each in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")]
+    apt = {name.removeprefix("python3-") for name in names if name.startswith("python3-")}
+    assert workspace <= pip | {APT.get(name, name) for name in apt}
+    assert "opencv-python-headless" in pip  # apt's is too old for markers
+
+
+def test_an_opencv_that_finds_no_markers_is_refused(monkeypatch):
+    dictionary.cache_clear()
+    monkeypatch.delattr(cv2.aruco, "ArucoDetector", raising=False)
+    with pytest.raises(TrackingError, match=re.escape(cv2.__version__)):
+        dictionary("4X4_50")
