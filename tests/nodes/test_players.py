@@ -142,6 +142,11 @@ def test_what_is_waited_for_is_said_and_is_what_the_recorder_records(bench, path
     assert len(poses) == 10
 
 
+@pytest.mark.parametrize("player", [PathPlayer, SessionPlayer])
+def test_an_installed_bag_is_played_by_its_name(bench, player):
+    assert not bench.make(player, path="press_and_slide.mcap").finished.done()
+
+
 def test_a_path_that_cannot_be_read_is_one_sentence(bench, tmp_path):
     with pytest.raises(BagError, match=r"nowhere\.mcap"):
         bench.make(PathPlayer, path=str(tmp_path / "nowhere.mcap"))

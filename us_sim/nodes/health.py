@@ -18,7 +18,9 @@ from us_sim.nodes.qos import STREAM, overridable
 __all__ = ["Health"]
 
 SAY_S = 5.0
-"""How long a problem of the same kind is not said again."""
+"""How long a problem of the same kind is not said again; each time it is twice as long."""
+SAY_AT_LEAST_S = 300.0
+"""How long at most."""
 ANOTHER_CLOCK_S = 10.0
 """From the present to a stamp: from there on it is of another clock, or of an earlier day."""
 
@@ -41,7 +43,7 @@ class Health:
         self._latencies: deque[float] = deque(maxlen=1000)
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
-        self._said: dict[str, float] = {}
+        self._next: dict[str, tuple[float, float]] = {}  # s, when to say it again, and then when
         self._last_problem = ""
         self.warning = ""  # what is wrong for as long as it is
         self._failures_told = 0
@@ -79,12 +81,13 @@ class Health:
         return 1e-9 * (time.monotonic_ns() - getattr(self._node, "arrived", time.monotonic_ns()))
 
     def problem(self, kind: str, sentence: str) -> None:
-        """Count a problem of that kind; of each kind one is logged every five seconds at most."""
+        """Count a problem of that kind; one that goes on is logged ever more rarely."""
         self._problems[kind] += 1
         self._last_problem = sentence = shown(sentence)
         now = time.monotonic()
-        if now - self._said.get(kind, -SAY_S) >= SAY_S:
-            self._said[kind] = now
+        due, wait = self._next.get(kind, (now, SAY_S))
+        if now >= due:
+            self._next[kind] = now + wait, min(2 * wait, SAY_AT_LEAST_S)
             self._node.get_logger().warning(sentence)
 
     def problems(self, kind: str) -> int:

@@ -26,6 +26,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.nodes.session_settings import PathPlayerSettings
 from us_sim.recording.path import ProbePath, read_path
+from us_sim.share import find_bag
 
 __all__ = ["PathPlayer", "main"]
 
@@ -43,9 +44,9 @@ class PathPlayer(GuardedNode):
         super().__init__("path_player", **kwargs)
         self._live = LiveSettings(self, {"player": Group(PathPlayerSettings())}, use=self._use)
         settings = self._settings
-        path = settings.path
-        if not path:
+        if not settings.path:
             raise BagError("path_player's parameter `path` is missing; name a bag to play")
+        path = find_bag(settings.path)
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
         lockstep = settings.lockstep
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps

@@ -22,6 +22,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.session_settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
+from us_sim.share import find_bag
 
 __all__ = ["SessionPlayer", "main"]
 
@@ -44,9 +45,9 @@ class SessionPlayer(GuardedNode):
         super().__init__("session_player", **kwargs)
         self._live = LiveSettings(self, {"player": Group(SessionPlayerSettings())}, use=self._use)
         settings = self._settings
-        path = settings.path
-        if not path:
+        if not settings.path:
             raise BagError("session_player's parameter `path` is missing; name a bag to play")
+        path = find_bag(settings.path)
         self._bag = read_bag(path)
         self.finished = Future()
         self.health = Health(self, str(path))

@@ -172,7 +172,8 @@ class TissueDeformer(SceneNode):
 
 
 def _inside_out(deformation: Deformation, name: str) -> str:
-    sentence = f"{deformation.inverted} tetrahedra are inside out"
+    count = deformation.inverted
+    sentence = f"{count} {'tetrahedron is' if count == 1 else 'tetrahedra are'} inside out"
     if name == "fem_nonlinear":
         return sentence
     return (

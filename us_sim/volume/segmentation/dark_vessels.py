@@ -94,7 +94,7 @@ class DarkVessels(Settings):
         # A coarse voxel's centre lies amid the fine ones that it is the mean of.
         fine = ndimage.affine_transform(
             found.astype(np.float32),
-            1.0 / factor,
+            np.diag(1.0 / factor),
             -(factor - 1.0) / (2.0 * factor),
             output_shape=region.grey.shape,
             order=1,
@@ -187,7 +187,7 @@ def _closed(
     return np.asarray(
         ndimage.affine_transform(
             array_of(ball).astype(np.float32),
-            1.0 / factor,
+            np.diag(1.0 / factor),
             -(factor - 1.0) / (2.0 * factor),
             output_shape=level.shape,
             order=1,

@@ -77,7 +77,7 @@ def label_surface(
     ndimage.gaussian_filter(field, _SMOOTHING * steps, output=field, mode="constant", truncate=3.0)
     if (steps > 1.0).any():
         shape = tuple(np.ceil(np.array(field.shape) / steps).astype(int))
-        field = ndimage.affine_transform(field, steps, output_shape=shape, order=1)
+        field = ndimage.affine_transform(field, np.diag(steps), output_shape=shape, order=1)
     if field.max() <= _LEVELS[0]:
         raise VolumeError(
             f"label {label} ({volume.label_names.get(label, 'unnamed')}) is too thin for a surface "
