@@ -110,10 +110,11 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _own_corner() -> None:
     """Keep the tests' DDS on this host and out of other simulations' domain."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    own = str(1 + os.getpid() % 100)
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        os.environ["ROS_DOMAIN_ID"] = own  # the workers must not hear each other
-    os.environ.setdefault("ROS_DOMAIN_ID", own)
+    worker = os.environ.get(_WORKER, "")
+    own = 1 + (os.getppid() if worker else os.getpid()) % 100
+    # The workers must not hear each other: the second one is on the next domain.
+    domain = int(os.environ.get("ROS_DOMAIN_ID") or own) + int(worker.removeprefix("gw") or 0)
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
 
 
 @pytest.fixture(scope="session")

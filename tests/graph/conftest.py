@@ -1,6 +1,5 @@
 """Whole runs of the command, in processes of their own."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,6 @@ from command import us_sim
 from us_sim.recording.path import ProbePath, write_path
 
 RATE_HZ = 60.0
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _own_domain() -> None:
-    """Graph tests run beside the node tests' domain."""
-    os.environ["ROS_DOMAIN_ID"] = str(1 + (os.getpid() + 37) % 100)
 
 
 @pytest.fixture(scope="session")

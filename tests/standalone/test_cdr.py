@@ -83,10 +83,10 @@ def test_a_sequence_that_claims_four_billion_elements_is_refused_at_once(kind):
     data = serialize(value)
     for place in range(4, len(data) - 3, 4):
         claiming = data[:place] + b"\xff\xff\xff\xff" + data[place + 4 :]
-        start = time.perf_counter()
+        start = time.process_time()
         with contextlib.suppress(CdrError):
             deserialize(claiming, type(value))
-        assert time.perf_counter() - start < 0.5
+        assert time.process_time() - start < 0.5
 
 
 def test_a_sequence_beyond_its_bound_is_refused():

@@ -450,9 +450,9 @@ def test_a_frame_whose_time_is_up_is_gone_on_with_in_the_next_and_ends_the_same(
     solver.warm_up()
     residuals, times = [], []
     for _ in range(300):
-        began = time.perf_counter()
+        began = time.process_time()
         deformation = solver.deform(pose)
-        times.append(time.perf_counter() - began)
+        times.append(time.process_time() - began)
         residuals.append(deformation.residual)
         if solver.deform(pose) is deformation:
             break
