@@ -1,6 +1,7 @@
 """Measuring, freezing and keeping the image in a real browser, against a geometry that is known."""
 
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -363,3 +364,86 @@ def test_a_picture_of_another_size_is_not_measured_and_says_why(
     page.keyboard.press("d")
     drag(page, (900, 300), (1000, 300))
     assert values(page) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "ending", "begins"),
+    [("mp4", "mp4", b"\0\0\0\x1cftyp"), ("gif", "gif", b"GIF89a"), ("loop_dcm", "dcm", b"")],
+)
+def test_the_last_seconds_are_saved_as_they_are_seen(
+    page: Any, images: Images, tmp_path: Path, kind: str, ending: str, begins: bytes
+) -> None:
+    for grey in (80, 120):
+        images.show(grey)
+        await_grey(page, grey)
+    page.locator(".us-kinds").select_option(kind)
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    assert download.value.suggested_filename.endswith(f".{ending}")
+    file = tmp_path / f"loop.{ending}"
+    download.value.save_as(file)
+    assert file.read_bytes().startswith(begins)
+    if ending == "dcm":
+        read = pytest.importorskip("pydicom").dcmread(file)
+        assert read.pixel_array[:, 5, 5].tolist() == [40, 80, 120]
+        assert list(read.FrameTimeVector) == [0, 40_000, 40_000]  # ms of their own time
+    else:
+        shown, picture = cv2.VideoCapture(str(file)).read()
+        assert shown
+        assert picture[200, 200].tolist() == pytest.approx([40] * 3, abs=4)
+
+
+@pytest.mark.usefixtures("images")
+def test_what_the_viewer_refuses_to_save_is_said(
+    browser: Any, served: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pydicom.dataset", None)
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page.goto(served[0].address)
+    save = page.get_by_role("button", name="Save", exact=True)
+    until(save.is_enabled, "there is an image")
+    page.evaluate(
+        "import('/us_sim/assets/events.js').then(m => m.events.on('problem', said => "
+        "document.body.dataset.said = said))"
+    )
+    page.locator(".us-kinds").select_option("dcm")
+    save.click()
+    said = page.locator("body[data-said]")
+    said.wait_for()
+    assert "us_sim[dicom]" in said.get_attribute("data-said")
+    page.close()
+
+
+def test_a_strip_is_frozen_with_the_image_and_saved_below_it(
+    page: Any, simulator: Simulator, tmp_path: Path
+) -> None:
+    feed = Feed("m_mode", rate=None)
+    simulator.add(feed)
+
+    def show(blue: int) -> None:
+        strip = np.full((60, 300, 3), (blue, 20, 20), np.uint8)
+        encoded = cv2.imencode(".jpg", strip)[1].tobytes()
+        header = {"stamp": "1", "rows": 60, "columns": 300, "encoding": "jpeg"}
+        feed.offer(lambda n: Packet("m_mode", n, header, encoded))
+
+    show(200)
+    page.evaluate("import('/us_sim/assets/strips.js').then(m => m.showStrip('m_mode', true))")
+    drawn = """blue => {
+        const strip = document.querySelector(".us-strip");
+        const found = strip?.getContext("2d").getImageData(9, 9, 1, 1).data[2] ?? 0;
+        return Math.abs(found - blue) < 8;
+    }"""
+    page.wait_for_function(drawn, arg=200)
+    page.keyboard.press(" ")
+    show(90)
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    download.value.save_as(tmp_path / "still.png")
+    blue = cv2.imread(str(tmp_path / "still.png"))[:, 300].astype(int)
+    below = np.flatnonzero(np.abs(blue - (200, 20, 20)).max(axis=1) < 8)
+    grey = np.flatnonzero((blue == 40).all(axis=1))
+    assert below.size > 100  # as wide as the image
+    assert below.min() > grey.max()
+    page.keyboard.press(" ")
+    show(91)
+    page.wait_for_function(drawn, arg=91)

@@ -6,10 +6,13 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, WebSocket
+from fastapi import FastAPI, Request, Response, WebSocket
+from fastapi.concurrency import run_in_threadpool
 from fastapi.staticfiles import StaticFiles
 from nicegui import ui
 
+from us_sim.errors import UsSimError
+from us_sim.viewer.export import LARGEST, exported, frames_of
 from us_sim.viewer.page import build_page
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.stream import serve_page
@@ -29,6 +32,20 @@ def application(simulator: Simulator) -> Any:
     @app.websocket("/us_sim/stream")
     async def stream(websocket: WebSocket) -> None:
         await serve_page(websocket, simulator)
+
+    @app.post("/us_sim/export/{kind}")
+    async def export(kind: str, request: Request) -> Response:
+        message = bytearray()
+        async for chunk in request.stream():
+            message += chunk
+            if len(message) > LARGEST:
+                return Response("that is too much to be saved: save less", 413)
+        try:
+            frames = frames_of(bytes(message))
+            made = await run_in_threadpool(exported, kind, frames)
+        except UsSimError as error:
+            return Response(str(error), 400, media_type="text/plain")
+        return Response(made, media_type="application/octet-stream")
 
     @ui.page("/")
     def page() -> None:

@@ -1,11 +1,23 @@
-/** What runs over time below the image: M-mode and the spectrum, each watched while it is shown. */
+/**
+ * What runs over time below the image: M-mode and the spectrum, each watched while it is shown.
+ *
+ * They are frozen with the image: they end with the newest one then.
+ */
 
-import { element } from "./events.js";
+import { element, events } from "./events.js";
 import { stream } from "./stream.js";
 
 const TITLES = { m_mode: "M-mode", spectrum: "Spectrum of blood flow" };
 const place = await element("strips");
 const strips = new Map();
+let isFrozen = false;
+
+events.on("image-frozen", (on) => (isFrozen = on));
+
+/** The canvases of those that are shown, from the upper to the lower. */
+export function stripsShown() {
+  return [...place.children];
+}
 
 function strip(kind) {
   const canvas = Object.assign(document.createElement("canvas"), { className: "us-strip" });
@@ -13,6 +25,7 @@ function strip(kind) {
   canvas.setAttribute("aria-label", TITLES[kind]);
   canvas.title = TITLES[kind];
   stream.on(kind, async (header, payload) => {
+    if (isFrozen) return;
     const bitmap = await createImageBitmap(new Blob([payload], { type: "image/jpeg" }));
     if (canvas.width !== header.columns || canvas.height !== header.rows) {
       canvas.width = header.columns;

@@ -5,7 +5,7 @@ import { frameShown, hasImage } from "../image.js";
 import { isTyping } from "../hand/typing.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
-import { factsOf, save } from "./picture.js";
+import { KINDS, factsOf, save } from "./picture.js";
 
 const style = document.createElement("link");
 style.rel = "stylesheet";
@@ -50,7 +50,31 @@ const tools = {
   note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
 };
 const clearing = button("Clear", "", clearOrUndo);
-const saving = button("Save", "Keep the image with its scale and measurements as a PNG file (key P)", save);
+const saving = button("Save", "Keep this as a file (key P)", saveChosen);
+const kinds = document.createElement("select");
+kinds.className = "us-kinds";
+kinds.title =
+  "What Save keeps: this image, or the last 10 s; with scale and measurements, or as DICOM the pixels";
+kinds.setAttribute("aria-label", "What is saved");
+for (const [kind, [label]] of Object.entries(KINDS)) kinds.append(new Option(label, kind));
+const saved = Object.assign(document.createElement("span"), { className: "us-saved" });
+saved.append(saving, kinds);
+bar.append(saved);
+
+async function saveChosen() {
+  if (saving.disabled || !hasImage()) return;
+  const [, , { isLoop = false } = {}] = KINDS[kinds.value];
+  if (isLoop) freeze.hold();
+  saving.disabled = true;
+  saving.textContent = "Saving …";
+  try {
+    await save(kinds.value, frameShown(), [...freeze.cine.frames]);
+  } catch {
+    events.tell("problem", "The viewer does not answer, so nothing was saved");
+  }
+  saving.textContent = "Save";
+  saving.disabled = false;
+}
 
 /** Remove what is on the image, or have it back. */
 function clearOrUndo() {
@@ -128,7 +152,7 @@ const KEYS = {
   o: () => overlay.use("ellipse"),
   t: () => overlay.use("note"),
   x: clearOrUndo,
-  p: save,
+  p: saveChosen,
 };
 addEventListener("keydown", (event) => {
   if (event.key === "Escape" && overlay.tool) overlay.use(null);
@@ -147,7 +171,7 @@ addEventListener("keydown", (event) => {
 freeze.on(showFreeze);
 overlay.on(showMeasures);
 events.on("connection", showFreeze);
-events.on("image-drawn", () => saving.disabled && showWhetherUsable());
+events.on("image-drawn", () => freezing.disabled && showWhetherUsable());
 showFreeze();
 showWhetherUsable();
 showMeasures();

@@ -1,12 +1,14 @@
 /** A frame as a picture to keep: with its scale and measures, and what is known of it. */
 
+import { events } from "../events.js";
 import { frameShown, painter, pixelToMillimetres } from "../image.js";
+import { stripsShown } from "../strips.js";
 import { Ellipse, Note } from "./measures.js";
 
 /** Pixels: the least height of the image, and what is around it. */
 const LEAST = 768;
 const LEFT = 56;
-const TOP = 64;
+const TOP = 72;
 const EDGE = 20;
 const LINE = 24;
 
@@ -31,8 +33,11 @@ export function factsOf(frame) {
   ];
 }
 
-/** The picture of a frame on a canvas; null where it is not known where its pixels are. */
-export async function picture(frame = frameShown()) {
+/**
+ * The picture of a frame on a canvas, with other canvases below it; null where it is not known where
+ * the frame's pixels are.
+ */
+export async function picture(frame = frameShown(), below = []) {
   const { columns, rows, matrix } = frame?.header ?? {};
   if (!matrix) return null;
   const first = pixelToMillimetres(-0.5, -0.5, matrix);
@@ -47,7 +52,9 @@ export async function picture(frame = frameShown()) {
   (await painter(frame))(image.getContext("2d"));
   const canvas = document.createElement("canvas");
   canvas.width = LEFT + width + EDGE;
-  canvas.height = TOP + height + EDGE + LINE * lines.length;
+  const end = TOP + height + EDGE + LINE * lines.length;
+  const strips = below.map((strip) => [strip, Math.round((strip.height * width) / strip.width)]);
+  canvas.height = strips.reduce((sum, [, its]) => sum + its + EDGE, end);
   const draw = canvas.getContext("2d");
   draw.fillStyle = "#000";
   draw.fillRect(0, 0, canvas.width, canvas.height);
@@ -72,6 +79,11 @@ export async function picture(frame = frameShown()) {
     draw.fillStyle = measure.colour;
     const label = `${measures.indexOf(measure) + 1}   ${measure.text}`;
     draw.fillText(label, LEFT, TOP + height + EDGE / 2 + LINE * (row + 0.5));
+  }
+  let top = end;
+  for (const [strip, its] of strips) {
+    draw.drawImage(strip, LEFT, top, width, its);
+    top += its + EDGE;
   }
   return canvas;
 }
@@ -111,18 +123,58 @@ function drawMeasure(draw, measure, number, to, scale, side) {
   draw.fillText(measure instanceof Note ? measure.words : `${number + 1}`, x + 11, y - 10);
 }
 
-/** Have the browser keep the frame that is shown as a file. */
-export async function save() {
-  const frame = frameShown();
-  const canvas = await picture(frame);
-  canvas?.toBlob((blob) => keep(blob, frame, "png"), "image/png");
+/** What can be saved, by its key: label, the file's ending, whether of all frames, of their pixels. */
+export const KINDS = {
+  png: ["PNG", "png"],
+  dcm: ["DICOM", "dcm", { isRaw: true }],
+  mp4: ["10 s, MP4", "mp4", { isLoop: true }],
+  gif: ["10 s, GIF", "gif", { isLoop: true }],
+  loop_dcm: ["10 s, DICOM", "dcm", { isLoop: true, isRaw: true }],
+};
+
+/**
+ * Have the browser keep `frame`, or `frames` of which it is one, as a file of a kind of `KINDS`.
+ *
+ * Videos and DICOM are made by the viewer, from pictures as the PNG's, or from the frames' pixels.
+ */
+export async function save(kind, frame = frameShown(), frames = [frame]) {
+  const [, ending, { isLoop = false, isRaw = false } = {}] = KINDS[kind];
+  if (kind === "png") {
+    const blob = await blobOf(frame, "image/png", stripsShown());
+    if (blob) keep(blob, frame, ending);
+    return;
+  }
+  const like = ({ header }) =>
+    ["kind", "rows", "columns", "matrix"].map((key) => String(header[key])).join();
+  const chosen = (isLoop ? frames : [frame]).filter((each) => !isRaw || like(each) === like(frame));
+  const sent = [];
+  for (const each of chosen) {
+    const [when, ...facts] = factsOf(each);
+    const { header, mode, time, payload } = each;
+    const bytes = isRaw ? payload : await (await blobOf(each, "image/jpeg"))?.arrayBuffer();
+    const told = { ...header, mode, facts: [when, ...facts], time: time / 1000 };
+    if (bytes) sent.push([{ ...told, bytes: bytes.byteLength }, bytes]);
+  }
+  const text = JSON.stringify({ kind, sequence: 0, frames: sent.map(([told]) => told) });
+  const head = new TextEncoder().encode(text);
+  const length = new Uint32Array([head.length]); // little endian where browsers run
+  const body = new Blob([length, head, ...sent.map(([, bytes]) => bytes)]);
+  const answer = await fetch(`/us_sim/export/${ending}`, { method: "POST", body });
+  if (answer.ok) keep(await answer.blob(), frame, ending);
+  else events.tell("problem", await answer.text());
+}
+
+/** The picture of a frame as a file; null where there is none. */
+async function blobOf(frame, type, below = []) {
+  const canvas = await picture(frame, below);
+  return canvas && new Promise((done) => canvas.toBlob(done, type, 0.92));
 }
 
 /** Have the browser keep what was made of a frame. */
-function keep(blob, frame, kind) {
+function keep(blob, frame, ending) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
-  link.download = `us_sim-${timeOf(frame).replace(/[^0-9]+/g, "-")}.${kind}`;
+  link.download = `us_sim-${timeOf(frame).replace(/[^0-9]+/g, "-")}.${ending}`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
