@@ -32,7 +32,7 @@ LONG = "x" * 300  # more than a file's name may have
         (["view", "upper_arm", "--attach"], "--attach shows what runs already: leave out the"),
         (["view", "--attach", "--record", "a.mcap"], "--attach shows what runs already"),
         (["view", "--attach", "--param", "skin.a=1"], "--param skin: --attach starts the viewer"),
-        (["run", "upper_arm", "--port", "3"], "are where the viewer listens: add --view"),
+        (["run", "upper_arm", "--port", "3"], "are the viewer's: add --view"),
         (["run", "liver_sweep", "--dry-run"], "volume.file: is missing"),
         (["run", "upper_arm", "--path", "nowhere.mcap"], "nowhere.mcap"),
         (["bag", "info", "nowhere.mcap"], "nowhere.mcap"),

@@ -212,3 +212,21 @@ def test_nothing_is_asked_while_nobody_looks(bench, remote):
     remote.board.unwatch("console")
     bench.spin_until(lambda: bench.peer.count_subscribers("/parameter_events") == 0)
     assert "gain" in looked_at(bench, remote, "console")  # read anew when somebody does again
+
+
+def test_a_node_with_a_door_is_set_through_that_alone(bench):
+    asking = bench.add(GuardedNode("asking", context=bench.context))
+    asked: list[dict[str, Any]] = []
+    refused: Future[str] = Future()
+    refused.set_result("not from here")
+
+    def door(**values: Any) -> "Future[str]":
+        asked.append(values)
+        return refused
+
+    remote = RemoteParameters(asking, Posted(asking), {"console": door})
+    node = console(bench)
+    looked_at(bench, remote, "console")
+    assert answered(bench, remote.board.set("console", "gain", 3.0)) == "not from here"
+    assert asked == [{"gain": 3.0}]
+    assert node.get_parameter("gain").value == 0.0

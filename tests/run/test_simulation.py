@@ -1,5 +1,6 @@
 """What a running simulation does as its control is set, without any process."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import pytest
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.session_settings import SessionControlSettings
 from us_sim.run.plan import plan_of
+from us_sim.run.recordings import Recordings
 from us_sim.run.request import Request
 from us_sim.run.simulation import Simulation
 from us_sim.scene.reading import load_scene
@@ -22,6 +24,7 @@ class Supervisor:
     def __init__(self, plan):
         self.plan, self.why, self.waiting, self.kept = plan, "", [], {}
         self.set, self.dropped = {}, {}
+        self.recordings = Recordings()
         self.started = set(plan.nodes)
         self.plans = [plan]
 
@@ -94,9 +97,16 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     simulation.look()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
     assert control.told[-1][1]["record_note"] == ""
+    supervisor.recordings.begin(supervisor.plan.processes[0])
+    (tmp_path / "a.mcap").write_bytes(bytes(1000))
+    (tmp_path / "a_1.mcap").write_bytes(bytes(500))
+    simulation._recording_at = 0.0
     simulation._monitor.node.reports["session_recorder"] = {"note": "it lies beside another"}
     simulation.look()
-    assert control.told[-1][1]["record_note"] == "it lies beside another"
+    told = control.told[-1][1]
+    assert told["record_note"] == "it lies beside another"
+    assert (told["record_bytes"], told["record_seconds"]) == ("1500", "0")
+    assert 0 < float(told["record_room_bytes"]) <= shutil.disk_usage(tmp_path).total
     ask(simulation, control, replay=PATH, replay_rate=0.5)
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}
     player = supervisor.plan.processes[-1].all_parameters
@@ -161,6 +171,7 @@ def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
         ({"record": "a.bag"}, "must be a file that ends in .mcap"),
         ({"record": "nowhere/a.mcap"}, "there is no such folder"),
         ({"record": PATH}, "exists already"),
+        ({"record": "~nobody.mcap/a.mcap"}, "there is no such folder"),
         ({"replay": "nowhere.mcap"}, "there is no bag at nowhere.mcap"),
         ({"scene": "nowhere"}, "there is no scene file nowhere"),
     ],

@@ -156,6 +156,45 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
     page.get_by_text("cannot be changed: end the replay first").wait_for()
 
 
+def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(page, session):
+    board, _ = session
+    state = dataclasses.replace(RUNNING, record="/a.mcap", record_seconds=61.0, record_bytes=61e6)
+    board.tell_state(dataclasses.replace(state, record_room=36e9))
+    opened(page, "Session")
+    recorded = page.get_by_text("recording to /a.mcap: 1:01 min, 61 MB, room for 10 h")
+    recorded.wait_for()
+    assert "us-wrong" not in recorded.get_attribute("class")
+    board.tell_state(dataclasses.replace(state, record_room=5e8))
+    page.locator(".us-wrong", has_text="room for 8 min").wait_for()
+
+
+@pytest.mark.parametrize(
+    ("asked", "file"),
+    [
+        ({"record": "a.mcap"}, "/recordings/a.mcap"),
+        ({"record": "/home/a.mcap"}, ""),
+        ({"record": "../a.mcap"}, ""),
+        ({"record": ".."}, ""),
+        ({"record": "~a.mcap"}, ""),
+        ({"scene": "/home/secret.yaml"}, ""),
+        ({"scene": "/arm.yaml", "volume": "/etc/passwd"}, ""),
+        ({"replay": "/home/b.mcap"}, ""),
+    ],
+)
+def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, file):
+    for is_own in (True, False):
+        sent = []
+        board = SessionBoard(ask=lambda v, s=sent: s.append(v), folder="/recordings", is_own=is_own)
+        board.tell_state(RUNNING)
+        told = board.ask(**asked)
+        if is_own or file:
+            assert sent
+            assert not file or sent == [{"record": file}]
+        else:
+            assert not sent
+            assert next(iter(asked.values())) in told.result() or "/etc/passwd" in told.result()
+
+
 def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):
     board, _ = session
     board.tell_state(SessionState())

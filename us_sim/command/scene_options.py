@@ -29,7 +29,7 @@ __all__ = [
     "viewer",
 ]
 
-_OF_THE_VIEWER = ("host", "port")
+_OF_THE_VIEWER = ("host", "port", "recordings")
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
@@ -133,7 +133,7 @@ def viewed(args: argparse.Namespace) -> ViewerSettings | None:
     if args.view:
         return viewer(args)
     if any(name in args for name in _OF_THE_VIEWER):
-        raise UsSimError("--host and --port are where the viewer listens: add --view")
+        raise UsSimError("--host, --port and --recordings are the viewer's: add --view")
     return None
 
 

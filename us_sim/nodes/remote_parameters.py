@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -33,9 +33,16 @@ class RemoteParameters:
     Args:
         node: that asks.
         post: has work done in the thread that spins ``node``; returns a future.
+        doors: by the names of nodes, what sets their parameters in place of them.
     """
 
-    def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:
+    def __init__(
+        self,
+        node: GuardedNode,
+        post: Callable[[Callable[[], Any]], Any],
+        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
+    ) -> None:
+        self._doors = doors or {}
         self._node, self._post = node, post
         self._space = node.get_namespace().rstrip("/")
         self._nodes: dict[str, RemoteNode] = {}
@@ -97,6 +104,8 @@ class RemoteParameters:
             self.board.tell(known)
 
     def _send(self, parameter: Parameter, raw: Any) -> Future[str]:
+        if parameter.node in self._doors:
+            return self._doors[parameter.node](**{parameter.name: raw})
         told: Future[str] = Future()
 
         def ask() -> None:

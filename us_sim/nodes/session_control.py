@@ -22,7 +22,7 @@ from us_sim.scene.listing import ListedScene
 __all__ = ["Controlled", "SessionControl"]
 
 
-_FLOWING = ("position", "fraction")
+_FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_room_bytes")
 """What changes all the time, and is told once a second."""
 
 

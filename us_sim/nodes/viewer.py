@@ -23,7 +23,8 @@ from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
 from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
 from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.nodes.viewer_hand import ViewerHand
-from us_sim.nodes.viewer_session import ViewerSession
+from us_sim.nodes.viewer_session import CONTROL, ViewerSession
+from us_sim.viewer.access import is_loopback
 from us_sim.viewer.parameters import Parameter, in_words
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
@@ -47,9 +48,15 @@ class Viewer(GuardedNode):
         settings = declared(self, ViewerSettings())
         self.health = Health(self, f"{settings.host}:{settings.port}")
         self.post = Posted(self)
-        self._remote = RemoteParameters(self, self.post)
+        folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
+        self._session = ViewerSession(
+            self,
+            self.post,
+            folder if settings.recordings else "",
+            is_own=is_loopback(settings.host),
+        )
+        self._remote = RemoteParameters(self, self.post, {CONTROL: self._session.board.ask})
         listener = StatusListener(self, self.post)
-        self._session = ViewerSession(self, self.post)
         self.simulator = Simulator(
             nodes=self._remote.board, status=listener.board, session=self._session.board
         )

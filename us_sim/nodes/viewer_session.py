@@ -16,7 +16,7 @@ from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 from us_sim.viewer.session import NOT_THERE, LoadableScene, SessionBoard, SessionState
 
-__all__ = ["ViewerSession"]
+__all__ = ["CONTROL", "ViewerSession"]
 
 CONTROL = "session_control"
 LOOK_S = 0.5
@@ -32,9 +32,17 @@ class ViewerSession:
     Args:
         node: that listens.
         post: has work done in the thread that spins ``node``.
+        folder, is_own: as for `SessionBoard`.
     """
 
-    def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:
+    def __init__(
+        self,
+        node: GuardedNode,
+        post: Callable[[Callable[[], Any]], Any],
+        folder: str = "",
+        *,
+        is_own: bool = True,
+    ) -> None:
         self._node, self._post = node, post
         self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
         self._subscriptions: list[Any] = []
@@ -42,7 +50,7 @@ class ViewerSession:
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
         self._asked: list[tuple[Future[str], float]] = []  # and when that was
-        self.board = SessionBoard(lambda: post(self._look), self._ask)
+        self.board = SessionBoard(lambda: post(self._look), self._ask, folder, is_own=is_own)
 
     def close(self) -> None:
         """No answer is waited for any more."""
@@ -159,6 +167,9 @@ def _state_of(status: DiagnosticStatus) -> SessionState:
         problem=status.message if status.level != DiagnosticStatus.OK else "",
         record=said.get("record", ""),
         record_note=said.get("record_note", ""),
+        record_seconds=number("record_seconds", 0.0),
+        record_bytes=number("record_bytes", 0.0),
+        record_room=number("record_room_bytes", 0.0),
         replay=said.get("replay", ""),
         replay_as=said.get("replay_as", "path"),
         replay_state=said.get("replay_state", ""),

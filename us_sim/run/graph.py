@@ -88,6 +88,8 @@ def simulation_nodes(
 def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
     """The process that shows the simulation in browsers, at an address that it says itself."""
     settings: dict[str, object] = {"host": view.host, "port": view.port}
+    if view.recordings:
+        settings["recordings"] = view.recordings
     return NodeProcess(VIEWER, settings, given or {}, {TOKEN: _viewer_token()})
 
 

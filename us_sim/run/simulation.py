@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -31,6 +32,7 @@ __all__ = ["Simulation"]
 CATALOGUE_AFTER_S = 3.0
 """From all nodes ready until scenes are listed: the first picture goes before."""
 _BAGS_EVERY_S = 2.0
+_RECORDING_EVERY_S = 1.0
 _OF_SCENE = {"scene", "volume"}
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
@@ -59,7 +61,8 @@ class Simulation:
         self._asked: tuple[str, str | None] = ("", None)  # scene and volume that are being made
         self._catalogue: Background | None = None
         self._ready_since: float | None = None
-        self._bags_at = 0.0
+        self._bags_at = self._recording_at = 0.0
+        self._recording: dict[str, str] = {}  # how far it is
         self._bags: dict[str, str] = {}
         self._problem = ""
         self._kept: dict[tuple[str, str | None], Kept] = {}  # by scenes and their volumes
@@ -103,7 +106,7 @@ class Simulation:
             load_scene(wanted.scene, volume=wanted.volume)
             return
         if "record" in named and wanted.record:
-            self._check_recording(Path(wanted.record).expanduser(), wanted)
+            self._check_recording(_file(wanted.record), wanted)
         if {"replay", "replay_as"} & set(named) and wanted.replay:
             file = find_bag(wanted.replay)
             if wanted.replay_as == "path":
@@ -124,7 +127,7 @@ class Simulation:
             return
         request = replace(
             self._request,
-            record=Path(wanted.record).expanduser() if wanted.record else None,
+            record=_file(wanted.record) if wanted.record else None,
             is_changed=True,
         )
         if not wanted.replay:
@@ -295,14 +298,19 @@ class Simulation:
             key: player[key] for key in ("position", "duration") if request.path and key in player
         }
         recorder = self._monitor.node.reports.get(RECORDER, {})
+        record = request.record.resolve() if request.record else None
+        if time.monotonic() - self._recording_at > _RECORDING_EVERY_S:
+            self._recording_at = time.monotonic()
+            self._recording = self._supervisor.recordings.progress(record) if record else {}
         values = {
             "scene": request.scene.name,
             "origin": request.scene.origin,
             "volume": request.scene.volume.name,
             "loading": self._asked[0] if self._making is not None else "",
             "fraction": f"{fraction:.2f}",
-            "record": str(request.record.resolve()) if request.record else "",
-            "record_note": recorder.get("note", "") if request.record else "",
+            "record": str(record or ""),
+            "record_note": recorder.get("note", "") if record else "",
+            **(self._recording if record else {}),
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
             "replay_state": player.get("state", "starting") if request.path else "",
@@ -334,6 +342,11 @@ class Simulation:
             replay_as="recording" if request.everything else "path",
             **changes,
         )
+
+
+def _file(name: str) -> Path:
+    """A file by its name; that of an unknown user's home stays as it is."""
+    return Path(os.path.expanduser(name))
 
 
 def _listed(names: list[str]) -> str:

@@ -64,7 +64,7 @@ class Supervisor:
         self._were_ready: set[str] = set()
         self._processes: dict[str, NodeProcess] = {}  # that were started, by node
         self._due: list[NodeProcess] = []  # that are started when others have ended
-        self._recordings = Recordings()
+        self.recordings = Recordings()
         self._is_disk_full = False
         self._began = time.monotonic()
         self._changes = 0
@@ -179,7 +179,7 @@ class Supervisor:
             self._due.remove(process)
             self._processes[process.node] = process
             if process.node == RECORDER:
-                self._recordings.begin(process)
+                self.recordings.begin(process)
         self._group.start(ready)
 
     def end(self) -> None:
@@ -194,7 +194,7 @@ class Supervisor:
 
     def outcome(self, startup: float) -> Outcome:
         """How it went, once all has ended."""
-        files = self._recordings.files()
+        files = self.recordings.files()
         recorded = images_in(files)
         # How many images were to be recorded is only known where all that were made were.
         recorder = recorder_of(self._plan.processes)

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from pathlib import PurePath
 
 __all__ = ["NOT_THERE", "Ask", "LoadableScene", "SessionBoard", "SessionState"]
 
@@ -48,6 +49,9 @@ class SessionState:
     problem: str = ""  # why the last thing that was asked for came to nothing
     record: str = ""  # file that is recorded to, with its folder
     record_note: str = ""  # what is to be known of that file
+    record_seconds: float = 0.0  # since when
+    record_bytes: float = 0.0  # its size so far
+    record_room: float = 0.0  # bytes that are left
     replay: str = ""  # bag that is played
     replay_as: str = "path"
     replay_state: str = ""
@@ -69,10 +73,21 @@ class SessionBoard:
     Args:
         on_watch: called when pages begin to look, or no longer do.
         ask: hands on what a page asks for.
+        folder: to which pages record; "" is the one that us-sim runs in.
+        is_own: whether all pages are this computer's own; others may ask for what is listed, and
+            for recordings in that folder, and not for files anywhere.
     """
 
-    def __init__(self, on_watch: Callable[[], None] = lambda: None, ask: Ask | None = None) -> None:
+    def __init__(
+        self,
+        on_watch: Callable[[], None] = lambda: None,
+        ask: Ask | None = None,
+        folder: str = "",
+        *,
+        is_own: bool = True,
+    ) -> None:
         self._on_watch, self._ask = on_watch, ask
+        self.folder, self._is_own = folder, is_own
         self._lock = threading.Lock()
         self._pages = 0
         self._state = SessionState()
@@ -138,8 +153,27 @@ class SessionBoard:
 
     def ask(self, **values: object) -> Future[str]:
         """Set parameters of ``session_control``; the future holds why not, or nothing."""
-        if self._ask is not None and self._state.is_there:
+        refusal = "" if self._is_own else self._refusal(values)
+        if self._ask is not None and self._state.is_there and not refusal:
+            file = values.get("record")
+            if self.folder and file:
+                values["record"] = str(PurePath(self.folder, str(file)))
             return self._ask(values)
         refused: Future[str] = Future()
-        refused.set_result(NOT_THERE)
+        refused.set_result(refusal or NOT_THERE)
         return refused
+
+    def _refusal(self, values: Mapping[str, object]) -> str:
+        """Why pages of other computers may not ask for this; "" where they may."""
+        file = str(values.get("record") or "")
+        if PurePath(file).name != file or file.startswith(("~", "..")):
+            return f"record: {file}: give a name without a folder"
+        listed = {
+            "scene": [self._state.origin, *(each.origin for each in self._scenes)],
+            "replay": [self._state.replay, *self._bags.values()],
+            "volume": [],
+        }
+        for key, files in listed.items():
+            if values.get(key) and values[key] not in files:
+                return f"{key}: {values[key]}: is not one of those that are listed"
+        return ""

@@ -34,3 +34,8 @@ class ViewerSettings(Settings):
     rate: float = setting(
         Quantity("frequency", 1.0, 120.0), "images and meshes, at most, for each page", default=30.0
     )
+    recordings: str | None = setting(
+        description="folder to which pages record; not given: the one that us-sim runs in. Pages "
+        "that other computers may open record nowhere else",
+        default=None,
+    )

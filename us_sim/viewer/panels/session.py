@@ -19,6 +19,9 @@ __all__ = ["build"]
 
 EVERY_S = 0.3
 """How often it is looked whether something has changed."""
+RATED_S = 5.0
+"""After which a recording's rate is known well enough to say how long there is room."""
+SHORT_MIN = 10.0
 SETTLE_S = 1.5
 """For what a person asked for to be so; until then controls stay as they were set."""
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
@@ -54,9 +57,10 @@ class _Session:
         self._file = (
             ui.input("file", value=self._proposed).props("dense outlined").classes("us-wide-field")
         )
+        folder = self._board.folder or "the folder that us-sim runs in"
         self._file.tooltip(
-            "MCAP file to write, in the folder that us-sim runs in; a name that you leave as it "
-            "is gets the time at which Record is pressed"
+            f"MCAP file to write, in {folder}; a name that you leave as it is gets the time at "
+            f"which Record is pressed"
         )
         with ui.row().classes("us-session-row"):
             self._record = ui.button("Record", icon="fiber_manual_record", on_click=self._begin)
@@ -105,7 +109,9 @@ class _Session:
         self._file.set_enabled(not state.record)
         self._record.set_enabled(not state.record and state.replay_as == "path")
         self._stop.set_enabled(bool(state.record))
-        self._recorded.set_text(f"recording to {state.record}" if state.record else "")
+        told, is_short = recorded(state)
+        self._recorded.set_text(f"recording to {state.record}{told}" if state.record else "")
+        self._recorded.classes(**{"add" if is_short else "remove": "us-wrong"})
         self._note.set_text(state.record_note)
         self._note.set_visibility(bool(state.record_note))
         if dict(board.bags) != self._bags:
@@ -201,6 +207,29 @@ class _Session:
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
         return not refused
+
+
+def recorded(state: SessionState) -> tuple[str, bool]:
+    """How long, how large, and how much longer it may become; and whether that is little.
+
+    >>> recorded(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room=9e9))
+    (': 1:12 min, 360 MB, room for 30 min', False)
+    >>> recorded(SessionState(record_seconds=10.0, record_bytes=1e9, record_room=5e9))
+    (': 0:10 min, 1.0 GB, room for 1 min', True)
+    """
+    seconds, size, room = state.record_seconds, state.record_bytes, state.record_room
+    if not room:
+        return "", False
+    minutes, rest = divmod(int(seconds), 60)
+    shown = f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
+    told = f": {minutes}:{rest:02} min, {shown}"
+    if not size or seconds < RATED_S:
+        return f"{told}, room for {room / 1e9:.1f} GB", False
+    left = room / size * seconds / 60.0
+    return (
+        f"{told}, room for {f'{left / 60:.0f} h' if left > 120 else f'{left:.0f} min'}",
+        left < SHORT_MIN,
+    )
 
 
 def _proposed() -> str:
