@@ -167,6 +167,31 @@ def test_why_an_image_shows_no_flow_is_on_diagnostics_at_once(bench, scene, send
     assert waits < 2.0  # else it comes once a second
 
 
+@pytest.mark.parametrize("kind", ["m_mode", "spectrum"])
+def test_a_strip_goes_on_when_the_line_or_the_gate_is_moved(bench, send, kind):
+    node, pose = send(**{"spectrum.gain": 30.0})  # so that noise lights the columns
+    pictures = bench.collect(Image, f"ultrasound/{kind}")
+    stream = next(each for each in node._streams if each.topic.endswith(kind))
+    bench.spin_until(lambda: stream.is_wanted)
+
+    def columns(second):
+        count = len(pictures)
+        pose(second)
+        bench.spin_until(lambda: len(pictures) > count)
+        picture = np.frombuffer(pictures[-1].data, np.uint8)
+        picture = picture.reshape(pictures[-1].height, pictures[-1].width, 3)
+        lit = picture[:200, :512].any(axis=2).sum(axis=0)
+        return np.count_nonzero(lit > 20)  # a line at 0 cm/s is in all
+
+    columns(3)
+    before = columns(4)  # of a sweep of four seconds
+    assert before > 100
+    assert node.set_parameters([Parameter(f"{kind}.lateral", value=0.05)])[0].successful
+    assert columns(5) > before + 100
+    assert node.set_parameters([Parameter(f"{kind}.sweep", value=8.0)])[0].successful
+    assert columns(6) < before  # begun anew, as columns stand for other moments
+
+
 def test_nothing_is_computed_for_nobody(bench, send):
     node, pose = send()
     images = bench.collect(Image, "ultrasound/image")

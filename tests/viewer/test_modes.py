@@ -133,14 +133,6 @@ def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simul
 
 @pytest.mark.usefixtures("asked")
 def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
-    probe = Feed("probe")
-    simulator.add(probe)
-
-    def press(newton: float, age: float = 0.0) -> None:
-        header = {"stamp": "1", "position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
-        header |= {"force": [0.0, 0.0, -newton], "force_age": age, "force_stamp": "1"}
-        probe.offer(lambda sequence: Packet("probe", sequence, header, b""))
-
     def see(**values: str) -> None:
         simulator.status.tell(NodeStatus(NODE, Level.WELL, "imaging", values), time.monotonic())
 
@@ -168,9 +160,11 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     is_said("Poor contact", "No spectrum: no vessel")
     see(contact="good", no_colour="", no_spectrum="")
     is_said()
-    press(24.0)
+    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"force": "24.20"})
+    simulator.status.tell(tissue, time.monotonic())
     is_said("Too much force: 24 N")
-    press(24.0, age=0.8)  # of a pose before
+    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"unbalanced": "1"})
+    simulator.status.tell(tissue, time.monotonic())
     is_said()
 
 

@@ -144,10 +144,12 @@ class TissueDeformer(SceneNode):
                 f"the tissue's forces are not in balance (residual {deformation.residual:.2g}), so "
                 f"no force is sent: move the probe more slowly, or give the frames more time"
             )
+        force = float(np.linalg.norm(deformation.force))
         self.health.state = self._live.state
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
             "unbalanced": str(self._unbalanced),
+            **({"force": f"{force:.2f}"} if deformation.is_balanced else {}),
             "contact_nodes": str(len(deformation.contact_nodes)),
             "action": deformation.action,
             **self._comparison(),

@@ -48,6 +48,11 @@ class MMode:
             _ROWS, _COLUMNS, settings.sweep, (0.0, 1e3 * probe.depth, "mm")
         )
 
+    def go_on(self, before: MMode) -> None:
+        """Go on with the picture of a line that looked elsewhere, if its scales are the same."""
+        if before._picture.layout == self._picture.layout:
+            self._picture = before._picture
+
     def line(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Grey values (rows,) along the line of an image (rows, columns), from the face down."""
         linear, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE

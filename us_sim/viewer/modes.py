@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from nicegui import ui
 
+from us_sim.viewer.parameters import Kind
 from us_sim.viewer.simulator import Simulator
 
 __all__ = ["build_modes"]
@@ -28,6 +29,7 @@ STRIPS = {
     "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
 }
 FLIP_TOLD = "Exchange left and right, on all pages; the dot is at the side of the probe's mark"
+_TOO_MUCH = 20.0  # N; sonographers press with some 5 to 10
 _CONTACT = {
     "none": "No contact: press the probe onto the skin",
     "poor": "Poor contact: press more, or tilt less",
@@ -39,6 +41,8 @@ _ABSENT = {
     "across_flow": "the beams cross the flow at a right angle: tilt the probe, or steer the beams",
     "too_slow": "the flow is slower than the wall filter lets through",
 }
+TISSUE = "tissue_deformer"
+_UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
 _LOOK_S = 0.3
 
 
@@ -50,13 +54,15 @@ class _Modes:
         self._mode = "b-mode"
         self._buttons: dict[str, ui.button] = {}
         self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
-        with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"'):
+        self._places: list[dict[str, Any]] = []
+        with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"') as bar:
             for mode, (label, tooltip) in MODES.items():
                 self._buttons[mode] = _button(label, tooltip, lambda mode=mode: self._choose(mode))
             ui.element("span").classes("us-gap")
             for kind, (label, tooltip) in STRIPS.items():
                 self._buttons[kind] = _button(label, tooltip, lambda kind=kind: self._toggle(kind))
             self._buttons[FLIP] = _button("Flip", FLIP_TOLD, self._flip)
+        bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
         board, status = simulator.nodes, simulator.status
@@ -108,6 +114,11 @@ class _Modes:
             self._remarks = remarks
             told = f"m.setRemarks({json.dumps(remarks)})"
             ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {told})")
+        places = [] if self._probe_depth is None else list(self._looked_at())
+        if places != self._places:
+            self._places = places
+            told = f"m.setPlaces({json.dumps(places)})"
+            ui.run_javascript(f"import('/us_sim/assets/image_tools/places.js').then(m => {told})")
         parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
@@ -119,11 +130,59 @@ class _Modes:
         status = self._simulator.status.node(NODE, time.monotonic())
         values = status.values if status else {}
         remarks = [_CONTACT.get(values.get("contact", ""), "")]
+        tissue = self._simulator.status.node(TISSUE, time.monotonic())
+        force = (tissue.number("force") if tissue else None) or 0.0
+        if force > _TOO_MUCH:
+            remarks.append(f"Too much force: {force:.0f} N")
         if self._mode == "velocity":
             remarks.append(_absent("No colour", values.get("no_colour", ""), values))
         if self._strips["spectrum"]:
             remarks.append(_absent("No spectrum", values.get("no_spectrum", ""), values))
         return [remark for remark in remarks if remark]
+
+    def _value(self, name: str) -> float | None:
+        """Of a parameter that is a number, in SI units; None where there is none, or nothing."""
+        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
+        if parameter is None or parameter.kind is not Kind.NUMBER or parameter.value is None:
+            return None
+        return float(parameter.raw)
+
+    @property
+    def _probe_depth(self) -> float | None:
+        return self._value("depth")
+
+    def _looked_at(self) -> Iterator[dict[str, Any]]:
+        """The colour box, the gate and the line that are shown, as parameters have them, m, rad."""
+        deepest = self._probe_depth or 0.0
+        shown = {"colour": self._mode == "velocity", **self._strips}
+        for kind in (kind for kind, on in shown.items() if on):
+            lateral = self._value(f"{kind}.lateral")
+            if lateral is None:
+                continue
+            yield {
+                "kind": kind,
+                "lateral": lateral,
+                "deepest": deepest,
+                "depth": self._value(f"{kind}.depth") or 0.5 * deepest,
+                "steering": self._value(f"{kind}.steering") or 0.0,
+                "width": self._value(f"{kind}.width") or 0.0,
+                "height": self._value(f"{kind}.height") or 0.5 * deepest,
+                "size": self._value(f"{kind}.size") or 0.0,
+            }
+
+    async def _move(self, asked: Any) -> None:
+        """Move the box, the gate or the line to where a person has dragged it."""
+        wanted = asked if isinstance(asked, dict) else {}
+        kind = wanted.get("kind")
+        for name in ("lateral", "depth"):
+            parameter = self._simulator.nodes.of(NODE).parameters.get(f"{kind}.{name}")
+            value = wanted.get(name)
+            if parameter is None or kind not in ("colour", *STRIPS):
+                continue
+            if not isinstance(value, int | float) or abs(value - parameter.raw) < _UNMOVED:
+                continue
+            if not await self._set(parameter.name, value / parameter.size):
+                return
 
     def _mark(self) -> None:
         shown = {**self._strips, self._mode: True, FLIP: self._is_flipped}

@@ -36,6 +36,9 @@ class MModeStream(SettableStream[MMode]):
     def _make(self, probe: Probe, settings: MModeSettings) -> MMode:
         return MMode(probe, settings)
 
+    def _go_on(self, made: MMode, before: MMode) -> None:
+        made.go_on(before)
+
     def _message(self, frame: Frame, stamp: Time) -> Image:
         picture = self.for_frame(frame).show(frame.pixels, frame.time)
         return colour_image_message(picture, stamp, "probe")

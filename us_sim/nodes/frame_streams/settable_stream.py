@@ -29,6 +29,7 @@ class SettableStream(FrameStream, Generic[M]):
     def __init__(self, node: SceneNode, settings: Settings, prefix: str) -> None:
         super().__init__(node)
         self._made: M | None = None
+        self._is_outdated = False  # by a parameter that was set
         self._probe: Probe | None = None
         self._settings = LiveSettings(
             node, {"set": Group(settings, prefix)}, self._require, self._forget
@@ -54,14 +55,20 @@ class SettableStream(FrameStream, Generic[M]):
 
     def for_frame(self, frame: Frame) -> M:
         """What makes the topic of this frame."""
-        if self._made is None or frame.probe is not self._probe:
-            self._probe = frame.probe
-            self._made = self._make(frame.probe, self._settings.values["set"])
+        if self._made is None or self._is_outdated or frame.probe is not self._probe:
+            made, before = self._make(frame.probe, self._settings.values["set"]), self._made
+            if before is not None:
+                self._go_on(made, before)
+            self._probe, self._made, self._is_outdated = frame.probe, made, False
         return self._made
+
+    def _go_on(self, made: M, before: M) -> None:
+        """Take over, from what made the topic before, what still holds."""
+        del made, before
 
     def _require(self, wanted: dict[str, Any]) -> None:
         if self._probe is not None:
             self._make(self._probe, wanted["set"])
 
     def _forget(self, _: dict[str, Any]) -> None:
-        self._made = None
+        self._is_outdated = True

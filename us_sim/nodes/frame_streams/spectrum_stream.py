@@ -38,6 +38,9 @@ class SpectrumStream(SettableStream[Spectrum]):
     def _make(self, probe: Probe, settings: SpectrumSettings) -> Spectrum:
         return Spectrum(probe, settings)
 
+    def _go_on(self, made: Spectrum, before: Spectrum) -> None:
+        made.go_on(before)
+
     def _message(self, frame: Frame, stamp: Time) -> Image:
         spectrum = self.for_frame(frame)
         picture = spectrum.show(self._blood, frame)

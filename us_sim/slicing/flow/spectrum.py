@@ -89,6 +89,11 @@ class Spectrum:
             _ROWS, _COLUMNS, settings.sweep, (float(shown[0]), float(shown[1]), "cm/s")
         )
 
+    def go_on(self, before: Spectrum) -> None:
+        """Go on with the picture of a gate that looked elsewhere, if its scales are the same."""
+        if before._picture.layout == self._picture.layout:
+            self._picture = before._picture
+
     def show(self, blood: Blood, frame: Frame) -> NDArray[np.uint8]:
         """The picture (rows, columns, 3) up to the frame, with its scales.
 

@@ -136,12 +136,7 @@ export function remindFrozen() {
   showRemark();
 }
 
-/** N beyond which a press is said to be too much: sonographers press with some 5 to 10 N. */
-const TOO_MUCH = 20;
-/** s that a force may be older than the pose, and still be that of the press. */
-const PRESENT = 0.5;
 let remarks = []; // on the images as they come
-let pressed = ""; // on the force
 
 /** What is to be known of the image, or nothing. */
 function remark() {
@@ -152,7 +147,7 @@ function remark() {
   const age = arrived ? performance.now() - arrived : 0;
   if (document.hidden) return "";
   if (age >= STALE_MS) return `No new image for ${Math.floor(age / 1000)} s`;
-  return [...remarks, pressed].filter(Boolean).join("\n");
+  return remarks.join("\n");
 }
 
 /** Say these of the images as they come, in place of those said before. */
@@ -160,14 +155,6 @@ export function setRemarks(said) {
   remarks = said;
   showRemark();
 }
-
-stream.on("probe", ({ force, force_age: age }) => {
-  const size = force && age < PRESENT ? Math.hypot(...force) : 0;
-  const words = size > TOO_MUCH ? `Too much force: ${size.toFixed(0)} N` : "";
-  if (words === pressed) return;
-  pressed = words;
-  showRemark();
-});
 
 function showRemark() {
   const words = remark();

@@ -4,6 +4,7 @@ import "./image.js";
 import "./header.js";
 import "./strips.js";
 import "./image_tools/image_tools.js";
+import "./image_tools/places.js";
 import "./hand/panel.js";
 import "./hand/keys.js";
 import "./hand/image_drag.js";
