@@ -3,11 +3,18 @@
 import time
 from typing import Any
 
+import numpy as np
+
+from us_sim.skin.surface import plane_surface
 from us_sim.viewer.feed import Feed
+from us_sim.viewer.meshes.coloured_surface import ColouredSurface
+from us_sim.viewer.meshes.rest_surface import RestSurface
+from us_sim.viewer.meshes.transducer import transducer_packet
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.simulator import Simulator
 
 PIXEL = 8e-5  # m
+FACE = [0.005, 0.01, 0.001]  # m, where the probe's face is
 MATRIX = [PIXEL, 0, 0, -0.0128, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
 RANGES = {"x": [-0.07, 0.07], "y": [-0.08, 0.08], "press": [-0.05, 0.025], "tilt": [-1.05, 1.05]}
 STANCE = {"x": 0.012, "y": 0.0, "z": 0.0, "press": 0.0042, "rotation": 0.0, "fan": -0.2, "rock": 0}
@@ -57,3 +64,25 @@ class FakeHand:
         while not done():
             assert time.monotonic() < deadline, f"asked so far: {self.asked}"
             time.sleep(0.02)
+
+
+def show_patient(simulator: Simulator) -> None:
+    """Feed a flat piece of skin and a probe that stands on it."""
+    skin, mesh, pose = (Feed(kind, rate=None) for kind in ("skin_mesh", "probe_mesh", "probe"))
+    sheet = plane_surface((0.16, 0.16), 0.02)
+    surface = RestSurface(sheet.vertices, sheet.triangles)
+    skin.offer(lambda n: surface.told("skin_mesh", n))
+    body = ColouredSurface("body", (0.9, 0.9, 0.9), *_box([-0.02, -0.008, -0.12], [0.02, 0.008, 0]))
+    outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
+    mesh.offer(lambda n: transducer_packet("probe_mesh", n, [body], outline))
+    header = {"stamp": "1", "position": FACE, "quaternion": [0, 0, 0, 1]}
+    pose.offer(lambda n: Packet("probe", n, header, b""))
+    simulator.add(skin, mesh, pose)
+
+
+def _box(lower: list[float], upper: list[float]) -> tuple[Any, Any]:
+    """Corners (8, 3) m and triangles (12, 3) of a box, outwards."""
+    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"))
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    return corners.reshape(3, 8).T, np.array(triangles)

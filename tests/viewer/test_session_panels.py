@@ -140,8 +140,7 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
     board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
     opened(page, "Session")
     kind = page.get_by_role("button", name="All as recorded")
-    kind.hover()
-    page.get_by_text("start again, with what was set before").wait_for()
+    page.get_by_title("start again, with what was set before").wait_for()
     page.get_by_label("recording or path").click()
     page.get_by_role("option", name="hand.mcap").click()
     kind.click()
@@ -150,10 +149,7 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
     replay = {"replay": "/bags/hand.mcap", "replay_as": "recording", "replay_state": "playing"}
     board.tell_state(dataclasses.replace(RUNNING, **replay))
     until(kind.is_disabled, "it cannot be changed now", 30.0)
-    box = kind.bounding_box()
-    page.mouse.move(5, 5)
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, steps=5)
-    page.get_by_text("cannot be changed: end the replay first").wait_for()
+    page.get_by_title("cannot be changed: end the replay first").wait_for()
 
 
 def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(page, session):

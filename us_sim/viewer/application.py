@@ -9,6 +9,7 @@ from typing import Any
 from fastapi import FastAPI, Request, Response, WebSocket
 from fastapi.concurrency import run_in_threadpool
 from fastapi.staticfiles import StaticFiles
+from nicegui import app as nicegui_app
 from nicegui import ui
 
 from us_sim.errors import UsSimError
@@ -51,8 +52,11 @@ def application(simulator: Simulator) -> Any:
     def page() -> None:
         build_page(simulator)
 
+    # Its bar above the page would say nothing that a person waits for.
+    nicegui_app.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run_with(
         app,
+        language="en-US",
         title="us_sim",
         dark=True,
         tailwind=False,  # a compiler in the page, which nothing here needs

@@ -23,7 +23,7 @@ MODES = {
     "strain_estimate": ("Elastography", "Strain between two images, as a scanner estimates it"),
     "velocity": ("Colour", "Velocity of blood along the beams, as colour Doppler shows it"),
 }
-"""Label and tooltip by value of the parameter ``overlay``, and the plain image before them."""
+"""Label and title by value of the parameter ``overlay``, and the plain image before them."""
 STRIPS = {
     "m_mode": ("M-mode", "Echoes along one line of the image over time"),
     "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
@@ -56,11 +56,11 @@ class _Modes:
         self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
         self._places: list[dict[str, Any]] = []
         with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"') as bar:
-            for mode, (label, tooltip) in MODES.items():
-                self._buttons[mode] = _button(label, tooltip, lambda mode=mode: self._choose(mode))
+            for mode, (label, title) in MODES.items():
+                self._buttons[mode] = _button(label, title, lambda mode=mode: self._choose(mode))
             ui.element("span").classes("us-gap")
-            for kind, (label, tooltip) in STRIPS.items():
-                self._buttons[kind] = _button(label, tooltip, lambda kind=kind: self._toggle(kind))
+            for kind, (label, title) in STRIPS.items():
+                self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
             self._buttons[FLIP] = _button("Flip", FLIP_TOLD, self._flip)
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
@@ -192,9 +192,9 @@ class _Modes:
                 button.props["aria-pressed"] = pressed
 
 
-def _button(label: str, tooltip: str, on_click: Any) -> ui.button:
-    with ui.button(label, color=None, on_click=on_click).props("flat dense no-caps") as button:
-        ui.tooltip(tooltip)
+def _button(label: str, title: str, on_click: Any) -> ui.button:
+    button = ui.button(label, color=None, on_click=on_click).props("flat dense no-caps")
+    button.props["title"] = title
     return button
 
 

@@ -1,4 +1,4 @@
-"""The one page: header, 3D scene, ultrasound image, and a drawer of panels."""
+"""The one page: header, 3D scene, ultrasound image, and panels that can be opened."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _BODY = '<script type="module" src="/us_sim/assets/main.js"></script>'
 
 @dataclass(frozen=True)
 class Panel:
-    """One tab of the drawer."""
+    """One tab of the panels."""
 
     name: str
     icon: str  # of Material's icons, which NiceGUI brings
-    tooltip: str
+    title: str
     build: Callable[[Simulator], None]  # called inside the tab
 
 
@@ -50,24 +50,33 @@ def build_page(simulator: Simulator) -> None:
     ui.add_body_html(_BODY)
     ui.colors(primary="#4fb3bf", dark="#171b1f", dark_page="#0e1113", negative="#e5735c")
     ui.query(".nicegui-content").classes("us-content")
-    drawer = _drawer(simulator)
-    with ui.header().classes("us-header"):
-        ui.label("us_sim").classes("us-brand")
+    with ui.header(wrap=False).classes("us-header"):
+        ui.label("us_sim").classes("us-brand").props("role=heading aria-level=1")
         build_headline(simulator)
         ui.space()
         _block("readout")
-        with ui.button(icon="tune", on_click=drawer.toggle).props("flat round dense") as button:
-            button.props('aria-label="Panels" id="us-panels"')
-            ui.tooltip("Panels: image, tissue, cases, session, status")
-    with ui.element("main").classes("us-main"):
-        with ui.element("section").classes("us-left").props('aria-label="Patient in 3D"'):
+        button = ui.button(icon="tune").props("flat round dense id=us-panels")
+    with ui.element("div").classes("us-main"):  # the page's <main> is Quasar's
+        with _section("us-left", "Patient in 3D"):
             _block("scene")
             _block("hand")
-        with ui.element("section").classes("us-right").props('aria-label="Ultrasound"'):
+        with _section("us-right", "Ultrasound"):
             build_modes(simulator)
             _block("ultrasound")
             _block("strips")
             _block("image-tools")
+        with _section("us-drawer", "Panels") as drawer:
+            _panels(simulator)
+    drawer.set_visibility(False)
+    button.props["title"] = "Panels: image, tissue, cases, session, status"
+    button.props["aria-label"] = "Panels"
+    button.props["aria-expanded"] = "false"
+
+    def toggle() -> None:
+        drawer.set_visibility(not drawer.visible)
+        button.props["aria-expanded"] = str(drawer.visible).lower()
+
+    button.on_click(toggle)
 
 
 def _block(name: str) -> None:
@@ -75,18 +84,18 @@ def _block(name: str) -> None:
     ui.element("div").props["id"] = name
 
 
-def _drawer(simulator: Simulator) -> ui.right_drawer:
-    drawer = ui.right_drawer(value=False, bordered=True).classes("us-drawer")
-    # Quasar would cover the header, with the button that closes it, where a screen is narrow.
-    drawer.props("width=380 behavior=desktop")
-    with drawer:
-        if PANELS:
-            with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
-                for panel in PANELS:
-                    with ui.tab(panel.name, icon=panel.icon):
-                        ui.tooltip(panel.tooltip)
-            with ui.tab_panels(tabs, value=PANELS[0].name).classes("us-panels"):
-                for panel in PANELS:
-                    with ui.tab_panel(panel.name):
-                        panel.build(simulator)
-    return drawer
+def _section(name: str, label: str) -> ui.element:
+    """A part of the page that assistive technology lists by its label."""
+    section = ui.element("section").classes(name)
+    section.props["aria-label"] = label
+    return section
+
+
+def _panels(simulator: Simulator) -> None:
+    with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
+        for panel in PANELS:
+            ui.tab(panel.name, icon=panel.icon).props["title"] = panel.title
+    with ui.tab_panels(tabs, value=PANELS[0].name).classes("us-panels"):
+        for panel in PANELS:
+            with ui.tab_panel(panel.name):
+                panel.build(simulator)

@@ -75,7 +75,8 @@ class _Cases:
             others = [each for each in scenes if each.tracker not in BY_HAND]
             if others:
                 tip = "The same bodies, for probes that a device tracks"
-                with ui.expansion("With other trackers").classes("us-cases-more").tooltip(tip):
+                with ui.expansion("With other trackers").classes("us-cases-more") as more:
+                    more.props["title"] = tip
                     for each in others:
                         self._card(each, state)
 
@@ -102,7 +103,7 @@ class _Cases:
                 ).props("flat dense no-caps")
                 button.props["aria-label"] = f"Load {scene.name}"
                 button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
-                button.tooltip(AGAIN if is_loaded else ANOTHER)
+                button.props["title"] = AGAIN if is_loaded else ANOTHER
 
     async def _load(self, scene: LoadableScene) -> None:
         state = self._board.state
@@ -115,6 +116,7 @@ class _Cases:
     async def _is_sure(self, scene: LoadableScene, record: str) -> bool:
         """Ask, since the recording ends with its scene."""
         with ui.dialog() as dialog, ui.card():
+            dialog.props["aria-label"] = "Load another scene"
             ui.label(f"Loading {scene.name} ends the recording {record}. It is kept as it is.")
             with ui.row():
                 ui.button("Load", on_click=lambda: dialog.submit(True)).props("no-caps")

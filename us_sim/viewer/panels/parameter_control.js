@@ -14,12 +14,7 @@ const tidy = (number) => String(Number(Number(number).toPrecision(DIGITS)));
 export default {
   template: `
     <div class="us-control" :class="{'us-refused': refusal, 'us-long-unit': unit.length > 5}">
-      <label class="us-label" :for="field">
-        {{ label }}
-        <q-tooltip v-if="tip" anchor="bottom left" self="top left" max-width="320px" :delay="400">
-          {{ tip }}
-        </q-tooltip>
-      </label>
+      <label class="us-label" :for="field" :title="tip">{{ label }}</label>
       <template v-if="!live">
         <span class="us-fixed">{{ text }}<span v-if="unit"> {{ unit }}</span></span>
       </template>

@@ -58,15 +58,17 @@ class _Session:
             ui.input("file", value=self._proposed).props("dense outlined").classes("us-wide-field")
         )
         folder = self._board.folder or "the folder that us-sim runs in"
-        self._file.tooltip(
+        self._file.props["title"] = (
             f"MCAP file to write, in {folder}; a name that you leave as it is gets the time at "
             f"which Record is pressed"
         )
         with ui.row().classes("us-session-row"):
             self._record = ui.button("Record", icon="fiber_manual_record", on_click=self._begin)
-            self._record.props("no-caps dense").tooltip("Record all topics to the file")
+            self._record.props("no-caps dense")
+            self._record.props["title"] = "Record all topics to the file"
             self._stop = ui.button("Stop", icon="stop", on_click=self._end)
-            self._stop.props("no-caps dense").tooltip("End the recording; it is complete then")
+            self._stop.props("no-caps dense")
+            self._stop.props["title"] = "End the recording; it is complete then"
             self._recorded = ui.label().classes("us-quiet").props('role="status"')
         self._note = ui.label().classes("us-quiet").props('role="status"')
 
@@ -74,22 +76,23 @@ class _Session:
         ui.label("Replay").classes("us-cases-title")
         self._bag = ui.select({}, label="recording or path", with_input=True)
         self._bag.props("dense outlined").classes("us-wide-field")
-        self._bag.tooltip("Bags in the folder that us-sim runs in, and those that came with it")
-        with ui.element("div"):  # also told while the choice is disabled
+        self._bag.props["title"] = (
+            "Bags in the folder that us-sim runs in, and those that came with it"
+        )
+        with ui.element("div") as self._kind_told:  # also told while the choice is disabled
             self._kind = ui.toggle(KINDS, value="path").props("no-caps dense")
-            self._kind_told = ui.tooltip(KINDS_TOLD)
         with ui.row().classes("us-session-row"):
             self._play = ui.button(icon="play_arrow", on_click=self._play_or_pause)
-            self._play.props('dense aria-label="Play or pause"').tooltip("Play, pause, go on")
+            self._play.props('dense aria-label="Play or pause" title="Play, pause, go on"')
             self._close = ui.button(icon="stop", on_click=lambda: self._ask(replay=""))
-            self._close.props('dense aria-label="End replay"').tooltip("End the replay")
+            self._close.props('dense aria-label="End replay" title="End the replay"')
             set_rate, set_loop = map(self._by_person, (self._set_rate, self._set_loop))
             self._rate = ui.select(RATES, value=1.0, label="speed", on_change=set_rate)
-            self._rate.props("dense outlined").tooltip("Speed factor").classes("us-session-rate")
+            self._rate.props('dense outlined title="Speed factor"').classes("us-session-rate")
             self._loop = ui.switch("loop", value=False, on_change=set_loop)
-            self._loop.tooltip("Begin again at the end")
+            self._loop.props["title"] = "Begin again at the end"
         self._time = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0)
-        self._time.props('aria-label="Time in the replay, s"').tooltip("Time in the replay, s")
+        self._time.props('aria-label="Time in the replay, s" title="Time in the replay, s"')
         self._time.on("pan", self._drag)
         self._time.on("change", self._seek)
         self._where = ui.label().classes("us-quiet").props('role="status"')
@@ -127,7 +130,7 @@ class _Session:
         for control in (self._close, self._time):
             control.set_enabled(plays)
         self._kind.set_enabled(not plays)
-        self._kind_told.set_text(KINDS_FIXED if plays else KINDS_TOLD)
+        self._kind_told.props["title"] = KINDS_FIXED if plays else KINDS_TOLD
         end = round(state.duration, 2)
         if end not in (0.0, self._time.props["max"]):
             self._time.props["max"] = end

@@ -33,12 +33,12 @@ def build(simulator: Simulator) -> None:
 def _show_parameters(simulator: Simulator, node: str) -> None:
     """A dialog with all parameters of a node, until it is closed."""
     with ui.dialog() as dialog, ui.card().classes("us-dialog"):
+        dialog.props["aria-label"] = f"Parameters of {node}"
         with ui.row().classes("us-dialog-head"):
             ui.label(node).classes("us-heading").props('role="heading" aria-level="1"')
             ui.space()
-            with ui.button(icon="close", on_click=dialog.close).props("flat round dense") as button:
-                button.props('aria-label="Close"')
-                ui.tooltip("Close")
+            button = ui.button(icon="close", on_click=dialog.close)
+            button.props("flat round dense title=Close aria-label=Close")
         shown = WhileShown(
             lambda: sections.watch(),
             lambda: sections.unwatch(),

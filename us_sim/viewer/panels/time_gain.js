@@ -5,12 +5,7 @@ export default {
   template: `
     <div class="us-time-gain" role="group" :aria-label="label" :aria-description="tip">
       <div class="us-time-gain-head">
-        <span class="us-label">
-          {{ label }}
-          <q-tooltip anchor="bottom left" self="top left" max-width="320px" :delay="400">
-            {{ tip }}
-          </q-tooltip>
-        </span>
+        <span class="us-label" :title="tip">{{ label }}</span>
         <button type="button" class="us-level" :disabled="isFlat" @click="flatten"
           title="the same gain at all depths: 0 dB">level</button>
       </div>

@@ -11,6 +11,7 @@ const PARTS = {
     ["wheel over the probe, Shift + wheel", "press, lift"],
     ["drag beside the patient, Alt + drag", "turn the view"],
     ["two fingers down, turned", "press, rotate"],
+    ["Esc", "close the layers"],
   ],
   "On the image": [
     ["drag down, up; wheel", "press, lift"],
@@ -29,6 +30,7 @@ const PARTS = {
     ["Shift + ← →", "rock"],
     ["H L U", "centre, lift, upright"],
     ["0 to 6", "views"],
+    ["← → on a slider", "a step less, more"],
     ["?", "this help"],
   ],
 };
@@ -49,6 +51,9 @@ for (const [title, lines] of Object.entries(PARTS)) {
   part.append(heading, list);
   dialog.append(part);
 }
+const closing = Object.assign(document.createElement("button"), { type: "button" });
+closing.textContent = "Close";
+dialog.prepend(closing);
 document.body.append(dialog);
 dialog.addEventListener("click", () => dialog.close());
 

@@ -35,8 +35,8 @@ const KEYS = {
 };
 const PLACES = { h: "home", l: "lift", u: "upright" };
 
+/** By the key's code: {change, since}, ms up to which its movement was asked for. */
 const held = new Map();
-let last = 0;
 
 function nameOf(event) {
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -51,21 +51,23 @@ addEventListener("keydown", (event) => {
   event.preventDefault(); // a page that scrolls would move the scene away
   if (event.repeat || held.has(event.code)) return;
   hand.ask({ by: KEYS[name](STEP_S) }, event.timeStamp);
-  held.set(event.code, { change: KEYS[name], from: performance.now() + HELD_MS });
-  if (held.size === 1) {
-    last = performance.now();
-    requestAnimationFrame(goOn);
-  }
+  held.set(event.code, { change: KEYS[name], since: event.timeStamp + HELD_MS });
+  if (held.size === 1) requestAnimationFrame(goOn);
 });
-addEventListener("keyup", (event) => held.delete(event.code));
+addEventListener("keyup", (event) => {
+  if (held.has(event.code)) follow(held.get(event.code), event.timeStamp);
+  held.delete(event.code);
+});
 addEventListener("blur", () => held.clear());
 
+/** Ask for the movement of the time that a key was held, however rarely the page is drawn. */
+function follow(key, now) {
+  if (now <= key.since) return;
+  hand.ask({ by: key.change((now - key.since) / 1000) });
+  key.since = now;
+}
+
 function goOn() {
-  const now = performance.now();
-  const seconds = Math.min(now - last, 50) / 1000;
-  last = now;
-  for (const { change: by, from } of held.values()) {
-    if (now > from) hand.ask({ by: by(seconds) });
-  }
+  for (const key of held.values()) follow(key, performance.now());
   if (held.size) requestAnimationFrame(goOn);
 }

@@ -5,13 +5,16 @@ import { hand } from "./hand.js";
 import { help } from "./help.js";
 import { latency } from "./latency.js";
 
-const MILLIMETRES = { unit: "mm", factor: 1000, digits: 1, step: 0.1 };
-const DEGREES = { unit: "°", factor: 180 / Math.PI, digits: 0, step: 1 };
+/** `notch`: by how much an arrow key moves a slider. */
+const MILLIMETRES = { unit: "mm", factor: 1000, digits: 1, step: 0.1, notch: 0.5 };
+const DEGREES = { unit: "°", factor: 180 / Math.PI, digits: 0, step: 1, notch: 1 };
+/** The way through the air takes so much less of the slider than as long a press. */
+const PRESS = { ...MILLIMETRES, air: 10 };
 const HALF = [-Math.PI, Math.PI];
 
-/** Name of the quantity, label, tooltip, unit, and its range's name in the state, or the range. */
+/** Name of the quantity, label, title, unit, and its range's name in the state, or the range. */
 const QUANTITIES = [
-  ["press", "Press", "How deep the probe is pressed into the skin at rest; below 0 it is lifted (keys W, S)", MILLIMETRES, "press"],
+  ["press", "Press", "How deep the probe is pressed into the skin at rest; at the mark it touches, before it it is lifted (keys S, W; Page ↓ ↑)", PRESS, "press"],
   ["fan", "Fan", "Tilt about the array: the image plane swings through the tissue (Shift ↑ ↓)", DEGREES, "tilt"],
   ["rock", "Rock", "Tilt within the image plane (Shift ← →)", DEGREES, "tilt"],
   ["rotation", "Rotate", "Turn about the skin's normal (keys Q, E)", DEGREES, HALF],
@@ -55,7 +58,9 @@ function put(part, property, value) {
   if (part[property] !== value) part[property] = value;
 }
 
-function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
+function makeRow([name, label, title, { unit, factor, digits, step, notch, air = 1 }, range]) {
+  const onSlider = (value) => (value < 0 ? value / air : value);
+  const ofSlider = (place) => (place < 0 ? place * air : place);
   const slider = make("input", { type: "range", step: step / 10, title });
   const number = make("input", { type: "number", step, title });
   slider.setAttribute("aria-label", `${label}, ${unit}`);
@@ -72,10 +77,18 @@ function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
   const ask = (value, event) => {
     if (Number.isFinite(value)) hand.ask({ to: { [name]: value / factor } }, event.timeStamp);
   };
-  slider.addEventListener("input", (event) => {
-    number.value = slider.valueAsNumber.toFixed(digits);
+  const slide = (value, event) => {
+    slider.value = onSlider(value);
+    number.value = ofSlider(slider.valueAsNumber).toFixed(digits);
     if (problem) tell("");
-    ask(slider.valueAsNumber, event);
+    ask(ofSlider(slider.valueAsNumber), event);
+  };
+  slider.addEventListener("input", (event) => slide(ofSlider(slider.valueAsNumber), event));
+  slider.addEventListener("keydown", (event) => {
+    const sign = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[event.key];
+    if (!sign) return;
+    event.preventDefault();
+    slide(ofSlider(slider.valueAsNumber) + sign * notch, event);
   });
   number.addEventListener("change", (event) => {
     const { value, min, max } = number;
@@ -93,15 +106,20 @@ function makeRow([name, label, title, { unit, factor, digits, step }, range]) {
     all,
     show({ goal, range: ranges }, canMove) {
       const limits = Array.isArray(range) ? range : ranges?.[range];
-      for (const entry of [slider, number]) {
+      for (const [entry, at] of [[slider, onSlider], [number, (value) => value]]) {
         put(entry, "disabled", !canMove);
         if (!limits) continue;
-        put(entry, "min", (limits[0] * factor).toFixed(digits));
-        put(entry, "max", (limits[1] * factor).toFixed(digits));
+        put(entry, "min", at(limits[0] * factor).toFixed(digits));
+        put(entry, "max", at(limits[1] * factor).toFixed(digits));
+      }
+      if (limits && air !== 1) {
+        const contact = slider.min / (slider.min - slider.max);
+        slider.style.setProperty("--contact", contact);
       }
       if (!goal) return;
       const text = (goal[name] * factor).toFixed(digits).replace(/^-(0\.?0*)$/, "$1");
-      if (!isHeld) slider.value = goal[name] * factor;
+      if (!isHeld) slider.value = onSlider(goal[name] * factor);
+      put(slider, "ariaValueText", `${text} ${unit}`);
       if (document.activeElement !== number && !isHeld) put(number, "value", text);
     },
   };

@@ -1,7 +1,8 @@
 /**
  * Moving the probe in the 3D scene: dragging over the skin puts it there, dragging the probe along
  * itself presses, across itself slides, with shift it tilts. With two fingers down presses and
- * turning rotates. The wheel presses over the probe, and with shift over the skin.
+ * turning rotates: a finger puts the probe only once it moves, or is up, without another one.
+ * The wheel presses over the probe, and with shift over the skin.
  */
 
 import { events } from "../events.js";
@@ -11,6 +12,8 @@ import { hand } from "./hand.js";
 
 /** CSS pixels after which a drag of the probe is either a press or a slide. */
 const DECIDED = 5;
+/** m a CSS pixel that two fingers press: however small the patient is drawn. */
+const FINGERS = 1e-4;
 /** m: how near to the face the body can be grabbed to tilt it. */
 const SHORTEST = 0.03;
 /** m a notch of the wheel. */
@@ -22,10 +25,13 @@ let drag = null;
 
 onPointer((event, hit) => {
   if (event.type === "wheel") return press(event, hit);
-  if (event.type === "pointerdown") return begin(event, hit);
+  if (event.type === "pointerdown" && !drag) return begin(event, hit);
   if (!drag) return false;
-  if (event.type === "pointermove") go(event, hit);
-  else if (event.type === "pointerup" || event.type === "pointercancel") end();
+  if (event.type === "pointerdown" || event.type === "pointermove") go(event, hit);
+  else if (event.type === "pointerup" || event.type === "pointercancel") {
+    if (event.type === "pointerup" && drag.mode === "touch") put(hit, event);
+    end();
+  }
   return true;
 });
 
@@ -41,12 +47,13 @@ function press(event, hit) {
 function begin(event, hit) {
   if (!hit || event.button !== 0 || event.altKey || event.ctrlKey || !hand.leads) return false;
   const isProbe = hit.object === "probe";
-  const mode = isProbe ? (event.shiftKey ? "tilt" : null) : "place";
+  const isFinger = event.pointerType === "touch";
+  const mode = isProbe ? (event.shiftKey ? "tilt" : null) : isFinger ? "touch" : "place";
   drag = { mode, travelled: [0, 0], lever: isProbe ? leverOf(hit.point) : 0 };
   fingers.clear();
   fingers.moved(event);
   stage.canvas.style.cursor = "grabbing";
-  if (drag.mode === "place") hand.ask({ to: { point: hit.point } }, event.timeStamp);
+  if (drag.mode === "place") put(hit, event);
   return true;
 }
 
@@ -54,14 +61,21 @@ function go(event, hit) {
   const { right, down, turn } = fingers.moved(event);
   if (fingers.count > 1) {
     drag.mode = "fingers";
-    hand.ask({ by: { press: down * metresPerPixel(), rotation: turn } }, event.timeStamp);
+    hand.ask({ by: { press: down * FINGERS, rotation: turn } }, event.timeStamp);
+  } else if (drag.mode === "touch") {
+    drag.travelled = [drag.travelled[0] + right, drag.travelled[1] + down];
+    if (Math.hypot(...drag.travelled) >= DECIDED) drag.mode = "place";
   } else if (drag.mode === "place") {
-    if (hit && hit.object !== "probe") hand.ask({ to: { point: hit.point } }, event.timeStamp);
+    put(hit, event);
   } else if (drag.mode === "tilt") {
     tilt(right, down, event);
   } else if (drag.mode !== "fingers") {
     carry(right, down, event);
   }
+}
+
+function put(hit, event) {
+  if (hit && hit.object !== "probe") hand.ask({ to: { point: hit.point } }, event.timeStamp);
 }
 
 /** Along the probe's own axes, as they are seen. */
@@ -134,16 +148,6 @@ function axesOnScreen() {
   const axis = (x, y, z) => seen(new THREE.Vector3(x, y, z));
   const axes = { x: axis(1, 0, 0), y: axis(0, 1, 0), z: axis(0, 0, 1) };
   return Math.hypot(...axes.z) < 100 ? { ...axes, z: [0, 1000] } : axes; // seen from above
-}
-
-/** m a CSS pixel at the probe. */
-function metresPerPixel() {
-  const pose = probePose();
-  const distance = pose
-    ? stage.camera.position.distanceTo(new THREE.Vector3(...pose.position))
-    : stage.camera.position.length();
-  const height = 2 * distance * Math.tan((stage.camera.fov * Math.PI) / 360);
-  return height / stage.canvas.clientHeight;
 }
 
 const TURNS = { x: "fan", y: "rock", z: "rotation" };

@@ -1,8 +1,11 @@
 /** Whether a key belongs to what has the focus rather than to the page. */
 
 const ENTRIES =
-  "input:not([type=checkbox], [type=radio]), textarea, select, [contenteditable], [role=slider], " +
+  "input:not([type=checkbox], [type=radio], [type=range]), textarea, select, [contenteditable], " +
   "[role=listbox], dialog, .q-dialog";
+const SLIDERS = "input[type=range], [role=slider]";
+/** Page up and down press and lift the probe also while one of its own sliders has the focus. */
+const PAGED = ":is(input[type=range], [role=slider]):not(.us-quantity *)";
 const PRESSED =
   "button, a, summary, input[type=checkbox], [role=button], [role=menuitem], [role=checkbox], " +
   "[role=switch], [role=tab]";
@@ -10,6 +13,7 @@ const PRESSED =
 const NEIGHBOURS = "[role=tab], [role=menuitem], [role=radio], input[type=radio]";
 const PRESSES = [" ", "Enter"];
 const STEPS = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"];
+const PAGES = ["PageUp", "PageDown"];
 
 /** Whether the person types, or moves or presses a control, so that the key is not for the page. */
 export function isTyping(event) {
@@ -17,7 +21,8 @@ export function isTyping(event) {
   const isOn = (kinds) => Boolean(event.target.closest?.(kinds));
   if (isOn(ENTRIES)) return true;
   if (PRESSES.includes(event.key)) return isOn(`${PRESSED}, ${NEIGHBOURS}`);
-  return STEPS.includes(event.key) && isOn(NEIGHBOURS);
+  if (PAGES.includes(event.key)) return isOn(PAGED);
+  return STEPS.includes(event.key) && isOn(`${NEIGHBOURS}, ${SLIDERS}`);
 }
 
 /**

@@ -95,8 +95,9 @@ function amountAt(event, { mode, origin, direction, side }) {
 }
 
 onPointer((event, hit) => {
-  if (event.type === "pointerdown") return begin(event, hit);
+  if (event.type === "pointerdown") return drag !== null || begin(event, hit);
   if (!drag) return false;
+  if (event.pointerId !== drag.pointerId) return true;
   if (event.type === "pointermove") {
     const now = amountAt(event, drag);
     if (now !== null) {
@@ -106,7 +107,7 @@ onPointer((event, hit) => {
       drag.amount += step;
       tell("move");
     }
-  } else if (event.type !== "wheel" && event.type !== "dblclick") {
+  } else {
     tell("end");
     drag.material.opacity = 0.85;
     drag = null;
@@ -122,7 +123,8 @@ function begin(event) {
   const { quaternion } = probe.frame;
   const direction = AXES[handle.axis].direction.clone().applyQuaternion(quaternion);
   const side = AXES[handle.axis === "x" ? "y" : "x"].direction.clone().applyQuaternion(quaternion);
-  drag = { ...handle, origin: probe.frame.position.clone(), direction, side, amount: 0 };
+  const { pointerId } = event;
+  drag = { ...handle, pointerId, origin: probe.frame.position.clone(), direction, side, amount: 0 };
   drag.last = amountAt(event, drag) ?? 0;
   drag.material.opacity = 1;
   tell("start");

@@ -49,8 +49,8 @@ export function pick(event, { onBody = false } = {}) {
 
 /**
  * Have `handler(event, hit) -> boolean` asked first, before the camera; what it takes by true is
- * its own until the pointer, and any other finger that came down since, is up. Those that came
- * first are asked first.
+ * its own until the pointer is up, and any other finger that came down since: it is given that
+ * one's events, too. Those that came first are asked first.
  */
 export function onPointer(handler) {
   handlers.push(handler);
@@ -64,7 +64,8 @@ stage.canvas.addEventListener(
   "pointerdown",
   (event) => {
     stage.canvas.focus({ preventScroll: true });
-    taker ??= offer(event, pick(event)) ?? null;
+    if (taker) taker(event, null);
+    else taker = offer(event, pick(event)) ?? null;
     if (!taker) return;
     event.stopImmediatePropagation();
     fingers.add(event.pointerId);

@@ -1,4 +1,4 @@
-/** The floating tools of the scene: what is shown, how transparent, and from where. */
+/** The bar above the scene, and its layers: what is shown, how transparent, and from where. */
 
 import { events } from "../events.js";
 import { cut } from "./cut.js";
@@ -89,11 +89,7 @@ const panel = make(
   make("div", { className: "us-choice", role: "group" }, ...tissueButtons),
 );
 
-const layers = button("Layers", "What is shown, and how transparent", () => {
-  panel.hidden = !panel.hidden;
-  layers.setAttribute("aria-expanded", String(!panel.hidden));
-  layers.classList.toggle("us-on", !panel.hidden);
-});
+const layers = button("Layers", "What is shown, and how transparent", () => open(panel.hidden));
 layers.setAttribute("aria-expanded", "false");
 layers.setAttribute("aria-controls", "us-layers");
 const under = button("Look under the skin", "Fade the skin, to see the structures below it", () =>
@@ -115,10 +111,30 @@ const views = VIEWS.map(([name, text, title]) =>
 );
 views.push(button("Fit", "Everything, from here (key 6)", () => view("fit"), { dataset: { view: "fit" } }));
 
-stage.place.append(
-  make("div", { className: "us-tools us-tools-layers" }, layers, under, cutting, panel),
-  make("div", { className: "us-tools us-tools-views", role: "group" }, ...views),
+const bar = make(
+  "div",
+  { className: "us-tools" },
+  layers,
+  under,
+  cutting,
+  make("div", { className: "us-tools-views", role: "group", ariaLabel: "Views" }, ...views),
 );
+bar.setAttribute("role", "toolbar");
+bar.setAttribute("aria-label", "3D view");
+stage.place.before(bar);
+stage.place.prepend(panel);
+
+function open(on) {
+  panel.hidden = !on;
+  layers.setAttribute("aria-expanded", String(on));
+  layers.classList.toggle("us-on", on);
+}
+
+addEventListener("keydown", (event) => {
+  if (event.key !== "Escape" || panel.hidden || event.target.closest?.("dialog, .q-dialog")) return;
+  if (panel.contains(document.activeElement)) layers.focus();
+  open(false);
+});
 
 let chosen = SKIN;
 

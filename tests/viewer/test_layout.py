@@ -1,0 +1,266 @@
+"""The page in windows of all sizes, for fingers, and for those who use no mouse."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from awaiting import until
+from chromium import watched
+from fake_hand import FACE, FakeHand, show_patient
+
+from us_sim.viewer.parameter_board import ParameterBoard
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.session import LoadableScene, SessionState
+from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.status import Level, NodeStatus
+
+PHONE, TURNED = (390, 844), (844, 390)
+TWICE, FOUR_TIMES = (640, 360), (320, 180)  # what a window of 1280 × 720 holds when magnified
+TABS = ("Image", "Tissue", "Cases", "Session", "Status")
+NODE = "slice_interpolator"
+PARAMETERS = (
+    Parameter(NODE, "depth", Kind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),
+    Parameter(NODE, "focus", Kind.NUMBER, 0.0, limits=(0.0, 0.4), may_be_nothing=True),
+    Parameter(NODE, "time_gain", Kind.NUMBERS, (0.0,), unit="dB"),
+    Parameter(NODE, "overlay", Kind.TEXT, "none", choices=("none", "strain")),
+    Parameter(NODE, "contact", Kind.TRUTH, False),
+)
+
+Open = Callable[..., Any]
+
+
+@pytest.fixture
+def hand(simulator: Simulator) -> FakeHand:
+    """A simulator that has something to show in every part of the page."""
+    hand = FakeHand(simulator)
+    show_patient(simulator)
+    simulator.nodes = ParameterBoard()
+    known = {parameter.name: parameter for parameter in PARAMETERS}
+    simulator.nodes.tell(NodeParameters(NODE, State.THERE, known))
+    simulator.session.tell_state(SessionState(True, "running", "upper_arm", "/arm.yaml"))
+    simulator.session.tell_scenes(
+        (
+            LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+            LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
+        )
+    )
+    now = time.monotonic()
+    simulator.status.tell(NodeStatus(NODE, Level.WELL, "runs"), now)
+    simulator.status.tell(NodeStatus("probe_tracker", Level.ERROR, "the probe is lost"), now)
+    return hand
+
+
+@pytest.fixture
+def opened(browser: Any, served: Any, hand: FakeHand) -> Iterator[Open]:  # noqa: ARG001
+    """Opens the page in a window of a size, with ``touch`` of a telephone, and awaits the image."""
+    wrong: list[str] = []
+    contexts = []
+
+    def open_page(size: tuple[int, int], touch: bool = False) -> Any:
+        width, height = size
+        viewport = {"width": width, "height": height}
+        contexts.append(browser.new_context(viewport=viewport, has_touch=touch, is_mobile=touch))
+        page = contexts[-1].new_page()
+        watched(page, served[0].address, wrong)
+        page.goto(served[0].address)
+        page.wait_for_function("document.querySelector('.us-image')?.width === 320")
+        page.wait_for_function("document.querySelector('.us-quantity input')?.disabled === false")
+        page.wait_for_selector(".us-tools-views")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not wrong
+
+
+def chosen(page: Any, tab: str) -> None:
+    """Choose a tab, and wait until it has slid in."""
+    page.get_by_role("tab", name=tab).click()
+    page.get_by_role("tab", name=tab, selected=True).wait_for()
+    page.wait_for_function(
+        "!document.querySelector('.us-panels').getAnimations({ subtree: true }).length"
+    )
+
+
+PARTS = """() => ["#scene", "#ultrasound"].map((name) => {
+    const part = document.querySelector(name);
+    part.scrollIntoView();
+    const { left, top, right, bottom } = part.getBoundingClientRect();
+    const seen = [];
+    for (let x = 0.5; x < 10; x++) for (let y = 0.5; y < 10; y++) {
+        const at = [left + (x / 10) * (right - left), top + (y / 10) * (bottom - top)];
+        const found = document.elementFromPoint(...at);
+        if (found) seen.push(found.matches(`${name} canvas, ${name}`));
+    }
+    return [bottom - top, seen.filter(Boolean).length / seen.length];
+})"""
+"""Height of each part, CSS pixels, and how much of it, in the window, nothing lies over."""
+UNREACHED = """() => [...document.querySelectorAll("header button, .us-main :is(button, input)")]
+    .filter((control) => {
+        if (!control.checkVisibility() || control.closest(".us-layers, .q-field")) return false;
+        control.scrollIntoView({ block: "nearest", inline: "nearest" });
+        const { left, top, width, height } = control.getBoundingClientRect();
+        const found = document.elementFromPoint(left + width / 2, top + height / 2);
+        return !control.contains(found) && !found?.contains(control);
+    }).map((control) => control.ariaLabel || control.textContent)"""
+"""Names of controls that no scrolling brings in front."""
+
+
+@pytest.mark.parametrize(
+    ("size", "touch"),
+    [(PHONE, True), (TURNED, True), (TWICE, False), (FOUR_TIMES, False), ((2560, 1440), False)],
+)
+def test_no_part_is_buried_and_every_control_can_be_reached(
+    opened: Open, size: tuple[int, int], touch: bool
+) -> None:
+    page = opened(size, touch)
+    for height, seen in page.evaluate(PARTS):
+        assert height >= 180
+        assert seen > 0.75
+    assert page.evaluate(UNREACHED) == []
+    assert page.evaluate("document.documentElement.scrollWidth") == size[0]
+    page.locator("#us-panels").click()
+    for tab in TABS:
+        chosen(page, tab)
+        assert page.evaluate(UNREACHED) == []
+    page.locator("#us-panels").click()
+    page.locator("#scene").wait_for()
+
+
+@pytest.mark.parametrize("size", [(2560, 1440), (1280, 720), PHONE])
+def test_sliders_are_as_long_as_the_window_allows(opened: Open, size: tuple[int, int]) -> None:
+    widths = (
+        opened(size)
+        .locator(".us-quantity input[type=range]")
+        .evaluate_all("sliders => sliders.map(slider => slider.clientWidth)")
+    )
+    assert min(widths) > min(160, 0.35 * size[0])
+
+
+@pytest.mark.parametrize("size", [PHONE, TURNED])
+def test_fingers_find_room_on_every_control(opened: Open, size: tuple[int, int]) -> None:
+    page = opened(size, touch=True)
+    page.get_by_role("button", name="Layers").tap()
+    small = """() => [...document.querySelectorAll(
+            "button, input:not([type=checkbox]):not(.q-field *), .us-row label, .q-field--dense," +
+            " [role=tab], [role=switch], .q-slider__track-container, .q-item")]
+        .filter((control) => control.checkVisibility())
+        .map((control) => [control, control.getBoundingClientRect()])
+        .filter(([, { width, height }]) => Math.min(width, height) < 40)
+        .map(([control]) => control.ariaLabel || control.textContent)"""
+    assert page.evaluate(small) == []
+    page.locator("#us-panels").tap()
+    for tab in TABS:
+        chosen(page, tab)
+        assert page.evaluate(small) == []
+
+
+def test_a_tap_leaves_nothing_over_the_page(browser: Any, served: Any, hand: FakeHand) -> None:
+    with browser.new_context(has_touch=True) as context:  # a computer with a touch screen
+        page = context.new_page()
+        page.goto(served[0].address)
+        page.locator("#us-panels").tap()
+        chosen(page, "Tissue")
+        page.get_by_role("button", name="Strain").tap()
+        page.wait_for_timeout(1000)  # longer than a tooltip waits
+        for tab in page.get_by_role("tab").all():
+            box = tab.bounding_box()
+            at = f"{box['x'] + box['width'] / 2}, {box['y'] + box['height'] / 2}"
+            assert page.evaluate(f"!!document.elementFromPoint({at}).closest('[role=tab]')")
+        assert hand.asked == []
+        assert page.locator("[role=tooltip], .q-tooltip").count() == 0
+
+
+@pytest.mark.parametrize(
+    ("size", "touch"), [(PHONE, True), (TURNED, True), (TWICE, False), ((1280, 720), False)]
+)
+def test_axe_finds_no_violation(opened: Open, size: tuple[int, int], touch: bool) -> None:
+    reason = "axe-playwright-python is not installed"
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason=reason).Axe()
+    page = opened(size, touch)
+
+    def check(what: str) -> None:
+        found = axe.run(page).response["violations"]
+        assert not [(what, each["id"], each["nodes"][0]["html"]) for each in found]
+
+    check("page")
+    page.get_by_role("button", name="Freeze").click()
+    page.get_by_role("button", name="Layers").click()
+    check("layers of a frozen image")
+    page.keyboard.press("Escape")
+    page.keyboard.press("?")
+    page.locator(".us-help").wait_for()
+    check("help")
+    page.keyboard.press("Escape")
+    page.locator("#us-panels").click()
+    for tab in TABS:
+        chosen(page, tab)
+        check(tab)
+    page.get_by_role("button", name="probe_tracker").click()
+    page.get_by_role("dialog", name="Parameters of probe_tracker").wait_for()
+    page.wait_for_function(
+        "document.querySelector('.q-dialog__inner').getAnimations().length === 0"
+    )
+    check("dialog of a node")
+
+
+def test_escape_closes_the_layers(opened: Open) -> None:
+    page = opened((1280, 720))
+    layers = page.get_by_role("button", name="Layers")
+    layers.focus()
+    page.keyboard.press("Enter")
+    page.get_by_label("Skin", exact=True).focus()
+    page.keyboard.press("Escape")
+    page.locator(".us-layers").wait_for(state="hidden")
+    assert layers.get_attribute("aria-expanded") == "false"
+    assert layers.evaluate("button => button === document.activeElement")
+
+
+def fingers(page: Any) -> Callable[..., None]:
+    """Real fingers: ``touch("touchStart", (x, y), (x, y))``."""
+    session = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    return touch
+
+
+def on_skin(page: Any) -> tuple[float, float]:
+    """CSS pixels of a place on the skin beside the probe."""
+    scene = "import('/us_sim/assets/scene/scene.js')"
+    place = [FACE[0] + 0.04, FACE[1] + 0.04, 0.0]
+    until(lambda: page.evaluate(f"{scene}.then(m => m.probePose() !== null)"), "there is a probe")
+    page.wait_for_timeout(1000)  # the view turns to it
+    page.locator("#scene").scroll_into_view_if_needed()
+    x, y = page.evaluate(
+        f"""{scene}.then(({{ stage }}) => {{
+            const at = stage.project(new stage.THREE.Vector3(...{place}));
+            const box = stage.canvas.getBoundingClientRect();
+            return [box.left + at.x, box.top + at.y];
+        }})"""
+    )
+    return x, y
+
+
+@pytest.mark.parametrize("size", [PHONE, TURNED])
+def test_two_fingers_on_the_skin_press_gently_and_put_the_probe_nowhere(
+    opened: Open, hand: FakeHand, size: tuple[int, int]
+) -> None:
+    page = opened(size, touch=True)
+    x, y = on_skin(page)
+    touch = fingers(page)
+    touch("touchStart", (x, y))
+    touch("touchStart", (x, y), (x + 20, y))
+    for step in range(1, 21):
+        touch("touchMove", (x, y + step), (x + 20, y + step))
+    touch("touchEnd")
+    hand.until(lambda: hand.total("press") == pytest.approx(2e-3, rel=0.1))
+    assert all("point" not in wish["to"] for wish in hand.asked)
+    hand.asked.clear()
+    touch("touchStart", (x, y))
+    touch("touchEnd")
+    hand.until(lambda: hand.asked and "point" in hand.asked[-1]["to"])
