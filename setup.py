@@ -82,6 +82,7 @@ setup(
         "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],
         "test": [
+            "axe-playwright-python>=0.1.4",
             "fast-simplification>=0.1.7",
             "hypothesis>=6.100",
             "meshio>=5.3",

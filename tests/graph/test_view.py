@@ -274,6 +274,7 @@ def test_it_fits_a_tablet_in_both_directions(person: Person) -> None:
         for name in (".us-image", "#scene canvas", "#hand", "#image-tools"):
 
             def fits(name: str = name, width: int = width, height: int = height) -> bool:
+                page.locator(name).first.scroll_into_view_if_needed()
                 box = page.locator(name).first.bounding_box()
                 right, bottom = box["x"] + box["width"], box["y"] + box["height"]
                 return bool(
