@@ -74,7 +74,13 @@ setup(
     ],
     extras_require={
         "conforming": ["fast-simplification>=0.1.7", "pytetwild>=0.4,<0.5"],
-        "dicom": ["pydicom>=3.0", "pillow>=10", "python-gdcm>=3.0.20"],
+        "dicom": [
+            "pillow>=10",
+            "pydicom>=3.0",
+            "pylibjpeg>=2.0",
+            "pylibjpeg-openjpeg>=2.2",
+            "python-gdcm>=3.0.20",
+        ],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
         "rerun": ["rerun-sdk>=0.41"],
@@ -92,6 +98,8 @@ setup(
             "playwright>=1.45",
             "pydicom>=3.0",
             "pyigtl>=0.3.1",
+            "pylibjpeg>=2.0",
+            "pylibjpeg-openjpeg>=2.2",
             "pytest>=7.4",
             "pytest-timeout>=2.2",
             "pytest-xdist>=3.6",

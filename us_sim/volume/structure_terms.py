@@ -13,35 +13,69 @@ names made of known words are kept; those that a person writes here are checked 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from functools import cache
 
-__all__ = ["is_anatomical", "problem_with", "readable"]
+__all__ = ["coded_name", "is_anatomical", "problem_with", "readable"]
 
 _TEXT = """
-    abdominal abscess achilles adipose adrenal aneurysm anterior aorta aortic appendix arch arm
-    arteria arteries artery articular ascending atrium atrial axilla axillary background basilic
-    biceps bicipital bifurcation bile bladder blood body bone bones bowel brachial brachialis
-    brachiocephalic brain branch branches breast bronchus bursa calcaneus calf capillary capsule
-    cardiac carotid carpal cartilage cava caval cavity celiac cephalic cerebral cervical chest
-    clavicle coeliac collateral colon common coronary cortex cortical cruciate cyst deep deltoid
-    descending diaphragm digital disc distal dorsal duct ductus duodenum elbow epidermis external
-    fascia fascicle fat fatty femoral femur fetal fetus fibula finger flexor fluid foot forearm
-    foramen forehead gall gallbladder gastric gland great groin hand head heart hepatic hilum hip
-    humerus iliac inferior inguinal inner intercostal intermediate internal intestine invisible
-    jugular kidney kidneys knee lateral lesion leg ligament ligaments ligamentum liver lobe lobule
-    lower lumbar lumen lung lungs lymph main mass medial median medulla meniscus mesenteric middle
-    minor major mitral muscle muscles myocardium nail neck nerve nerves nodule node nodes of oblique
-    other outer ovary pancreas parenchyma patella patellar pelvis pericardium peripheral peritoneum
-    placenta plantar plaque pleura plexus popliteal portal posterior prostate proximal pulmonary
-    quadriceps radial radius rectum renal retina rib ribs right root round sacrum saphenous scapula
-    sciatic segment septum sheath shadow shoulder sinus skin skull small soft spinal spine spleen
-    splenic sternum stomach structure subclavian subcutaneous subscapularis superficial superior
-    supraspinatus tarsal temporal tendon tendons testis thigh thorax thrombus thyroid tibia tibial
-    tissue toe tongue tooth trachea transverse triceps trigeminal trunk tumor tumour ulna ulnar
-    umbilical upper ureter urethra urinary uterus vagus valve varix vas vein veins vena venous
-    ventral ventricle vertebra vertebrae vessel vessels wall wrist left artefact air gas water and
+    abdominal abdominis abscess achilles acromioclavicular acromion adductor adenohypophysis adipose
+    adrenal air amniotic amygdaloid and aneurysm annulus anterior anus aorta aortic aponeurosis
+    appendage appendix aqueduct arachnoid arch arcuate arm artefact arteria arterial arteries artery
+    articular ascending atrial atrium autochthon autonomic axilla axillary azygos background basilic
+    basilica biceps bicipital bifurcation bile biliary bladder bleeding blood body bone bones bowel
+    brachial brachialis brachiocephalic brachioradialis brain branch branches breast bronchi
+    bronchus bulb bundle bursa calcaneus calcification calcified calf callosum canal capillary
+    capitate capsule carcinoma cardiac carotid carpal carpi cartilage cartilages catheter caudate
+    cava caval cavity celiac central cephalic cephalica cerebellar cerebral cervical cervix chest
+    chiasm cingulum circulatory circumflex clavicle clavicula clot coccyx coeliac collateral colon
+    column commissural commissure common complex condyle connective coracoid cord coronary corpus
+    cortex cortical corticospinal costal cranial cruciate csf cuboid cuneiform cyst deep deferent
+    deltoid descending diaphragm diencephalon digastric digital digitorum disc dissection distal
+    dorsal dorsalis dorsi duct ductus duodenum dura ear edema elbow embolism endocrine endometrium
+    epicondyle epidermis epididymis epidural erector esophagus ethmoid extensor external eyeball
+    facet fallopian fascia fascicle fasciculus fat fatty feces femoral femoralis femoris femur fetal
+    fetus fibers fibroid fibrosus fibula finger flavum flexor fluid follicle foot foramen forearm
+    forehead foreign fornix fourth frontal gall gallbladder ganglion gas gastric gastrocnemius
+    gastroduodenal gland glands glenoid gluteus gonadal gracilis graft great groin haematoma hamate
+    hand head heart hematoma hepatic hepatica hilum hip humerus hyoid iliac iliopsoas ilium implant
+    inferior infraspinatus inguinal inner insular intercostal intermediate internal interosseous
+    intervertebral intestine invisible ischium jugular jugularis kidney kidneys knee labrum lacrimal
+    lamina larynx lateral lateralis latissimus left leg lemniscus lesion lienal ligament ligaments
+    ligamentum limb limbic lips liver lobe lobule longitudinal lower lumbar lumborum lumen lunate
+    lung lungs lymph lymphatic main major malleolus mandible margin mass masseter mater maxilla
+    maximus matter medial medialis median mediastinum medius medulla meninges meniscus mesenteric
+    metacarpal metastasis metatarsal midbrain middle minimus minor mitral multifidus muscle muscles
+    myocardium myoma myometrium nail navicular neck necrosis needle nerve nerves nervous
+    neurohypophysis neuroma nigra node nodes nodule nose nucleus object oblique obliquus occipital
+    oesophagus of olecranon omentum optic organ other outer ovary palate palatine pallidum pancreas
+    parathyroid paravertebral parenchyma parietal patella patellar patellaris pectoralis peduncle
+    pelvis penis perforator perforators pericardial pericardium peripheral peritendon peritoneum
+    peroneus phalanges phalanx pharynx pia pineal pisiform pituitary placenta placental plantar
+    plantaris plaque pleura plexus pollicis polyp poplitea popliteal portal posterior process
+    projection pronator prostate prostatic proximal psoas pterygoid pubis pulmonary pulposus putamen
+    quadratus quadriceps radial radialis radiation radius rectum rectus region renal retina
+    retinaculum retroperitoneal rib ribs right root round sac sacrum salivary saphena saphenous
+    sartorius scalene scalenus scaphoid scapula sciatic scrotum segment semimembranosus seminal
+    semitendinosus septum seroma serratus shadow sheath shoulder sinus skeleton skin skull small
+    soft soleus space sphenoid spinae spinal spine spinous spleen splenic splenica stenosis stent
+    sternocleidomastoid sternum stomach striatum structure subarachnoid subclavia subclavian
+    subcutaneous subdeltoid subscapularis substantia superficial superior supinator supraspinatus
+    sympathetic synovial synovium system systemic talus target tarsal teeth telencephalon temporal
+    tendon tendons teres testicle testis thalamus thenar thigh third thoracic thorax thrombus thymus
+    thyroid tibia tibial tibialis tissue toe tongue tooth trachea tract transition transverse
+    transversus trapezium trapezius trapezoid tree triceps tricuspid trigeminal triquetrum
+    trochanter trunk tube tumor tumour tunnel ulna ulnar ulnaris umbilical uncinate unknown upper
+    ureter urethra urinary urine uterus vagus valve varix vas vastus vein veins vena venous ventral
+    ventricle ventricular vertebra vertebrae vertebral vesicle vessel vessels vomer wall waste water
+    wrist yolk zone zygomatic
 """
 _WORDS = frozenset(_TEXT.split())
-"""English and Latin words of anatomy as ultrasound shows it, their directions and sides."""
+"""English and Latin words of anatomy, of its directions and sides, and of what is found or put in
+a body: those of 3D Slicer's and TotalSegmentator's names, and of muscles, bones and vessels of the
+limbs. Words that are many people's names stand in `_PHRASES` with what goes with them."""
+
+_PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
 _NUMERAL = re.compile(r"\d{1,2}|[ivx]{1,4}[ab]?|[a-d]|[lctsr]\d{1,2}")
 _LONGEST = 60
@@ -49,9 +83,31 @@ _LONGEST = 60
 
 def is_anatomical(name: str) -> bool:
     """Whether a name is made of words of anatomy, sides and numbers up to two digits alone."""
-    words = readable(name).lower().split()
+    words = _PHRASES.sub("", readable(name).lower()).split()
     known = [word in _WORDS or _NUMERAL.fullmatch(word) is not None for word in words]
     return 0 < len(words) <= 8 and all(known) and any(word in _WORDS for word in words)
+
+
+def coded_name(codes: Sequence[str]) -> str:
+    """What SNOMED codes of a type and its modifier mean in DICOM; empty where nothing is known.
+
+    The words are those of pydicom's dictionary of the standard, never a file's own.
+    """
+    meanings = [_meanings().get(code, "") for code in codes[:2]]
+    kind, modifier = (*meanings, "", "")[:2]
+    return readable(f"{modifier} {kind}").lower() if kind else ""
+
+
+@cache
+def _meanings() -> Mapping[str, str]:
+    try:
+        from pydicom.sr.codedict import codes
+    except ImportError:
+        return {}
+    terms = (getattr(codes.SCT, name) for name in codes.SCT.dir())
+    # "Structure of right kidney (body structure)" is a right kidney.
+    without = re.compile(r"\(.*|\bstructures?( of( the)?)?\b|[^\w ]+", re.IGNORECASE)
+    return {term.value: readable(without.sub(" ", term.meaning)) for term in terms}
 
 
 def readable(name: str) -> str:

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import VolumeError
+from us_sim.volume.cases.settings import RESERVED
 from us_sim.volume.files.label_grid import on_grid
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import open_image
@@ -94,7 +95,7 @@ def test_segments_in_layers_that_overlap_are_the_last_ones_and_that_is_said(tmp_
     assert read.names == {1: "artery", 2: "bone", 3: "vessel wall"}
     assert read.voxels == {"artery": 32, "vessel wall": 64, "bone": 1}
     assert read.colours[1] == (1.0, 0.0, 0.0)
-    assert "artery and vessel wall overlap in 32 voxels, which are vessel wall now" in read.remarks
+    assert "artery and vessel wall overlap in 32 voxels, now of vessel wall" in read.remarks
 
 
 def test_segments_of_old_slicer_have_a_layer_each_and_the_value_1(tmp_path):
@@ -254,7 +255,19 @@ def test_labels_of_another_place_and_broken_tables_are_refused(tmp_path):
 def test_names_are_told_apart():
     for name in ("Artery", "left_kidney", "liver segment IVb", "rib 11", "L5 vertebra"):
         assert is_anatomical(name), name
-    for name in ("Hans", "vein 1234", "liver of Jane", "", "12", "19610312", "vein/../x"):
+    for name in ("cervical_vertebral_column", "gray_matter_of_brain", "gluteus_maximus_left"):
+        assert is_anatomical(name), name
+    for name in (
+        "Gray White",
+        "white",
+        "Hans",
+        "vein 1234",
+        "liver of Jane",
+        "",
+        "12",
+        "19610312",
+        "vein/../x",
+    ):
         assert not is_anatomical(name), name
     for name in ("lesion B", "gall bladder-2", "Läsion"):
         assert problem_with(name) is None, name
@@ -275,4 +288,27 @@ def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_data):
     like = open_image(folder / "Segmentation.seg.nrrd")
     volume = Volume(np.zeros(like.shape, np.uint8), like.placement())
     read = read_labels(folder / "SegmentationOverlapping.seg.nrrd", volume)
-    assert {"ribs", "right lung"} <= set(read.names.values())
+    columns = {f"{part} vertebral column" for part in ("cervical", "thoracic", "lumbar")}
+    assert {"ribs", "right lung", *columns} <= set(read.names.values())
+
+
+def test_names_come_of_snomed_codes_where_a_files_own_cannot_be_kept(tmp_path):
+    entry = (
+        "Segmentation.Status:inprogress|TerminologyEntry:Own list of Jane~SCT^123037004^Doe~SCT^"
+    )
+    kidney = {"Tags": f"{entry}64033007^Doe~SCT^7771000^Jane~Anatomic codes~^^~^^|"}
+    unknown = {"Tags": f"{entry}99999^Doe~^^~x~^^~^^|"}
+    fields = segments(("Doe", 1, 0, kidney), ("Niere", 2, 0, unknown), ("liver", 3, 0, kidney))
+    array = sum(block((n, n + 1), (0, 2), (0, 2), value=n) for n in (1, 2, 3))
+    read = read_labels(written(tmp_path / "a.seg.nrrd", array, fields), VOLUME)
+    assert read.names == {1: "left kidney", 2: "structure 2", 3: "liver"}
+
+
+def test_a_name_that_means_something_else_in_a_case_gets_a_number(tmp_path):
+    fields = segments(("tissue", 1, 0), ("vein", 2, 0))
+    array = block((0, 2), (0, 2), (0, 2)) + block((3, 5), (3, 5), (3, 5), value=2)
+    path = written(tmp_path / "a.seg.nrrd", array, fields)
+    read = read_labels(path, VOLUME, taken=RESERVED)
+    assert read.names == {1: "tissue 2", 2: "vein"}
+    assert any("tissue 2" in remark for remark in read.remarks)
+    assert read_labels(path, VOLUME, taken=RESERVED, names={1: "tissue"}).names[1] == "tissue"

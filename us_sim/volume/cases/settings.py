@@ -25,13 +25,15 @@ from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
 from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
-__all__ = ["AROUND", "CaseSettings", "CaseStart", "CaseStructure", "check_name"]
+__all__ = ["AROUND", "RESERVED", "CaseSettings", "CaseStart", "CaseStructure", "check_name"]
 
 AROUND = "tissue"
 """Name of what is in no structure: label 0, or all of a volume without labels."""
 
 _LONGEST_NAME = 80
 _FACES = ("top", "bottom", "left", "right", "front", "back", "sides")
+RESERVED = (AROUND, *_FACES)
+"""Names that no structure has."""
 
 
 def check_name(name: str) -> str | None:
@@ -141,7 +143,7 @@ class CaseSettings(Settings):
         for name, structure in self.structures.items():
             if problem := check_name(name):
                 raise self.refused("structures", problem)
-            if name == AROUND or name in _FACES:
+            if name in RESERVED:
                 raise self.refused(
                     f"structures.{name}", "means something else already: choose another name"
                 )

@@ -32,7 +32,7 @@ from us_sim.volume.deidentification.rectangle import Rectangle
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.deidentification.source import Progress, Source
 from us_sim.volume.deidentification.text_detection import find_text
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.readers import ENDINGS
 
 __all__ = ["Import", "import_files", "look_at"]
@@ -132,6 +132,8 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
         return file_source(paths[0], settings.volume, spacing or None)
     strange = [*others, *(path for path in paths if path not in others and not is_dicom(path))]
     if strange:
+        if packed := packed_in(strange[0]):
+            raise VolumeError(f"{strange[0]}: is packed as {packed}; unpack it first")
         raise VolumeError(
             f"{strange[0]}: is no DICOM file; give the DICOM files of one series, or one MHA, NRRD "
             f"or NIfTI volume"

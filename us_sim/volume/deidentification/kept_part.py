@@ -16,6 +16,7 @@ Regions(kept=(), blanked=0, doubt='a region reaches to 595,414 in an image of 32
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ __all__ = ["Regions", "never_holds_text", "pixel_size", "ultrasound_regions"]
 _TWO_DIMENSIONAL = 1  # Region Spatial Format
 _ECHOES = (1, 2)  # Region Data Type: tissue, colour flow
 _CENTIMETRES = 3  # Physical Units
+_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
 _ENHANCED_US_VOLUME = "1.2.840.10008.5.1.4.1.1.6.2"
 
 
@@ -114,11 +116,20 @@ def pixel_size(file: DicomFile, regions: Regions) -> tuple[tuple[float, float], 
             found.add((abs(delta[0] or 0.0) * 10.0, abs(delta[1] or 0.0) * 10.0))
     if len(found) == 1:
         return found.pop(), True
-    for key in ("PixelSpacing", "NominalScannedPixelSpacing"):
-        stated = numbers(header, key, 2)  # between rows, then between columns (PS3.3, 10.7.1.3)
+    for source in (header, *(each for key in _GROUPS for each in _measures(header, key))):
+        # Between rows, then between columns (PS3.3, 10.7.1.3).
+        stated = numbers(source, "PixelSpacing", 2)
+        stated = stated or numbers(source, "NominalScannedPixelSpacing", 2)
         if stated and all(1e-4 <= each <= 100.0 for each in stated):
             return (stated[1], stated[0]), True
     ratio = numbers(header, "PixelAspectRatio", 2)  # vertical, then horizontal
     if ratio and min(ratio) > 0.0:
         return (1.0, ratio[0] / ratio[1]), False
     return (1.0, 1.0), False
+
+
+def _measures(header: Any, key: str) -> list[Any]:
+    """What the groups of values of an enhanced object say of its first image's pixels."""
+    return [
+        each for group in items(header, key)[:1] for each in items(group, "PixelMeasuresSequence")
+    ]

@@ -1,7 +1,8 @@
 """Labels from files of other programs, on the grid of the volume that they belong to.
 
-Any volume file will do, whose values are then labels; 3D Slicer's ``.seg.nrrd`` with the names and
-colours of its segments; and a table of labels beside either.
+Any MHA, NRRD or NIfTI file will do, whose values are then labels; 3D Slicer's ``.seg.nrrd`` and
+DICOM segmentations with the names and colours of their segments; and a table of labels beside
+either.
 
 >>> import pathlib, tempfile
 >>> import numpy as np
@@ -21,7 +22,7 @@ colours of its segments; and a table of labels beside either.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.anatomical_colours import Colour
+from us_sim.volume.files.dicom.header import is_dicom, open_dicom
 from us_sim.volume.files.label_grid import on_grid
 from us_sim.volume.files.label_table import read_label_table
-from us_sim.volume.files.readers import open_image
+from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.segments import Segment, check_representation, segments_of
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.label_map import LabelMap
-from us_sim.volume.structure_terms import is_anatomical, readable
+from us_sim.volume.structure_terms import coded_name, is_anatomical, readable
 from us_sim.volume.volume import Volume
 
 __all__ = ["read_labels"]
@@ -50,6 +52,7 @@ def read_labels(
     resample: bool = False,
     table: str | os.PathLike[str] | None = None,
     names: Mapping[int, str] | None = None,
+    taken: Collection[str] = (),
 ) -> LabelMap:
     """The labels in a file, on the grid of a volume.
 
@@ -58,28 +61,21 @@ def read_labels(
     overlap, a voxel is of the one that comes last, as when 3D Slicer exports a label map.
 
     Args:
-        path: MHA, NRRD, NIfTI, or a segmentation of 3D Slicer.
+        path: MHA, NRRD, NIfTI, a segmentation of 3D Slicer or of DICOM.
         like: the volume that they belong to.
         resample: take the nearest voxel where the file's grid is another than the volume's.
         table: names and colours, see `read_label_table`.
         names: by label, as a person gives them; they go before all others.
+        taken: names that mean something else; a structure of that name gets a number.
 
     Raises:
         VolumeError: a file cannot be read, its values are no labels, no voxel of it has one, or its
             grid is another one and ``resample`` is not given.
     """
     path = Path(path)
-    image = open_image(path, layers=True)
-    placement = image.placement()
     remarks: list[str] = []
     try:
-        check_representation(image.texts)
-        segments = segments_of(image.texts)
-        layers = _layers(image)
-        if segments:
-            labels, known = _from_segments(layers, segments, remarks)
-        else:
-            labels, known = _from_values(layers, remarks)
+        labels, known, placement = _read(path, remarks)
         labels, moved = on_grid(
             labels, placement, like.shape, like.index_to_patient, resample=resample
         )
@@ -95,12 +91,38 @@ def read_labels(
         remarks.append(f"{', '.join(gone)}: no voxel of the volume has it; it is left out")
     if not there:
         raise VolumeError(f"{path}: none of its voxels has a label: segment it first")
-    kept, said = _names({label: known[label][0] for label in sorted(there)}, names or {})
+    kept, said = _names({label: known[label][0] for label in sorted(there)}, names or {}, taken)
     colours = {label: colour for label, (_, colour) in known.items() if colour is not None}
     return LabelMap(labels, kept, colours, (*moved, *remarks, *said))
 
 
 _Known = dict[int, tuple[str, Colour | None]]
+
+
+def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, NDArray[np.float64]]:
+    """Labels (i, j, k) on the file's grid, their names and colours, and its placement."""
+    if not path.name.lower().endswith(ENDINGS) and path.is_file() and is_dicom(path):
+        from us_sim.volume.files.dicom.segmentation import read_segmentation
+
+        found = read_segmentation(open_dicom(path))
+        made = _from_segments(found.shape, found.segments, found.mask, remarks)
+        return *made, found.placement
+    image = open_image(path, layers=True)
+    placement = image.placement()
+    check_representation(image.texts)
+    layers, segments = _layers(image), segments_of(image.texts)
+    if not segments:
+        return *_from_values(layers, remarks), placement
+
+    def mask(segment: Segment) -> NDArray[np.bool_]:
+        if segment.layer >= len(layers):
+            raise VolumeError(
+                f"says that a segment is in layer {segment.layer} of {len(layers)}; save it again"
+            )
+        inside = layers[segment.layer] == segment.value
+        return inside if segment.extent is None else _within(inside, segment.extent)
+
+    return *_from_segments(image.shape, segments, mask, remarks), placement
 
 
 def _layers(image: StoredImage) -> NDArray[np.generic]:
@@ -121,29 +143,31 @@ def _layers(image: StoredImage) -> NDArray[np.generic]:
 
 
 def _from_segments(
-    layers: NDArray[np.generic], segments: list[Segment], remarks: list[str]
+    shape: tuple[int, ...],
+    segments: list[Segment],
+    mask: Callable[[Segment], NDArray[np.bool_]],
+    remarks: list[str],
 ) -> tuple[NDArray[np.uint8], _Known]:
-    """Labels (i, j, k), names and colours of segments in layers (layer, i, j, k)."""
+    """Labels (i, j, k), names and colours of segments, of which each has a mask (i, j, k)."""
+    if len(segments) > _MOST:
+        raise VolumeError(f"has {len(segments)} segments; {_MOST} are read at most")
     values = [segment.value for segment in segments]
-    keep = len(set(values)) == len(values) and max(values) <= _MOST
-    labels = np.zeros(layers.shape[1:], np.uint8)
+    keep = len(set(values)) == len(values) and min(values) > 0 and max(values) <= _MOST
+    labels = np.zeros(shape, np.uint8)
     known: _Known = {}
     for number, segment in enumerate(segments, start=1):
         label = segment.value if keep else number
-        known[label] = (segment.name, segment.colour)
-        if segment.layer >= len(layers):
-            raise VolumeError(
-                f"says that a segment is in layer {segment.layer} of {len(layers)}; save it again"
-            )
-        mask = layers[segment.layer] == segment.value
-        if segment.extent is not None:
-            mask = _within(mask, segment.extent)
-        for other in np.unique(labels[mask]):
+        name = segment.name if is_anatomical(segment.name) else coded_name(segment.codes)
+        known[label] = (name or segment.name, segment.colour)
+        inside = mask(segment)
+        for other in np.unique(labels[inside]):
             if other:
-                both = int(np.count_nonzero(labels[mask] == other))
-                one, two = _plain(known[int(other)][0], int(other)), _plain(segment.name, label)
-                remarks.append(f"{one} and {two} overlap in {both} voxels, which are {two} now")
-        labels[mask] = label
+                both = int(np.count_nonzero(labels[inside] == other))
+                one, two = _plain(known[int(other)][0], int(other)), _plain(known[label][0], label)
+                remarks.append(
+                    f"{one} and {two} overlap in {both} voxel{'s' * (both > 1)}, now of {two}"
+                )
+        labels[inside] = label
     return labels, known
 
 
@@ -195,21 +219,27 @@ def _plain(name: str, label: int) -> str:
     return readable(name).lower() if is_anatomical(name) else f"structure {label}"
 
 
-def _names(found: Mapping[int, str], given: Mapping[int, str]) -> tuple[dict[int, str], list[str]]:
+def _names(
+    found: Mapping[int, str], given: Mapping[int, str], reserved: Collection[str]
+) -> tuple[dict[int, str], list[str]]:
     """Names that are kept, each once, and what is said of the others."""
     names: dict[int, str] = {}
+    said: list[str] = []
     hidden = [n for n, name in found.items() if n not in given and not is_anatomical(name)]
     for label, name in found.items():
         wanted = given.get(label) or _plain(name, label)
         taken, number = set(names.values()) | set(given.values()) - {given.get(label)}, 2
+        taken |= set() if label in given else set(reserved)
         unique = wanted
         while unique in taken:
             unique, number = f"{wanted} {number}", number + 1
         names[label] = unique
-    if not hidden:
-        return names, []
-    numbers = ", ".join(map(str, hidden))
-    return names, [
-        f"the names of labels {numbers} are not kept, as they are no anatomical terms: give them "
-        f"with --names {hidden[0]}=NAME"
-    ]
+        if wanted in reserved and unique != wanted:
+            said.append(f"{wanted} means something else in a case, so it is called {unique}")
+    if hidden:
+        numbers = ", ".join(map(str, hidden))
+        said.append(
+            f"the names of labels {numbers} are not kept, as they are no anatomical terms: give "
+            f"them with --names {hidden[0]}=NAME"
+        )
+    return names, said

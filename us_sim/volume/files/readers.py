@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.axis_order import volume_of_slices
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.frame_sequence import sequence_remedy
 from us_sim.volume.files.grey_levels import GreyLevels
 from us_sim.volume.files.metaimage import metaimage_image
@@ -114,6 +114,8 @@ def open_image(
     if not os.path.isfile(path):
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
     if not path.name.lower().endswith(ENDINGS):
+        if packed := packed_in(path):
+            raise VolumeError(f"{path}: is packed as {packed}; unpack it first")
         raise VolumeError(
             f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which "
             f"3D Slicer makes of others"

@@ -6,7 +6,7 @@ of Slicer before 5 have a layer for each segment, in which it is 1
 
 >>> from us_sim.volume.files.segments import segments_of
 >>> segments_of({"Segment0_Name": "artery", "Segment0_Color": "1 0 0", "Segment0_LabelValue": "5"})
-[Segment(name='artery', value=5, layer=0, colour=(1.0, 0.0, 0.0), extent=None)]
+[Segment(name='artery', value=5, layer=0, colour=(1.0, 0.0, 0.0), extent=None, codes=())]
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from us_sim.volume.anatomical_colours import Colour
 __all__ = ["Segment", "check_representation", "segments_of"]
 
 _FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
-_MOST = 255
 
 
 @dataclass(frozen=True)
@@ -35,21 +34,19 @@ class Segment:
     layer: int
     colour: Colour | None  # red, green, blue, 0 to 1
     extent: tuple[int, ...] | None  # first and last index along i, j and k within which it is
+    codes: tuple[str, ...] = ()  # of SNOMED CT: what it is, and which one of several
 
 
 def segments_of(pairs: Mapping[str, str]) -> list[Segment]:
     """The segments that the keys and values of a header tell of, in their order; often none.
 
     Raises:
-        VolumeError: there are more than 255, or a value of one is none; the sentence does not say
-            of which file.
+        VolumeError: a value of one is none; the sentence does not say of which file.
     """
     found: dict[int, dict[str, str]] = {}
     for key, value in pairs.items():
         if match := _FIELD.fullmatch(key):
             found.setdefault(int(match[1]), {})[match[2]] = value
-    if len(found) > _MOST:
-        raise VolumeError(f"has {len(found)} segments; {_MOST} are read at most")
     shared = any("LabelValue" in fields for fields in found.values())
     return [_segment(number, at, found[number], shared) for at, number in enumerate(sorted(found))]
 
@@ -77,7 +74,15 @@ def _segment(number: int, at: int, fields: Mapping[str, str], shared: bool) -> S
         layer,
         _colour(fields.get("Color", "")),
         _extent(number, fields.get("Extent")),
+        _codes(fields.get("Tags", "")),
     )
+
+
+def _codes(tags: str) -> tuple[str, ...]:
+    """The codes of type and modifier in ``TerminologyEntry:context~category~type~modifier~…``."""
+    _, found, entry = tags.partition("TerminologyEntry:")
+    parts = [part.split("^") for part in entry.partition("|")[0].split("~")[2:4]] if found else []
+    return tuple(part[1] for part in parts if part[0] == "SCT" and len(part) > 1)
 
 
 def _whole(number: int, fields: Mapping[str, str], key: str, default: int, least: int) -> int:

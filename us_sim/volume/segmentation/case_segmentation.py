@@ -18,7 +18,7 @@ from us_sim.share import shared_roots
 from us_sim.volume.anatomical_colours import anatomical_colour
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, is_case, read_case
 from us_sim.volume.cases.provenance import Source, Step, add_step
-from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
 from us_sim.volume.cases.writing import changed_case, write_case_settings
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import read_volume
@@ -134,7 +134,12 @@ def _found(asked: SegmentRequest, volume: Volume, progress: Progress) -> _Found:
     if asked.labels is not None:
         names = asked.given_names()
         labels = read_labels(
-            asked.labels, volume, resample=asked.resample, table=asked.label_table, names=names
+            asked.labels,
+            volume,
+            resample=asked.resample,
+            table=asked.label_table,
+            names=names,
+            taken=RESERVED,
         )
         step = Step(
             "labels taken from a file",

@@ -7,6 +7,7 @@ import numpy as np
 import pydicom
 import pytest
 from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
+from pydicom.data import get_testdata_file
 from pydicom.pixels import apply_color_lut, pixel_array
 from pydicom.uid import ExplicitVRBigEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
 
@@ -14,8 +15,9 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files import stored_voxels
 from us_sim.volume.files.dicom import decoding
 from us_sim.volume.files.dicom.frame_times import frame_times
-from us_sim.volume.files.dicom.grey import GreyImages
+from us_sim.volume.files.dicom.grey import GreyImages, stored_frames
 from us_sim.volume.files.dicom.header import open_dicom
+from us_sim.volume.files.dicom.image_format import image_format
 
 CINE = np.random.default_rng(3).integers(0, 256, (4, 12, 10), dtype=np.uint8)
 
@@ -116,7 +118,7 @@ def test_times_of_images(tmp_path):
         ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "are read at most"),
         ({"NumberOfFrames": -1}, "holds -1 images"),
         ({"Rows": 0}, "10 × 0 pixels"),
-        ({"BitsAllocated": 1}, "of 1 bits"),
+        ({"BitsAllocated": 1}, "its header says 60"),
         ({"BitsStored": 77}, "77 of 8 bits"),
         ({"SamplesPerPixel": 4}, "4 numbers as"),
         ({"PhotometricInterpretation": "RGB"}, "1 numbers as 'RGB'"),
@@ -158,6 +160,30 @@ def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
     path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
     with pytest.raises(VolumeError, match="damaged, or not of the size and type"):
         images(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value"),
+    [  # as pydicom's own tests have them
+        ("JPEG-lossy", (420, 140), 244),
+        ("JPEG-lossy", (230, 120), 95),
+        ("HTJ2K_08_RGB", (160, 295), (91, 37, 2)),
+        ("HTJ2K_08_RGB", (275, 635), (207, 193, 171)),
+    ],
+)
+def test_jpeg_of_12_bits_and_htj2k_are_decoded(shared_data, name, at, value):
+    path = shared_data / "foreign-files" / f"{name}.dcm"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    file = open_dicom(path)
+    (stored,) = stored_frames(file, image_format(file), [0])
+    np.testing.assert_array_equal(stored[at], value)
+
+
+def test_jpeg_of_12_bits_that_comes_with_pydicom_is_decoded():
+    file = open_dicom(get_testdata_file("JPGExtended.dcm"))
+    (stored,) = stored_frames(file, image_format(file), [0])
+    assert (stored[420, 140], stored[230, 120]) == (244, 95)
 
 
 def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):

@@ -1,6 +1,8 @@
 """DICOM volumes: where their voxels are, by every way in which a header states it."""
 
+import bz2
 import dataclasses
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,14 @@ from pydicom.data import get_testdata_file
 from pydicom.uid import ImplicitVRLittleEndian
 
 from us_sim.errors import VolumeError
+from us_sim.volume.deidentification.importing import import_files
+from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.dicom.placed_images import placed_images
 from us_sim.volume.files.readers import read_placement, read_volume
 from us_sim.volume.files.writing import write_volume
+from us_sim.volume.sequences.sweep import read_sweep
+
+CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 
 VOXELS = np.random.default_rng(5).integers(0, 256, (7, 6, 5), dtype=np.uint8)
 PLACED = turned()
@@ -250,7 +257,7 @@ def test_directions_that_are_not_at_right_angles_are_refused(tmp_path):
 
 def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
     paths = single_files(tmp_path)
-    with pytest.raises(VolumeError, match="is one slice of a volume; give all files"):
+    with pytest.raises(VolumeError, match="is one slice of a volume"):
         read_volume(paths[0])
     made = pydicom.dcmread(paths[0])
     made.SeriesInstanceUID = pydicom.uid.generate_uid()
@@ -274,3 +281,54 @@ def test_a_scene_takes_a_dicom_volume(tmp_path):
 
     path = write(tmp_path / "a.dcm", enhanced(VOXELS, PLACED))
     assert dataclasses.asdict(VolumeSettings(file=str(path)))["file"] == str(path)
+
+
+def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
+    times = 5
+    made = enhanced(VOXELS[:, :, :1], turned(), times=times)
+    path = write(tmp_path / "a.dcm", made)
+    with pytest.raises(VolumeError, match=r"5 images at one place.*us-sim import a\.dcm"):
+        placed_images([path])
+    out = tmp_path / "a.igs.mha"
+    import_files([path], out, ImportSettings(keep_whole_image=True))
+    sweep = read_sweep(out, tracked=False)
+    np.testing.assert_allclose(sweep.times, 0.04 * np.arange(times))
+    assert sitk.ReadImage(str(out)).GetSpacing()[:2] == (0.5, 0.25)
+
+
+def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
+    placed = turned()
+    for k in range(VOXELS.shape[2]):
+        made = header(VOXELS[:, :, k].T[None].copy(), CT_IMAGE, SeriesInstanceUID="1.2.3")
+        made.FrameOfReferenceUID = "1.2.4"
+        made.ImagePositionPatient = (placed[:3, 3] + k * placed[:3, 2]).tolist()
+        along = placed[:3, :2] / np.linalg.norm(placed[:3, :2], axis=0)
+        made.ImageOrientationPatient = along.T.ravel().tolist()
+        made.PixelSpacing = np.linalg.norm(placed[:3, :2], axis=0)[::-1].tolist()
+        made.SpecificCharacterSet = "ISO_IR 100"
+        path = write(tmp_path / f"{9 - k}", made, ImplicitVRLittleEndian)
+        content = path.read_bytes()
+        path.write_bytes(content[content.index(b"\x08\0\5\0") :])  # the first element of its data
+    (tmp_path / "note.txt").write_text("hello")
+    volume = read_volume(tmp_path)
+    np.testing.assert_array_equal(volume.intensities, VOXELS)
+    np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, placed[:3, 3])
+
+
+@pytest.mark.parametrize(("name", "message"), [("MOVEKNEE.dcm", "19 images at one place")])
+def test_real_files_are_called_what_they_are(shared_data, name, message):
+    path = shared_data / "foreign-files" / name
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    with pytest.raises(VolumeError, match=message):
+        placed_images([path])
+
+
+@pytest.mark.parametrize(("pack", "word"), [(gzip.compress, "gzip"), (bz2.compress, "bzip2")])
+def test_a_packed_file_is_called_packed(tmp_path, pack, word):
+    path = write(tmp_path / "a.dcm", enhanced(VOXELS, turned()))
+    packed = tmp_path / "a.dcm.gz"
+    packed.write_bytes(pack(path.read_bytes()))
+    for read in (read_volume, lambda path: import_files([path], tmp_path / "o.nrrd")):
+        with pytest.raises(VolumeError, match=f"packed as {word}"):
+            read(packed)

@@ -30,7 +30,7 @@ from us_sim.volume.files.dicom.palette import WEIGHTS, grey_palette
 from us_sim.volume.files.dicom.values import items, number
 from us_sim.volume.files.grey_levels import GreyLevels
 
-__all__ = ["GreyImages"]
+__all__ = ["GreyImages", "stored_frames"]
 
 
 class GreyImages:
@@ -159,16 +159,34 @@ class GreyImages:
             yield from _read(self.files[n], self.form, frames)
 
 
+def stored_frames(
+    file: DicomFile, form: ImageFormat, frames: Sequence[int]
+) -> Iterator[NDArray[Any]]:
+    """Images of a file as they are stored, by their numbers.
+
+    Raises:
+        VolumeError: an image is damaged, or its decoder is missing.
+    """
+    if frames:
+        yield from (
+            _read(file, form, frames) if form.direct else decoded_frames([(file, frames)], form)
+        )
+
+
 def _read(file: DicomFile, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
     """Images that are stored as they are."""
     assert file.pixels is not None
     with file.open() as data:
         for frame in frames:
-            data.seek(file.pixels.start + frame * form.frame_bytes)
-            read = data.read(form.frame_bytes)
-            if len(read) != form.frame_bytes:
+            first, last = frame * form.native_bits, (frame + 1) * form.native_bits
+            data.seek(file.pixels.start + first // 8)
+            wanted = -(-last // 8) - first // 8
+            read = data.read(wanted)
+            if len(read) != wanted:
                 raise VolumeError(f"{file.path}: breaks off in its images; copy it again")
-            image = np.frombuffer(read, form.type)
+            image = np.frombuffer(read, np.uint8 if form.type == np.bool_ else form.type)
+            if form.type == np.bool_:  # first the lowest bit; images follow without a gap
+                image = np.unpackbits(image, bitorder="little")[first % 8 :][: form.frame_bytes]
             if form.samples == 1:
                 yield image.reshape(form.rows, form.columns)
             elif form.planar:
@@ -186,7 +204,7 @@ def _luma(image: NDArray[Any]) -> NDArray[Any]:
 
 def _masked(image: NDArray[Any], form: ImageFormat) -> NDArray[Any]:
     """Without the bits that do not count, such as overlays of older files."""
-    if form.type.kind == "f" or form.bits == 8 * form.type.itemsize or not form.direct:
+    if form.type.kind in "fb" or form.bits == 8 * form.type.itemsize or not form.direct:
         return image
     if form.type.kind == "u":
         return image & image.dtype.type((1 << form.bits) - 1)

@@ -24,7 +24,7 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.values import quiet, text, whole
 from us_sim.volume.files.stored_voxels import check_claim
 
-__all__ = ["EXTRA", "DicomFile", "PixelPlace", "dicom_files", "is_dicom", "open_dicom"]
+__all__ = ["EXTRA", "DicomFile", "PixelPlace", "dicom_files", "is_dicom", "open_dicom", "packed_in"]
 
 EXTRA = "pip install 'us_sim[dicom]'"
 
@@ -81,7 +81,22 @@ def is_dicom(path: Path) -> bool:
             start = file.read(132)
     except OSError:
         return False
-    return start[128:] == b"DICM" or path.suffix.lower() in _NAMES
+    named = path.suffix.lower() in _NAMES
+    return start[128:] == b"DICM" or _has_no_preamble(start) or named
+
+
+def _has_no_preamble(start: bytes) -> bool:
+    """Whether a file begins with an element of the groups that come first, as older ones do."""
+    if len(start) < 8 or start[:2] not in (b"\x02\0", b"\x08\0") or start[3]:
+        return False
+    return (start[4:6].isalpha() and start[4:6].isupper()) or start[5:8] == b"\0\0\0"
+
+
+def packed_in(path: Path) -> str:
+    """The archive or compression that a file is, as a word for a person; empty of others."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    return {b"\x1f\x8b": "gzip", b"PK": "zip", b"BZ": "bzip2"}.get(start[:2], "")
 
 
 def dicom_files(folder: Path) -> list[Path]:
@@ -153,8 +168,7 @@ class _Bounded(io.BufferedIOBase):
 def _opened(path: Path) -> DicomFile:
     with path.open("rb") as file:
         start = file.read(144)
-        old = start[:1] in (b"\x02", b"\x08") and start[1:2] == b"\0"  # without a preamble
-        if start[128:132] != b"DICM" and not old:
+        if start[128:132] != b"DICM" and not _has_no_preamble(start):
             raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
         file.seek(0)
         try:

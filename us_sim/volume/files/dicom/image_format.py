@@ -47,6 +47,11 @@ class ImageFormat:
         return self.rows * self.columns * self.samples * self.type.itemsize
 
     @property
+    def native_bits(self) -> int:
+        """Bits that an image which is not compressed has in the file, where masks are packed."""
+        return self.frame_bytes if self.type == np.bool_ else 8 * self.frame_bytes
+
+    @property
     def colour(self) -> bool:
         """Whether grey values have to be made of colours."""
         return self.samples == 3 or self.photometric == "PALETTE COLOR"
@@ -104,6 +109,8 @@ def _bits(file: DicomFile) -> tuple[int, np.dtype[np.generic]]:
         return bits, np.dtype(f"<f{bits // 8}")
     allocated = whole(file.header, "BitsAllocated")
     stored = whole(file.header, "BitsStored") or allocated
+    if allocated == 1:
+        return 1, np.dtype(np.bool_)
     if allocated not in (8, 16, 32) or not stored or not 1 <= stored <= allocated:
         raise VolumeError(
             f"{file.path}: its pixels have {stored} of {allocated} bits; save it with 8, 16 or 32"
@@ -128,7 +135,7 @@ def _check_bytes(file: DicomFile, form: ImageFormat) -> None:
                 f"{form.frames}; copy or export it again"
             )
         return
-    expected = form.frames * form.frame_bytes
+    expected = -(-form.frames * form.native_bits // 8)
     if form.photometric == "YBR_FULL_422":
         expected = form.frames * form.rows * math.ceil(form.columns / 2) * 4 * form.type.itemsize
     if file.pixels.length not in (expected, expected + expected % 2):

@@ -35,6 +35,9 @@ from us_sim.volume.files.dicom.vendors import (
 
 __all__ = ["PlacedImages", "is_flat", "opened_images", "placed_images"]
 
+SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
+"""Classes of files that hold labels: masks of segments, and label maps."""
+
 _TISSUE = "TISSUE_INTENSITY"
 _MOST_FILES = 1 << 14
 
@@ -79,6 +82,12 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     if len(paths) > _MOST_FILES:
         raise VolumeError(f"{len(paths)} files are more than the {_MOST_FILES} that are read")
     files = [one_image_after_another(open_dicom(path)) for path in paths]
+    for file in files:
+        if text(file.header, "SOPClassUID") in SEGMENTATIONS:
+            raise VolumeError(
+                f"{file.path}: is a segmentation, which has labels and no grey values; give it to "
+                f"`us-sim segment CASE --labels {file.path.name}`"
+            )
     # A maker's own volume may have a picture of no use beside it, or none at all.
     for file in files:
         if file.pixels is None and (remedy := hidden_volume(file)):
@@ -87,9 +96,9 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
 
 
 def is_flat(images: GreyImages) -> bool:
-    """Whether nothing says where the images lie in space, so that they are no volume."""
+    """Whether the images are no volume: nothing says where they lie, or all lie at one place."""
     planes, _ = _planes(images)
-    return planes is None or len(planes) < 2
+    return planes is None or len({plane.position for plane in planes}) < 2
 
 
 def placed_images(
@@ -108,7 +117,7 @@ def placed_images(
     images = paths if isinstance(paths, GreyImages) else opened_images(paths)
     _check_series(images.files)
     planes, times = _planes(images)
-    if planes is None or len(planes) < 2:
+    if planes is None or len({plane.position for plane in planes}) < 2:
         raise VolumeError(f"{images.files[0].path}: {_why_flat(images, planes)}")
     wanted = images.all
     kinds: list[str] = []
@@ -183,8 +192,16 @@ def _in_time(
 def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
     """What the files are in place of a volume, and what to do."""
     count = len(images.all)
+    as_images = f"`us-sim import {images.files[0].path.name} --out images.igs.mha`"
+    if planes and count == 1:
+        return (
+            "is one slice of a volume; put the files of its series into one folder, and name that"
+        )
     if planes:
-        return "is one slice of a volume; give all files of its series"
+        return (
+            f"holds {count} images at one place, one after another in time, and no volume; as 2D "
+            f"images it is imported with {as_images}"
+        )
     what = "a 2D image" if count == 1 else f"a 2D cine of {count} images"
     if len(images.files) > 1:
         what = f"one of {len(images.files)} files with 2D images"
@@ -192,6 +209,7 @@ def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
     what += ", one after another in time" if timed and count > 1 else ""
     hidden = next(filter(None, map(hidden_volume, images.files)), "")
     remedy = hidden or (
-        "export the 3D data as an Enhanced US Volume, or record a tracked sweep and reconstruct it"
+        f"export the 3D data as an Enhanced US Volume, or record a tracked sweep and reconstruct "
+        f"it; as 2D images it is imported with {as_images}"
     )
     return f"is {what}, not a volume: nothing in it says where its images lie in space; {remedy}"

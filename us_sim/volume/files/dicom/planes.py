@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement
 
-__all__ = ["Plane", "grid_of", "image_axes"]
+__all__ = ["Plane", "grid_of", "image_axes", "sparse_grid_of"]
 
 _PARALLEL = 1e-4  # difference of the components of directions that are the same
 _EVEN = 0.02  # of the distance between images, by which one may be off
@@ -69,16 +69,7 @@ def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArr
         raise VolumeError(
             f"{path}: is one image; a volume needs two or more: give all files of the series"
         )
-    orientation = np.array([plane.orientation for plane in planes])
-    spacing = np.array([plane.spacing for plane in planes])
-    if (
-        np.ptp(orientation, axis=0).max() > _PARALLEL
-        or np.ptp(spacing, axis=0).max() > _PARALLEL * np.abs(spacing).max()
-    ):
-        raise VolumeError(
-            f"{path}: its images are not parallel, or their pixels differ in size, so they are no "
-            f"grid; export a volume with even slices"
-        )
+    _check_parallel(path, planes)
     axes = image_axes(path, planes[0].orientation)
     positions = np.array([plane.position for plane in planes])
     depth = positions @ axes[:, 2]
@@ -95,6 +86,51 @@ def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArr
         )
     rows, columns = planes[0].spacing
     return order, checked_placement(path, (columns, rows, distance), axes, positions[0])
+
+
+def sparse_grid_of(
+    path: Path | str, planes: Sequence[Plane], step: float | None
+) -> tuple[list[int], NDArray[np.float64]]:
+    """Which slice of a grid each image is, several of which may be the same and others missing,
+    and the (4, 4) m from (column, row, slice).
+
+    Args:
+        path: which errors name.
+        planes: of the images.
+        step: mm, between slices; None for the smallest that there is.
+
+    Raises:
+        VolumeError: they are not parallel, are shifted against each other, lie between the slices,
+            or where no body does.
+    """
+    _check_parallel(path, planes)
+    axes = image_axes(path, planes[0].orientation)
+    positions = np.array([plane.position for plane in planes])
+    depth = positions @ axes[:, 2]
+    gaps = np.diff(np.unique(np.round(depth / _PLACES) * _PLACES))
+    step = step or (float(gaps.min()) if len(gaps) else 1.0)
+    slices = np.rint((depth - depth.min()) / step)
+    first = positions[int(np.argmin(depth))]
+    apart = np.abs(positions - first - np.outer(slices * step, axes[:, 2])).max()
+    if not apart <= max(_EVEN * step, _PLACES) * max(slices.max(), 1.0):
+        raise VolumeError(
+            f"{path}: its images are {apart:g} mm off an even grid of {step:g} mm; export it again"
+        )
+    rows, columns = planes[0].spacing
+    return slices.astype(int).tolist(), checked_placement(path, (columns, rows, step), axes, first)
+
+
+def _check_parallel(path: Path | str, planes: Sequence[Plane]) -> None:
+    orientation = np.array([plane.orientation for plane in planes])
+    spacing = np.array([plane.spacing for plane in planes])
+    if (
+        np.ptp(orientation, axis=0).max() > _PARALLEL
+        or np.ptp(spacing, axis=0).max() > _PARALLEL * np.abs(spacing).max()
+    ):
+        raise VolumeError(
+            f"{path}: its images are not parallel, or their pixels differ in size, so they are no "
+            f"grid; export a volume with even slices"
+        )
 
 
 def _check_even(path: Path | str, gaps: NDArray[np.float64], distance: float) -> None:
