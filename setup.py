@@ -115,6 +115,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/us_sim"]),
         ("share/us_sim", ["package.xml"]),
+        *shared_files("launch"),
         *shared_files("config"),
         *shared_files("bags"),
     ],

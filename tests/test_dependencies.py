@@ -89,22 +89,36 @@ def test_the_installed_versions_have_all_that_is_used(folder):
     assert missing - either == set()
 
 
-def requirements(monkeypatch, *command):
-    """What setup.py asks for when it is called so, as names of pip."""
+@pytest.fixture
+def set_up(monkeypatch):
+    """What setup.py says when it is called with a command."""
     given = {}
-    monkeypatch.setattr(sys, "argv", ["setup.py", *command])
     monkeypatch.setattr(pytest.importorskip("setuptools"), "setup", given.update)
     monkeypatch.chdir(ROOT)
-    runpy.run_path(str(ROOT / "setup.py"))
-    return {plain(each) for each in given["install_requires"]}
+
+    def called(command):
+        monkeypatch.setattr(sys, "argv", ["setup.py", command])
+        runpy.run_path(str(ROOT / "setup.py"))
+        return given
+
+    return called
 
 
 def plain(requirement):
+    """The name of pip in a requirement."""
     return re.split(r"[<>=]", requirement)[0].lower()
 
 
-def test_a_workspace_of_ros_has_all_that_it_asks_for(monkeypatch):
-    wheel, workspace = (requirements(monkeypatch, verb) for verb in ("bdist_wheel", "install"))
+def test_the_launch_file_is_where_ros_has_them(set_up):
+    installed = dict(set_up("install")["data_files"])
+    assert installed["share/us_sim/launch"] == ["launch/us_sim.launch.py"]
+
+
+def test_a_workspace_of_ros_has_all_that_it_asks_for(set_up):
+    wheel, workspace = (
+        {plain(each) for each in set_up(verb)["install_requires"]}
+        for verb in ("bdist_wheel", "install")
+    )
     assert wheel - workspace == {"cyclonedds"}
     page = (ROOT / "docs" / "ros2.md").read_text(encoding="utf-8")
     (line,) = re.findall(r"^pip install --break-system-packages (.*)$", page, re.MULTILINE)
