@@ -22,9 +22,9 @@ class Watcher(GuardedNode):
         super().__init__("watcher", **kwargs)
         self.health = Health(self, "test")
         self.post = Posted(self)
-        self.flip = False
+        self.arranged = False, False
         feeds = image_feeds(
-            self, self.post, 30.0, lambda stamp: {"known": stamp}, lambda: self.flip
+            self, self.post, 30.0, lambda stamp: {"known": stamp}, lambda: self.arranged
         )
         self.feeds = {feed.kind: feed for feed in feeds}
 
@@ -133,7 +133,7 @@ def test_an_image_says_where_its_pixels_are_and_what_else_is_known(bench, watche
     packet = bench.spin_until(newest) or newest()
     assert packet.header["matrix"] == matrix.ravel().tolist()
     assert packet.header["known"] == 7 * 10**9
-    watcher.flip, last = True, feed.sequence
+    watcher.arranged, last = (True, True), feed.sequence
     bench.spin_until(lambda: newest() and feed.sequence > last)
     packet = newest()
     shown = np.frombuffer(packet.payload, np.uint8).reshape(40, 30)
@@ -188,3 +188,24 @@ def test_posted_work_is_done_in_order_and_tells_its_end(bench, watcher):
     assert watcher.post(lambda: None).cancelled()
     bench.spin_for(3)
     assert done == list(range(5))
+
+
+def test_of_two_images_beside_each_other_the_left_ones_pixels_are_known(bench, watcher):
+    matrix = np.array([[1e-4, 0, 0, -0.02], [0, 0, 1, 0], [0, 2e-4, 0, 1e-4], [0, 0, 0, 1.0]])
+    places = bench.peer.create_publisher(Float64MultiArray, "ultrasound/image_to_probe", LATCHED)
+    places.publish(affine_message(matrix))
+    watcher.arranged = True, True
+    feed = watcher.feeds["annotated"]
+    feed.watch(nothing)
+    publisher = bench.publisher(Image, "ultrasound/image_annotated")
+
+    def header():
+        message = colour_image_message(np.zeros((40, 60, 3), np.uint8), Time(), "probe")
+        publisher.publish(message)
+        packet = feed.newest()
+        return packet.header if packet and "matrix" in packet.header else None
+
+    bench.spin_until(header)
+    assert header()["panels"] == 2
+    there = np.reshape(header()["matrix"], (4, 4)) @ [29, 3, 0, 1]
+    np.testing.assert_allclose(there, matrix @ [0, 3, 0, 1], atol=1e-15)

@@ -103,7 +103,9 @@ def test_dicom_of_a_jpeg_in_colour_is_in_colour_and_says_that_it_lost_something(
     picture = np.full((30, 41, 3), (30, 60, 200), np.uint8)  # blue, green, red
     sent = cv2.imencode(".jpg", picture)[1].tobytes()
     ((header, _),) = images(1, encoding="jpeg", kind="annotated")
+    header |= {"panels": 2}
     read = pydicom.dcmread(io.BytesIO(exported("dcm", [(header, sent)])))
+    assert read.SequenceOfUltrasoundRegions[0].RegionLocationMaxX1 == 19  # of two images
     assert np.abs(read.pixel_array[9, 9].astype(int) - (200, 60, 30)).max() < 6
     assert read.LossyImageCompression == "01"
 

@@ -23,8 +23,9 @@ PIXEL += "c.getContext('2d').getImageData(5, 5, 1, 1).data).slice(0, 3) : null; 
 
 def known(value: str, is_flipped: bool = False) -> NodeParameters:
     overlay = Parameter(NODE, "overlay", Kind.TEXT, value, choices=("none", "strain", "velocity"))
-    flip = Parameter(NODE, "flip", Kind.TRUTH, is_flipped)
-    return NodeParameters(NODE, State.THERE, {"overlay": overlay, "flip": flip})
+    switches = {"flip": is_flipped, "beside": False}
+    made = {name: Parameter(NODE, name, Kind.TRUTH, value) for name, value in switches.items()}
+    return NodeParameters(NODE, State.THERE, {"overlay": overlay, **made})
 
 
 @pytest.fixture
@@ -205,3 +206,12 @@ def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(
     until(lambda: flip.get_attribute("aria-pressed") == "true", "it is flipped")
     flip.click()
     until(lambda: asked == [True, False], "the node is asked for the other")
+
+
+def test_beside_is_asked_for_with_outlines_where_nothing_is_over_the_image(
+    page: Any, asked: list[Any]
+) -> None:
+    page.goto(page.address)
+    page.get_by_role("button", name="Beside").click()
+    until(lambda: asked == [True, "none"], "the node is asked for both")
+    page.locator("button[aria-pressed=true]", has_text="Outlines").wait_for()

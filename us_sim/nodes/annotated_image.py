@@ -174,12 +174,16 @@ class AnnotatedImage:
             image = frame.pixels
             self._outline(frame)
             overlay = self._overlay(frame)
-        if self._annotation.is_flipped != self._settings.values["shown"].flip:
+        shown = self._settings.values["shown"]
+        if self._annotation.is_flipped != shown.flip:
             self._annotation = Annotation(
                 self._probe, self._structures, is_flipped=not self._annotation.is_flipped
             )
         lines = [line for each in self._streams if each.is_wanted for line in each.lines]
         picture = self._annotation.draw(image, self._labels, badge, overlay, lines)
+        if shown.beside:
+            plain = image[:, ::-1] if shown.flip else image
+            picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
         self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
         self._node.health.published("ultrasound/image_annotated")
 

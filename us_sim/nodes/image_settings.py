@@ -54,6 +54,11 @@ class AnnotatedImageSettings(Settings):
         "mark is at the right then",
         default=False,
     )
+    beside: bool = setting(
+        description="the image without anything over it at the left of the annotated one, of the "
+        "same moment",
+        default=False,
+    )
 
 
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:

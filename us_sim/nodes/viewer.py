@@ -62,7 +62,7 @@ class Viewer(GuardedNode):
         )
         rest = RestMesh(self)
         hand = ViewerHand(self, self.post, self.simulator, rest)
-        images = image_feeds(self, self.post, settings.rate, self._known, self._is_flipped)
+        images = image_feeds(self, self.post, settings.rate, self._known, self._arranged)
         self.simulator.add(*images)
         probe = ProbeFeeds(self, self.post, settings.rate)
         self._hand, self._probe = hand, probe
@@ -85,9 +85,9 @@ class Viewer(GuardedNode):
     def _imaging(self) -> Mapping[str, Parameter]:
         return self.simulator.nodes.of("slice_interpolator").parameters
 
-    def _is_flipped(self) -> bool:
-        flip = self._imaging.get("flip")
-        return flip is not None and bool(flip.raw)
+    def _arranged(self) -> tuple[bool, bool]:
+        flip, beside = map(self._imaging.get, ("flip", "beside"))
+        return flip is not None and bool(flip.raw), beside is not None and bool(beside.raw)
 
     def _known(self, stamp: int) -> dict[str, Any]:
         """For pages, beside the image of a stamp (ns): the scene, and how the probe was then.

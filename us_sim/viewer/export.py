@@ -226,7 +226,8 @@ def _region(header: Mapping[str, Any], region: Any) -> Any:
     matrix = np.array(header["matrix"], dtype=np.float64).reshape(4, 4)
     region.RegionSpatialFormat, region.RegionDataType, region.RegionFlags = _TWO_D, _TISSUE, 0
     region.RegionLocationMinX0 = region.RegionLocationMinY0 = 0
-    region.RegionLocationMaxX1 = int(header["columns"]) - 1
+    # Of two images beside each other it is the left one's.
+    region.RegionLocationMaxX1 = int(header["columns"]) // int(header.get("panels", 1)) - 1
     region.RegionLocationMaxY1 = int(header["rows"]) - 1
     region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = _CENTIMETRES
     region.ReferencePixelX0 = region.ReferencePixelY0 = 0

@@ -15,7 +15,7 @@ from us_sim.viewer.simulator import Simulator
 
 __all__ = ["build_modes"]
 
-NODE, OVERLAY, FLIP = "slice_interpolator", "overlay", "flip"
+NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {
     "b-mode": ("B-mode", "The image as it is"),
     "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
@@ -28,8 +28,15 @@ STRIPS = {
     "m_mode": ("M-mode", "Echoes along one line of the image over time"),
     "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
 }
-FLIP_TOLD = "Exchange left and right, on all pages; the dot is at the side of the probe's mark"
 _TOO_MUCH = 20.0  # N; sonographers press with some 5 to 10
+SWITCHES = {
+    BESIDE: ("Beside", "The B-mode image beside the one with outlines or colours, on all pages"),
+    FLIP: (
+        "Flip",
+        "Exchange left and right, on all pages; the dot is at the side of the probe's mark",
+    ),
+}
+"""Likewise, by parameters that are on or off."""
 _CONTACT = {
     "none": "No contact: press the probe onto the skin",
     "poor": "Poor contact: press more, or tilt less",
@@ -61,7 +68,8 @@ class _Modes:
             ui.element("span").classes("us-gap")
             for kind, (label, title) in STRIPS.items():
                 self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
-            self._buttons[FLIP] = _button("Flip", FLIP_TOLD, self._flip)
+            for name, (label, title) in SWITCHES.items():
+                self._buttons[name] = _button(label, title, lambda name=name: self._switch(name))
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
@@ -76,8 +84,10 @@ class _Modes:
         if mode == "b-mode" or await self._set(OVERLAY, mode):
             self._show(mode)
 
-    async def _flip(self) -> None:
-        await self._set(FLIP, not self._is_flipped)
+    async def _switch(self, name: str) -> None:
+        is_on = not self._is_on(name)
+        if await self._set(name, is_on) and name == BESIDE and is_on and self._mode == "b-mode":
+            await self._choose("none")
         self._mark()
 
     async def _set(self, name: str, value: object) -> bool:
@@ -87,9 +97,8 @@ class _Modes:
             ui.notify(refused, type="warning", multi_line=True)
         return not refused
 
-    @property
-    def _is_flipped(self) -> bool:
-        parameter = self._simulator.nodes.of(NODE).parameters.get(FLIP)
+    def _is_on(self, name: str) -> bool:
+        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
         return parameter is not None and bool(parameter.raw)
 
     def _show(self, mode: str) -> None:
@@ -185,7 +194,7 @@ class _Modes:
                 return
 
     def _mark(self) -> None:
-        shown = {**self._strips, self._mode: True, FLIP: self._is_flipped}
+        shown = {**self._strips, self._mode: True, **{name: self._is_on(name) for name in SWITCHES}}
         for name, button in self._buttons.items():
             pressed = str(shown.get(name, False)).lower()
             if button.props.get("aria-pressed") != pressed:

@@ -36,7 +36,7 @@ def image_feeds(
     post: Posted,
     rate: float,
     known: Known = lambda _: {},
-    is_flipped: Callable[[], bool] = lambda: False,
+    arranged: Callable[[], tuple[bool, bool]] = lambda: (False, False),
 ) -> list[Feed]:
     """The B-mode image as ``image`` and ``image_jpeg``, and pictures in colour.
 
@@ -47,7 +47,8 @@ def image_feeds(
         post: has work done in the node's thread.
         rate: Hz, of images, at most, for each page.
         known: what else is known of the image of a stamp, ns, for its header.
-        is_flipped: whether left and right are to be exchanged, as they are in the annotated one.
+        arranged: whether left and right are to be exchanged, as in the annotated image, and
+            whether that has the B-mode image at its left.
     """
     places: list[NDArray[np.float64]] = []
 
@@ -58,11 +59,15 @@ def image_feeds(
 
     def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
         def tell(message: Image, sequence: int) -> Packet:
-            flip = is_flipped()
+            flip, is_beside = arranged()
             packet = make(message, sequence, flip)
             header = {**packet.header, **known(int(packet.header["stamp"]))}
+            panels = 2 if is_beside and packet.kind == "annotated" else 1
+            if panels > 1:
+                header["panels"] = panels
             for matrix in places:
-                of_pixels = _flipped(matrix, int(header["columns"])) if flip else matrix
+                columns = int(header["columns"]) // panels
+                of_pixels = _flipped(matrix, columns) if flip else matrix
                 header["matrix"] = of_pixels.ravel().tolist()
             return replace(packet, header=header)
 
