@@ -222,7 +222,7 @@ def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, mo
     for depth in (0.0041, 0.004):
         assert press(depth) == pytest.approx(force, rel=0.1)
     assert press(0.004) == pytest.approx(force, rel=1e-6)  # the old tissue goes on
-    assert node.health.state.startswith("fem, preparing for ")
+    assert node.health.preparing
     go.set()
     for turn in range(1000):
         if press(0.004 + 1e-9 * (turn % 2)) < 1.5 * force:

@@ -125,8 +125,7 @@ def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is
     monkeypatch.setattr(SwitchableTissue, "make", slow)
     assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
     assert told.wait(timeout=20)
-    bench.spin_until(lambda: node.health.state.startswith("fem, preparing for "))
-    assert node.health.state.endswith(" s, compiling msds, kernel 7")
+    bench.spin_until(lambda: node.health.preparing.endswith(" s, compiling msds, kernel 7"))
     # Set back, it goes on as it is, and what was begun is never adopted.
     assert node.set_parameters([Parameter("solver", value="fem")])[0].successful
     assert node.health.state == "fem"

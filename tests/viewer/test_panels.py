@@ -332,7 +332,8 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
     words, box = option.get_by_text("springs").bounding_box(), option.bounding_box()
     assert words["width"] > 0.8 * (box["width"] - 32)  # all of the menu but its margins
     page.keyboard.press("Escape")
-    says("preparing msds: the tissue goes on", state="fem, preparing msds")
+    says("preparing msds: the tissue goes on", preparing="preparing msds")
+    page.locator(".us-headline", has_text="preparing msds").wait_for()
     apart = {"compared_with": "msds", "difference_max_mm": "0.4123", "difference_rms_mm": "0.05"}
     says("msds is 0.412 mm away at most, 0.05 mm root mean square", **apart)
     assert panel.get_by_text("Settings of fem").is_visible()

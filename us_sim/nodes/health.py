@@ -54,6 +54,7 @@ class Health:
         self.received = 0
         self.dropped = 0
         self.values: dict[str, str] = {}
+        self.preparing = ""  # what it goes on without until that is ready
         self.scheduling = ""  # how its process goes before others, if that was asked for
         self._publisher = node.create_publisher(
             DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
@@ -112,6 +113,7 @@ class Health:
             "rate_hz": f"{rate:.1f}",
             "received": str(self.received),
             "dropped": str(self.dropped),
+            **({"preparing": self.preparing} if self.preparing else {}),
             **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},

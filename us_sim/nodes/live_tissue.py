@@ -99,7 +99,7 @@ class LiveTissue:
         self._asked = dict(values)
         if values == self._current:
             self._preparation.drop()
-            self._node.health.state = self.state
+            self._tell_preparing()
             self._node.get_logger().info(
                 f"set back: {self.tissue.name} goes on as it is, and what was being prepared is "
                 f"dropped"
@@ -113,6 +113,7 @@ class LiveTissue:
             f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready"
         )
         self._preparation.want(plan)
+        self._tell_preparing()
 
     def _plan(self, values: Mapping[str, Any]) -> Plan:
         """What to make for these settings."""
@@ -144,8 +145,16 @@ class LiveTissue:
     def _tick(self) -> None:
         """Look, and tell diagnostics how far it is, also while no pose comes."""
         if self._preparation.state:
-            self._node.health.state = self.state
+            self._node.health.state, self._node.health.preparing = (
+                self.state,
+                self._preparation.state,
+            )
         self._look()
+
+    def _tell_preparing(self) -> None:
+        """Tell diagnostics at once that something is being prepared, or no longer is."""
+        self._node.health.state, self._node.health.preparing = self.state, self._preparation.state
+        self._node.health.report()
 
     def _look(self) -> None:
         """Go on with what is ready, or say why it never will be."""
@@ -156,6 +165,8 @@ class LiveTissue:
     def _settle(self, outcome: Prepared | Failed) -> None:
         self._take(outcome)
         self._node.health.state = self.tissue.name  # also while no pose comes
+        self._node.health.preparing = ""
+        self._node.health.report()
 
     def _take(self, outcome: Prepared | Failed) -> None:
         if isinstance(outcome, Failed):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import PurePath
 
 from nicegui import ui
@@ -37,7 +38,7 @@ def words_of(state: SessionState) -> tuple[str, str]:
 
 def build_headline(simulator: Simulator) -> None:
     """Make it inside the header."""
-    board = simulator.session
+    board, nodes = simulator.session, simulator.status
     name = ui.label().classes("us-scene-name").props('id="us-scene"')
     words = ui.label().classes("us-headline").props('role="status"')
     problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
@@ -45,9 +46,12 @@ def build_headline(simulator: Simulator) -> None:
     def look() -> None:
         scene, told = words_of(board.state)
         name.set_text(scene)
-        words.set_text(told)
+        known = (each.values.get("preparing", "") for each in nodes.nodes(time.monotonic()))
+        words.set_text(" · ".join(filter(None, (*known, told))))
         problem.set_text(board.state.problem)
 
     board.watch()
+    nodes.watch(pages=1)
     ui.context.client.on_delete(board.unwatch)
+    ui.context.client.on_delete(lambda: nodes.watch(pages=-1))
     ui.timer(_LOOK_S, look)

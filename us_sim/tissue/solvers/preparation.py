@@ -42,11 +42,12 @@ class Preparation:
 
     @property
     def state(self) -> str:
-        """For how long something is being made already, and how far it is; '' when nothing is."""
+        """What is being made, for how long already, and how far it is; '' when nothing is."""
         with self._lock:
             if self._thread is None or self._newest is None:
                 return ""
-            return f"preparing for {time.monotonic() - self._began:.0f} s{self._progress}"
+            seconds = time.monotonic() - self._began
+            return f"preparing {self._newest.reason} for {seconds:.0f} s{self._progress}"
 
     def want(self, plan: Plan) -> None:
         """Begin to make what a plan needs; what is still being made for another is then dropped."""

@@ -6,6 +6,7 @@
  * control. After that it shows what the node has.
  */
 const PAUSE = 100; // ms between two changes that are sent
+const SLOW = 1000; // ms without an answer, after which that is said
 const POSITIONS = 400; // of a slider that goes by factors
 const DIGITS = 6;
 
@@ -45,6 +46,7 @@ export default {
           @update:model-value="typed = $event" @keydown="key" @blur="take" />
       </template>
       <div v-if="meanings[shown]" class="us-meaning">{{ meanings[shown] }}</div>
+      <div v-if="isSlow" class="us-meaning" role="status">waiting for the node to take it …</div>
       <div v-if="refusal" class="us-reason" role="alert">{{ refusal }}</div>
     </div>`,
   props: {
@@ -70,6 +72,7 @@ export default {
       isWaiting: false,
       typed: null,
       wrong: "",
+      isSlow: false, // no answer has come for a while
       held: null, // the span while it is dragged
     };
   },
@@ -119,7 +122,14 @@ export default {
       return isLogarithmic ? (POSITIONS * Math.log(value / low)) / Math.log(high / low) : value;
     },
   },
+  watch: {
+    seen() {
+      clearTimeout(this.waiting);
+      this.isSlow = false;
+    },
+  },
   beforeUnmount() {
+    clearTimeout(this.waiting);
     if (this.isWaiting && this.timer) this.send();
     clearTimeout(this.timer);
   },
@@ -152,6 +162,8 @@ export default {
       this.last = performance.now();
       this.isWaiting = false;
       this.sent = Math.max(this.sent, this.seen) + 1;
+      clearTimeout(this.waiting);
+      this.waiting = setTimeout(() => (this.isSlow = this.sent > this.seen), SLOW);
       this.$emit("change", { value: this.local, turn: this.sent });
     },
     key(event) {

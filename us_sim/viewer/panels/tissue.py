@@ -72,7 +72,7 @@ def build(simulator: Simulator) -> None:
         _say(simulator, state, difference, problem)
 
     with WhileShown(begin, end, EVERY_S, refresh):
-        state = ui.label().classes("us-note").props('role="status"')
+        state = ui.label().classes("us-note us-accent").props('role="status"')
         difference = ui.label().classes("us-note")
         problem = ui.label().classes("us-reason").props('role="alert"')
         for title, node, arrange in (
@@ -93,7 +93,7 @@ def _say(simulator: Simulator, state: ui.label, difference: ui.label, problem: u
     """What is being prepared, how far two methods are apart, and what was set back."""
     now = time.monotonic()
     status = simulator.status.node(NODE, now)
-    preparing = status.state.partition(", ")[2] if status else ""
+    preparing = status.values.get("preparing", "") if status else ""
     _set(state, f"{preparing}: the tissue goes on as it was until then" if preparing else "")
     _set(difference, _difference(status) if status else "")
     is_recent = status is not None and now - status.problem_heard < RECENT_S
