@@ -69,7 +69,7 @@ def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, t
     ("options", "message"),
     [
         (["--reference", "Table"], "from Image to Table; the known ones are ImageToReference"),
-        (["--spacing", "0.5"], "did you mean '0.5 cm'"),
+        (["--spacing", "0.5"], "did you mean '0.5 mm'"),
         (["--spacing", "0.01 mm"], "give --spacing"),
         (["--compounding", "sum"], "'sum' is not one of mean, median"),
         (["--fan-origin", "3", "4"], "--fan-radius: is missing"),
@@ -88,6 +88,16 @@ def test_what_cannot_be_is_one_sentence_and_leaves_nothing(
     (said,) = capsys.readouterr().err.strip().splitlines()
     assert message in said
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("asked", "said"), [(1, "1 frame predicted"), (8, "1 frame (not 8")])
+def test_why_fewer_frames_are_predicted_than_was_asked_is_said(
+    sweep, tmp_path, capsys, asked, said
+):
+    options = ["--spacing", "1 mm", "--leave-one-out", str(asked)]
+    out = str(tmp_path / "volume.nrrd")
+    assert main(["reconstruct", str(sweep[0]), "--out", out, *options]) == 0
+    assert said in capsys.readouterr().out
 
 
 def test_nothing_is_written_over(sweep, tmp_path, capsys):

@@ -58,12 +58,13 @@ def _extract(args: argparse.Namespace) -> int:
 
 def _repair(args: argparse.Namespace) -> int:
     from us_sim.recording.repair import repair
+    from us_sim.settings.spelling import counted
 
     file: Path = args.file
     made = repair(file, args.out or file.with_name(f"{file.stem}_repaired"))
     for fault in made.faults:
         print(fault.text)
-    print(f"{made.message_count} messages are in {made.path}")
+    print(f"{counted(made.message_count, 'message is', 'messages are')} in {made.path}")
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.command.setting_options import add_setting_options, read_settings
+from us_sim.settings.spelling import counted
 
 __all__ = ["add_print_marker"]
 
@@ -38,6 +39,6 @@ def _print_marker(args: argparse.Namespace) -> int:
     asked = read_settings(args, PrintSettings)
     body = read_rigid_body(args.body, asked.dictionary) if args.body else asked.body()
     pages = print_markers(body, args.out, asked.paper)
-    count = f"{len(pages)} sheets" if len(pages) > 1 else "1 sheet"
+    count = counted(len(pages), "sheet")
     print(f"{args.out}: {pages[0].foot}; {count} of {asked.paper}, to be printed at 100 %")
     return 0

@@ -26,6 +26,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
 from us_sim.nodes.session_settings import PathPlayerSettings
 from us_sim.recording.path import ProbePath, read_path
+from us_sim.settings.spelling import counted
 from us_sim.share import find_bag
 
 __all__ = ["PathPlayer", "main"]
@@ -75,7 +76,9 @@ class PathPlayer(GuardedNode):
             first = int(self._path.log_times[0])
             offer_player_services(self, lambda: self._settings, first, length)
         self.pose_count = len(self._path)
-        self.get_logger().info(f"{self.pose_count} poses of {self._path.topic} in {path}")
+        self.get_logger().info(
+            f"{counted(self.pose_count, 'pose')} of {self._path.topic} in {path}"
+        )
         if self._path.note:
             self.get_logger().warning(self._path.note)
 

@@ -30,6 +30,7 @@ from us_sim.recording.pre_roll import PreRoll
 from us_sim.recording.topic import MARKER
 from us_sim.recording.write_behind import Message, WriteBehind
 from us_sim.recording.writer import BagWriter
+from us_sim.settings.spelling import counted
 
 __all__ = ["SessionRecorder", "main"]
 
@@ -246,7 +247,9 @@ class SessionRecorder(GuardedNode):
         if new:
             self._events.lost(new)
             count = sum(map(sum, new.values()))
-            self.health.problem("lost", f"{count} messages of {', '.join(new)} were not recorded")
+            self.health.problem(
+                "lost", f"{counted(count, 'message')} of {', '.join(new)} not recorded"
+            )
 
     def _tell_splits(self) -> None:
         while self._splits:

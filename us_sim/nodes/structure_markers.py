@@ -17,6 +17,7 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings
 from us_sim.scene.building import volume_of
 from us_sim.scene.structures import Structure, structures_of
+from us_sim.settings.spelling import counted
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 __all__ = ["StructureMarkers"]
@@ -87,7 +88,7 @@ class StructureMarkers:
             return
         count = sum(len(made.surface.triangles) for made in self._structures)
         names = ", ".join(made.name for made in self._structures)
-        self.state = f"{names}: {count} triangles"
+        self.state = f"{names}: {counted(count, 'triangle')}"
         self._node.get_logger().info(
             f"made the surfaces of {self.state}, in {time.monotonic() - began:.1f} s"
         )

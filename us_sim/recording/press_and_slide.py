@@ -27,7 +27,8 @@ _KEYED_DURATION = 10.0
 """Length of the path in the key poses below, s. Each is a time and a value; between them the probe
 moves smoothly."""
 
-_SLIDE = np.array([[5.0, 0.0], [6.25, 0.008], [7.5, 0.0]])  # m along y, the vessels
+_SLIDE = np.array([[5.0, 0.0], [6.25, 1.0], [7.5, 0.0]])  # of the slide along y, the vessels
+_ROCKS_WHOLLY = 0.008  # m, of slide
 _ROCK = np.array([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]])  # degrees about x
 _PRESS = np.array(
     [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]],
@@ -37,7 +38,11 @@ positive."""
 
 
 def press_and_slide(
-    rate: float = 60.0, duration: float = 10.0, depth: float = 0.012, hover: float = 0.010
+    rate: float = 60.0,
+    duration: float = 10.0,
+    depth: float = 0.012,
+    hover: float = 0.010,
+    slide: float = 0.008,
 ) -> ProbePath:
     """A path that touches flat skin at the origin, presses on it and lets go of it.
 
@@ -49,6 +54,7 @@ def press_and_slide(
         duration: s; the phases keep their fractions of it.
         depth: m, of the press below the skin.
         hover: m, height above the skin before and after.
+        slide: m, along y and back; it rocks by 4° for 8 mm, and less for less.
 
     Returns:
         ``round(rate * duration)`` poses on ``/tracker/pose`` in frame ``patient``.
@@ -64,9 +70,10 @@ def press_and_slide(
     times = np.arange(round(rate * duration)) / rate
     phase = times * (_KEYED_DURATION / duration)
     press = _minimum_jerk(_PRESS, phase)
-    half_angle = np.radians(_minimum_jerk(_ROCK, phase)) / 2
+    rocked = min(1.0, abs(slide) / _ROCKS_WHOLLY)
+    half_angle = rocked * np.radians(_minimum_jerk(_ROCK, phase)) / 2
     positions = np.zeros((len(times), 3))
-    positions[:, 1] = _minimum_jerk(_SLIDE, phase)
+    positions[:, 1] = slide * _minimum_jerk(_SLIDE, phase)
     positions[:, 2] = press * np.where(press < 0, hover, depth)
     orientations = np.zeros((len(times), 4))
     orientations[:, 0] = np.sin(half_angle)

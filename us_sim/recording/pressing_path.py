@@ -1,4 +1,4 @@
-"""Files with the demo's path, pressed as deep as a case asks; made once and kept in the cache.
+"""Files with the demo's path, as a case asks for it; made once and kept in the cache.
 
 >>> import os, tempfile
 >>> from us_sim.recording.path import read_path
@@ -27,20 +27,22 @@ _MADE = 1
 """Changes with what `press_and_slide` makes, so that no older file is taken for it."""
 
 
-def pressing_path(depth: float) -> Path:
-    """The file of `press_and_slide` with a press of that depth (m), to a tenth of a millimetre.
+def pressing_path(depth: float, slide: float = 0.008) -> Path:
+    """The file of `press_and_slide` with that depth and slide (m), to a tenth of a millimetre.
 
     Raises:
         BagError: the cache folder cannot be written.
     """
-    file = cache_folder() / f"press-{_MADE}-{depth * 1e3:.1f}-mm.mcap"
+    name = f"press-{_MADE}-{depth * 1e3:.1f}-mm-slide-{slide * 1e3:.1f}-mm.mcap"
+    file = cache_folder() / name
     if file.is_file():
         return file
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as folder:
             partial = Path(folder, file.name)
-            write_path(partial, press_and_slide(depth=round(depth, 4)), sidecar=False)
+            path = press_and_slide(depth=round(depth, 4), slide=round(slide, 4))
+            write_path(partial, path, sidecar=False)
             os.replace(partial, file)
     except OSError as error:
         raise BagError(

@@ -25,6 +25,7 @@ from us_sim.errors import BagError, FileTakenError
 from us_sim.recording.bag_names import BagNames
 from us_sim.recording.contents import Contents
 from us_sim.recording.mcap_output import McapOutput, Place
+from us_sim.settings.spelling import counted
 
 __all__ = ["BagWriter"]
 
@@ -334,7 +335,7 @@ class BagWriter:
         except OSError as error:
             with contextlib.suppress(OSError):
                 self._finish()
-            kept = f"its first {self._output.message_count} messages are kept and can be read"
+            kept = f"the first {counted(self._output.message_count, 'message')} can be read"
             if self._taken_away:
                 kept = "; ".join(self._taken_away)
                 self._taken_away.clear()
@@ -375,13 +376,13 @@ class BagWriter:
             elif place is Place.MOVED:
                 self._taken_away.append(
                     f"{file.path} was moved away while it was recorded, with "
-                    f"{file.message_count} messages"
+                    f"{counted(file.message_count, 'message')}"
                 )
             else:
                 self.lost += file.counts
                 self._taken_away.append(
-                    f"{file.path} was removed while it was recorded: {file.message_count} messages "
-                    f"are lost with it"
+                    f"{file.path} was removed while it was recorded: "
+                    f"{counted(file.message_count, 'message is', 'messages are')} lost with it"
                 )
 
     def _tell_taken_away(self, then: str = "") -> None:

@@ -27,6 +27,7 @@ from us_sim.run.live import prepare_volume
 from us_sim.run.monitored import refuse_unknown
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
+from us_sim.settings.spelling import counted
 
 __all__ = ["render", "render_scene", "truth_folders"]
 
@@ -65,7 +66,7 @@ def render_scene(
         count = render(
             scene, path, out, lambda done, _: bar.update(done), parameters, folders, topic=topic
         )
-    print(f"{count} images in {out / 'images'}, all messages in {out / 'session.mcap'}")
+    print(f"{counted(count, 'image')} in {out / 'images'}, all messages in {out / 'session.mcap'}")
     for what, folder in folders.items():
         print(f"the {what} of each in {folder}")
     return 0

@@ -27,7 +27,7 @@ from us_sim.scene.tissue_box import footprint
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.settings.writing import document_of
 from us_sim.volume.cases.case import Case, read_case
-from us_sim.volume.cases.settings import AROUND, CaseSettings
+from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
 from us_sim.volume.volume import grid_extent
 
 __all__ = ["case_document", "patient_from_volume"]
@@ -91,7 +91,7 @@ def _path(settings: CaseSettings) -> str:
         press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
     from us_sim.recording.pressing_path import pressing_path
 
-    return str(pressing_path(press))
+    return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
 
 
 def patient_from_volume(start: Placement) -> Placement:

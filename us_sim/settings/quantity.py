@@ -119,8 +119,16 @@ class Quantity:
         return f"{shown(value)} is not {article} {self.dimension}{hint}"
 
     def _hint(self, number: float) -> str:
-        """A likely unit slip: millimetres or kilopascals written where SI is meant."""
-        for unit, factor in _UNITS[self.dimension].items():
-            if factor != 1.0 and self.minimum <= number * factor <= self.maximum:
-                return f"; did you mean '{number:g} {unit}'?"
-        return ""
+        """A likely unit slip: the unit with which the number is most in the middle of the range."""
+        meant = {
+            unit: number * factor
+            for unit, factor in _UNITS[self.dimension].items()
+            if factor != 1.0 and self.minimum <= number * factor <= self.maximum
+        }
+        if not meant:
+            return ""
+        unit = next(iter(meant))
+        if self.minimum > 0.0 and math.isfinite(self.maximum):
+            middle = math.sqrt(self.minimum * self.maximum)
+            unit = min(meant, key=lambda unit: abs(math.log(meant[unit] / middle)))
+        return f"; did you mean '{number:g} {unit}'?"

@@ -1,8 +1,10 @@
-"""What to say of a name that is not known.
+"""Names and numbers in sentences: what to say of a name that is not known, one or several.
 
 >>> from us_sim.settings.spelling import unknown
 >>> unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
 "'fem_nonlinaer' is not one of fem, fem_nonlinear; did you mean 'fem_nonlinear'?"
+>>> >>> counted(1, "place"), counted(0, "place"), counted(2, "is", "are")
+('1 place', '0 places', '2 are')
 """
 
 from __future__ import annotations
@@ -11,12 +13,17 @@ import difflib
 import reprlib
 from collections.abc import Iterable
 
-__all__ = ["nearest", "shown", "unknown"]
+__all__ = ["counted", "nearest", "shown", "unknown"]
 
 _MANY = 25
 """Names that are too many to list beside the one that was probably meant."""
 _repr = reprlib.Repr()
 _repr.maxstring = _repr.maxother = _LONGEST = 60
+
+
+def counted(count: int, one: str, several: str | None = None) -> str:
+    """A number with its noun, ``1 frame`` or ``2 frames``; ``several`` where that is no mere s."""
+    return f"{count} {one if count == 1 else several or f'{one}s'}"
 
 
 def shown(value: object) -> str:

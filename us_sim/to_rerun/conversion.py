@@ -18,6 +18,7 @@ from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.conversions import nanoseconds_of
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.topic import BagTopic
+from us_sim.settings.spelling import counted
 from us_sim.to_rerun.rerun_file import RerunFile, require_rerun
 
 if TYPE_CHECKING:
@@ -133,7 +134,8 @@ class _Conversion:
             if done % 20 == 0 or done == total:
                 self._tell(done / total, message.topic)
         self.left_out += [
-            f"{count} messages on {topic} are left out, the first because {first}"
+            f"{topic}: {counted(count, 'message is', 'messages are')} left out, the first because "
+            f"{first}"
             for topic, (count, first) in refused.items()
         ]
         entities = [name.lstrip("/") for name in self.shown]

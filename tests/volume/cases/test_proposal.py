@@ -124,3 +124,22 @@ def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():
     said = CaseStart((0.01, 0.0, 0.0))
     fixed = CaseSettings("a", start=said, scanned=poses, structures=vein)
     assert with_proposal(fixed, volume).start == said
+
+
+@pytest.mark.parametrize(
+    ("ahead", "behind", "slide"),
+    [(20, 20, 8), (20, 2, 8), (5, 2, 5), (2, 20, -8), (2, 5.5, -5), (1, 1, 0)],
+)
+def test_the_press_slides_as_far_as_something_was_scanned(ahead, behind, slide):
+    grid = np.diag([1e-3, 2.5e-4, 1e-3, 1.0])
+    grid[:3, 3] = [-0.02, -0.025, 0.0]
+    grey = np.zeros((41, 201, 31), np.uint8)
+    y = np.arange(201) * 0.25 - 25
+    grey[:, (y >= -behind) & (y <= ahead), :] = 90
+    scanned = (Placement((0.0, 0.0, 0.0)),)
+    made = with_proposal(CaseSettings("a", scanned=scanned), Volume(grey, grid))
+    assert made.start.position == (0.0, 0.0, 0.0)
+    assert made.slide == pytest.approx(1e-3 * slide, abs=1.01e-3)
+    assert -behind <= 1e3 * made.slide <= ahead
+    chosen = CaseSettings("a", start=CaseStart((0.0, 0.0, 0.0)), slide=0.003)
+    assert with_proposal(chosen, Volume(grey, grid)).slide == 0.003

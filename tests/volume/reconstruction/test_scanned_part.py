@@ -136,9 +136,45 @@ def test_a_fan_that_is_named_is_the_probes(tmp_path):
     np.testing.assert_allclose(found.poses[0].position, [-0.1, 0.0, 0.01], atol=1e-5)
 
 
-def test_a_wide_picture_is_no_linear_array(tmp_path):
+def test_a_wide_picture_is_no_linear_array_but_says_where_it_was_seen_from(tmp_path):
     mask = np.ones((ROWS, COLUMNS), bool)  # 200 mm
-    assert scanning_probe(swept(tmp_path, mask), ImagePart(), mask) is None
+    mask[:10] = False
+    found = scanning_probe(swept(tmp_path, mask), ImagePart(), np.ones_like(mask))
+    assert found.probe is None
+    pose = found.poses[4].pose
+    np.testing.assert_allclose(pose.position, [-0.1, 0.008, 10 * SIDE[1]], atol=SIDE[0])
+    np.testing.assert_allclose(pose.rotation[:, 2], [0, 0, 1], atol=1e-6)
+
+
+def test_a_rectangle_that_is_named_is_a_linear_arrays(tmp_path):
+    part = ImagePart(clip=(100, 40, 79, 119))
+    mask = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.3  # proves nothing
+    used = image_mask(part, COLUMNS, ROWS)
+    found = scanning_probe(swept(tmp_path, mask), part, used)
+    assert found.probe.geometry == "linear"
+    assert found.probe.array.given.aperture == pytest.approx(80 * SIDE[0])
+    assert found.probe.array.given.depth == pytest.approx(120 * SIDE[1])
+    np.testing.assert_allclose(found.poses[0].position, [-139.5 * SIDE[0], 0, 39.5 * SIDE[1]])
+
+
+def test_a_case_of_a_real_sweep_starts_where_its_probe_was(shared_data):
+    folder = shared_data / "plus-nwire-calibration"
+    file = folder / "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml"
+    calibration = read_calibration(file, "Probe")
+    sequence = read_sequence(folder / "NwirePhantomFreehand.igs.mha")
+    sweep = sweep_of(sequence, calibration=calibration.transforms)
+    used = image_mask(calibration.part, sweep.columns, sweep.rows)
+    found = scanning_probe(sweep, calibration.part, used)
+    rows, columns = np.linalg.norm(sweep.image_to_reference[0][:3, 1::-1], axis=0)
+    assert found.probe.array.given.aperture == pytest.approx(495 * columns, abs=2 * columns)
+    assert found.probe.array.given.depth == pytest.approx(488 * rows, abs=2 * rows)
+    faces = (sweep.image_to_reference @ [167 + 495 / 2, 62, 0, 1])[:, :3]
+    for pose in found.poses:
+        off = np.linalg.norm(faces - pose.position, axis=1)
+        k = off.argmin()  # its frame
+        assert off[k] < 0.1e-3
+        down = sweep.image_to_reference[k][:3, 1] / rows
+        assert pose.pose.rotation[:, 2] @ down > np.cos(np.radians(0.1))
 
 
 def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):

@@ -10,6 +10,7 @@ import numpy as np
 from us_sim.errors import SceneError
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import path_of
+from us_sim.settings.spelling import counted
 from us_sim.tracking.measurement import PATIENT, Measurement
 
 __all__ = ["PathInput"]
@@ -56,7 +57,7 @@ class PathInput(TrackerInput):
             return
         self._timer.cancel()
         self._begun = device.now()
-        device.say(f"playing {len(self._path)} poses of {self._path.topic}")
+        device.say(f"playing {counted(len(self._path), 'pose')} of {self._path.topic}")
         steps = np.diff(self._due)
         period = 0.5e-9 * float(np.median(steps)) if len(steps) else LONGEST_S
         self._timer = device.every(float(np.clip(period, SHORTEST_S, LONGEST_S)), self._tick)

@@ -7,6 +7,7 @@ from typing import Any
 from geometry_msgs.msg import PoseArray, PoseStamped
 
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.settings.spelling import counted
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["PoseArrayInput"]
@@ -24,8 +25,8 @@ class PoseArrayInput(TrackerInput):
         if self._entry >= len(message.poses):
             self._device.refuse(
                 "entry",
-                f"tracker/poses holds {len(message.poses)} poses, so none is number {self._entry} "
-                f"(from 0): set tracker.entry in the scene",
+                f"tracker/poses holds {counted(len(message.poses), 'pose')}, so none is "
+                f"number {self._entry} (from 0): set tracker.entry in the scene",
             )
             return
         entry = PoseStamped(header=message.header, pose=message.poses[self._entry])

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
+from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.volume_term import area_vectors
 from us_sim.tissue.model import TissueModel
 
@@ -59,8 +60,12 @@ class Tangling:
         if inverted == 0:
             return "", False
         if self._frames_free < _PATIENCE or not self._held:
-            return f"{inverted} tetrahedra are inside out", False
-        return f"{inverted} tetrahedra stayed inside out, so the tissue was put back to rest", True
+            return f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out", False
+        return (
+            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
+            f"was put back to rest",
+            True,
+        )
 
 
 def watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:

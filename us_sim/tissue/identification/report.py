@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from us_sim.errors import StiffnessError
+from us_sim.settings.spelling import counted
 from us_sim.tissue.identification.stiffness import StiffnessFit
 
 __all__ = ["table", "write_moduli"]
@@ -57,8 +58,8 @@ def _left_over(found: StiffnessFit) -> str:
     if landmark is not None:
         parts.append(f"{1e3 * landmark:.3g} mm of landmarks")
     return (
-        f"left over (RMS): {', '.join(parts)}; {len(found.depths)} poses down to "
-        f"{1e3 * found.depths.max():.1f} mm, {found.fitted.steps} steps"
+        f"left over (RMS): {', '.join(parts)}; {counted(len(found.depths), 'pose')} down to "
+        f"{1e3 * found.depths.max():.1f} mm, {counted(found.fitted.steps, 'step')}"
     )
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.connected_parts import connected_parts
 from us_sim.geometry.mesh_faces import FACES, MOST_NODES, face_order
+from us_sim.settings.spelling import counted
 
 __all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
 
@@ -51,7 +52,7 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
     if not used.all():
         idle = np.flatnonzero(~used)
         raise MeshError(
-            f"{_counted(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
+            f"{counted(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
             f"such as node {idle[0]}: remove them, or let us_sim.tissue.mesh.repair do it"
         )
     _check_places(nodes)
@@ -79,13 +80,13 @@ def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) ->
     bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
     if len(bad):
         raise MeshError(
-            f"{_counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
+            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
             f"{bad[0]} at {nodes[bad[0]].tolist()}: give every node three numbers"
         )
     bad = np.flatnonzero((np.abs(nodes) > _FARTHEST).any(axis=1))
     if len(bad):
         raise MeshError(
-            f"{_counted(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
+            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
             f"away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give coordinates in metres"
         )
     if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
@@ -113,7 +114,7 @@ def _check_places(nodes: NDArray[np.float64]) -> None:
     if len(same):
         node, other = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         raise MeshError(
-            f"{_counted(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
+            f"{counted(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
             f"lies, such as node {other} on node {node}: join them, or let "
             f"us_sim.tissue.mesh.repair do it"
         )
@@ -141,7 +142,7 @@ def _check_volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) 
     ):
         if len(bad):
             raise MeshError(
-                f"{_counted(len(bad), 'tetrahedron is', 'tetrahedra are')} "
+                f"{counted(len(bad), 'tetrahedron is', 'tetrahedra are')} "
                 f"{what}, such as tetrahedron {bad[0]} (volume {volumes[bad[0]]:.3g} m3): {remedy}"
             )
 
@@ -153,7 +154,7 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
     same = np.flatnonzero((whole[order[1:]] == whole[order[:-1]]).all(axis=1))
     if len(same):
         raise MeshError(
-            f"{_counted(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
+            f"{counted(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
             f"tetrahedron {order[same[0] + 1]}, which has the nodes of tetrahedron "
             f"{order[same[0]]}: keep each once, or let us_sim.tissue.mesh.repair do it"
         )
@@ -163,7 +164,7 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
         first = starts[crowded[0]]
         several = (order[first : first + counts[crowded[0]]] // 4).tolist()
         raise MeshError(
-            f"the mesh is not manifold: {_counted(len(crowded), 'face belongs', 'faces belong')} "
+            f"the mesh is not manifold: {counted(len(crowded), 'face belongs', 'faces belong')} "
             f"to more than two tetrahedra, such as one of tetrahedra "
             f"{', '.join(map(str, several))}: take out those that overlap"
         )
@@ -172,7 +173,7 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
     folded = np.flatnonzero(_turn(tetrahedra, one) == _turn(tetrahedra, other))
     if len(folded):
         raise MeshError(
-            f"{_counted(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
+            f"{counted(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
             f"same side of the face they share, such as {one[folded[0]] // 4} and "
             f"{other[folded[0]] // 4}: they overlap, mend the mesh"
         )
@@ -203,7 +204,7 @@ def _check_hinges(
         node = hinges[0]
         raise MeshError(
             f"{bodies} parts of the mesh hang together by nodes or edges only, "
-            f"{_counted(len(hinges), 'node', 'nodes')} in all, such as node {node} between "
+            f"{counted(len(hinges), 'node', 'nodes')} in all, such as node {node} between "
             f"tetrahedra {_with_node(tetrahedra, body == lowest[node], node)} and "
             f"{_with_node(tetrahedra, body == highest[node], node)}: join such parts by faces, or "
             f"give each its own nodes"
@@ -214,7 +215,3 @@ def _with_node(
     tetrahedra: NDArray[np.integer], among: NDArray[np.bool_], node: np.integer
 ) -> np.intp:
     return np.flatnonzero(among & (tetrahedra == node).any(axis=1))[0]
-
-
-def _counted(count: int, one: str, several: str) -> str:
-    return f"{count} {one if count == 1 else several}"

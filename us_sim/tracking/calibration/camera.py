@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
+from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.board import BoardView
 from us_sim.tracking.camera.model import CameraModel
 
@@ -100,8 +101,8 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
     """
     if len(views) < _FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is seen in {len(views)} photos, and {_FEWEST_VIEWS} are the least (20 are "
-            f"good): take more, tilted to all sides"
+            f"the board is seen in {counted(len(views), 'photo')}, and {_FEWEST_VIEWS} are the "
+            f"least (20 are good): take more, tilted to all sides"
         )
     reach = _reach(views, width, height)
     if reach < _SMALLEST_REACH:

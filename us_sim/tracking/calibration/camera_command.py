@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
+from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.board import Board, BoardView
 from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
 from us_sim.tracking.calibration.report_picture import draw_coverage
@@ -59,8 +60,8 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
-    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {len(views)} photos, coverage in "
-    said += f"{picture}"
+    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {counted(len(views), 'photo')}, "
+    said += f"coverage in {picture}"
     if blank:
         said += f"; {len(blank)} without the board: {', '.join(blank)}"
     if far_off:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
+from us_sim.settings.spelling import counted
 from us_sim.settings.text_file import read_text
 from us_sim.tracking.calibration.clustered_covariance import ENOUGH_FEATURES
 from us_sim.tracking.calibration.landmark_file import read_landmarks, read_table, read_wires
@@ -86,7 +87,8 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
     )
     return (
         f"{out}: pixels of {1e3 * found.spacing[0]:.4f} × {1e3 * found.spacing[1]:.4f} mm, RMS "
-        f"{1e3 * found.rms:.2f} mm over {len(seen) - rejected} sightings, {rejected} left out, "
+        f"{1e3 * found.rms:.2f} mm over {counted(len(seen) - rejected, 'sighting')}, "
+        f"{rejected} left out, "
         f"± {1e3 * float(np.linalg.norm(deviations[:3])):.2f} mm and "
         f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°{_remarks(found, features)}"
     )

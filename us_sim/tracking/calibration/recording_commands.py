@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
+from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.dwell import find_dwells
 from us_sim.tracking.calibration.landmark_file import read_landmarks
 from us_sim.tracking.calibration.landmarks import register_landmarks
@@ -168,11 +169,12 @@ def _touched(
     dwells = find_dwells(seconds_of(motion), tips, rotations)
     if len(dwells) != len(names):
         start = seconds_of(motion)[0]
-        at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells) or "none"
+        at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells)
+        where = counted(len(dwells), "place") + (f" (at {at} s)" if at else "")
         raise CalibrationError(
-            f"{recording}: the stylus pivoted on {len(dwells)} places (at {at} s) where "
-            f"{len(names)} landmarks are named: touch each for two seconds in the file's order, "
-            f"tilting the stylus with its tip still"
+            f"{recording}: the stylus pivoted on {where} where "
+            f"{counted(len(names), 'landmark is', 'landmarks are')} named: touch each for two "
+            f"seconds in the file's order, tilting the stylus with its tip still"
         )
     places = [dwell.position for dwell in dwells]
     return dict(zip(names, places, strict=True)), motion.frame_id

@@ -24,13 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.spelling import counted
 from us_sim.tracking.camera.body_pose import BodyPose, body_poses
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.plane_ambiguity import PlaneAmbiguity
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.settings import CameraSettings
-from us_sim.tracking.camera.stray_markers import StrayMarkers, counted
+from us_sim.tracking.camera.stray_markers import StrayMarkers
 from us_sim.tracking.measurement import Measurement
 
 __all__ = ["CameraSource"]
@@ -164,8 +165,8 @@ class CameraSource:
             if len(markers) < least and self.body.chessboard is None:
                 count = len(markers)
                 self.last_problem = refusal or (
-                    f"{counted(count)} of the body {'is' if count == 1 else 'are'} seen, fewer "
-                    f"than the {least} of camera.minimum_markers"
+                    f"{counted(count, 'marker of the body is', 'markers of the body are')} "
+                    f"seen, fewer than the {least} of camera.minimum_markers"
                 )
                 return None
             found = body_poses(

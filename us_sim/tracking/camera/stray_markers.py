@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.settings.spelling import counted
 from us_sim.tracking.camera.markers import dictionary, family
 from us_sim.tracking.camera.rigid_body import RigidBody
 
-__all__ = ["StrayMarkers", "counted"]
+__all__ = ["StrayMarkers"]
 
 
 class StrayMarkers:
@@ -47,11 +48,11 @@ class StrayMarkers:
         if numbers:
             listed = ", ".join(str(number) for number in numbers[:5])
             own = name == self._families[0]
+            markers = counted(len(numbers), "marker")
             self._found = (
-                f", only {counted(len(numbers))} that the body lacks ({listed}): check the "
-                f"body's numbers"
+                f", only {markers} that the body lacks ({listed}): check the body's numbers"
                 if own
-                else f", but {counted(len(numbers))} of {name} ({listed}): check camera.dictionary"
+                else f", but {markers} of {name} ({listed}): check camera.dictionary"
             )
         return start.replace("no marker", "no marker of the body") + self._found
 
@@ -61,8 +62,3 @@ def _numbers_in(image: NDArray[np.uint8], name: str) -> list[int]:
     parameters.errorCorrectionRate = 0.0
     ids = cv2.aruco.ArucoDetector(dictionary(name), parameters).detectMarkers(image)[1]
     return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
-
-
-def counted(count: int) -> str:
-    """``1 marker``, ``2 markers``."""
-    return "1 marker" if count == 1 else f"{count} markers"

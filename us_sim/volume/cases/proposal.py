@@ -39,7 +39,7 @@ from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
-from us_sim.volume.cases.settings import CaseSettings, CaseStart
+from us_sim.volume.cases.settings import SLIDE, CaseSettings, CaseStart
 from us_sim.volume.volume import Volume
 
 __all__ = ["proposed_collider", "proposed_probe", "proposed_start", "with_proposal"]
@@ -63,6 +63,9 @@ _SLID, _SHOWN = (
     6e-3,
 )  # m: the press slides 8 mm along y; its middle, and half of what it shows
 _BETTER = 1.02
+_ROCK = math.radians(4.0)  # to both sides, in the middle of a whole slide
+_STILL = 0.9  # of what the start's image shows, that each image of the slide does
+_PLACES, _LENGTHS = 24, 8  # points along each side of an image; slides that are tried
 _ENDS = 0.1  # of a sweep, at both sides
 _FLAT = 0.015  # m, that the skin may be nearer or farther there
 _WIDEST = 0.05  # m, of a linear array's face
@@ -79,7 +82,7 @@ def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
     Raises:
         CaseError: nothing was scanned: all voxels are 0.
     """
-    start, probe = settings.start, settings.probe
+    start, probe, slide = settings.start, settings.probe, settings.slide
     if start is None or start.proposed:
         if settings.scanned:
             start = _start(settings.scanned[len(settings.scanned) // 2].pose)
@@ -89,10 +92,11 @@ def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
             start = proposed_start(volume)
             probe = probe or proposed_probe(volume, start)
             start = _at_structures(settings, volume, start, probe)
+        slide = _slide(volume, start, probe)
     probe = probe or proposed_probe(volume, start)
     if probe.collider is None:
         probe = dataclasses.replace(probe, collider=proposed_collider(probe.array))
-    return dataclasses.replace(settings, start=start, probe=probe)
+    return dataclasses.replace(settings, start=start, probe=probe, slide=slide)
 
 
 def proposed_start(volume: Volume) -> CaseStart:
@@ -144,6 +148,32 @@ def _of_scanned(settings: CaseSettings, volume: Volume, probe: ProbeSettings) ->
         if shown > best * _BETTER:
             best, first = shown, k
     return _start(poses[first].pose)
+
+
+def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
+    """m, how far the press may slide along the probe's y: its images show what was scanned."""
+    array: Any = probe.array.settings(PROBES)
+    places = np.linspace(0.0, 1.0, _PLACES)
+    x, z = np.meshgrid(array.width * (places - 0.5), array.depth * places)
+    image = _in_image(np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()]), probe)
+
+    def shown(pose: Pose) -> float:
+        """Part of the image at a pose beside the start that shows something."""
+        placed = (start.pose @ pose).apply(image)
+        index = np.rint(placed @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3])
+        inside = ((index >= 0) & (index < volume.shape)).all(axis=1)
+        found = volume.intensities[tuple(index[inside].astype(np.int64).T)] > 0
+        return float(found.sum() / len(image))
+
+    least = _STILL * shown(Pose())
+    for part in np.linspace(1.0, 0.0, _LENGTHS, endpoint=False):
+        for slide in (part * SLIDE, -part * SLIDE):
+            rocked = [Rotation.from_euler("x", sign * part * _ROCK).as_quat() for sign in (-1, 1)]
+            poses = [Pose(np.array([0.0, slide / 2, 0.0]), turned) for turned in rocked]
+            poses += [Pose(np.array([0.0, y, 0.0])) for y in (slide / 4, 0.75 * slide, slide)]
+            if all(shown(pose) >= least for pose in poses):
+                return round(float(slide), 4)
+    return 0.0
 
 
 def _counted(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None:

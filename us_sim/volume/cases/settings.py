@@ -25,10 +25,21 @@ from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
 from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
-__all__ = ["AROUND", "RESERVED", "CaseSettings", "CaseStart", "CaseStructure", "check_name"]
+__all__ = [
+    "AROUND",
+    "RESERVED",
+    "SLIDE",
+    "CaseSettings",
+    "CaseStart",
+    "CaseStructure",
+    "check_name",
+]
 
 AROUND = "tissue"
 """Name of what is in no structure: label 0, or all of a volume without labels."""
+
+SLIDE = 8e-3
+"""m, that the proposed path slides and comes back where nothing else is said."""
 
 _LONGEST_NAME = 80
 _FACES = ("top", "bottom", "left", "right", "front", "back", "sides")
@@ -105,6 +116,12 @@ class CaseSettings(Settings):
     press: float | None = setting(
         Quantity("length", 0.0, 0.1),
         "how deep the proposed path presses; not given: a third of the image, 22 mm at most",
+        default=None,
+    )
+    slide: float | None = setting(
+        Quantity("length", -0.05, 0.05),
+        "how far it slides along the probe's y, and rocks with it; not given: 8 mm, or as far as "
+        "something was scanned beside a proposed start",
         default=None,
     )
     around: Material | str = setting(

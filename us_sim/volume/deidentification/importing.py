@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.file_source import file_source
 from us_sim.volume.deidentification.imported import Imported
 from us_sim.volume.deidentification.kept_part import Regions
@@ -217,7 +218,7 @@ def _what(source: Source, part: Rectangle | None) -> str:
     if part is not None:
         columns, rows = part.size
     if source.placement is None:
-        return f"{count} image{'s' if count > 1 else ''} of {columns} × {rows} pixels"
+        return f"{counted(count, 'image')} of {columns} × {rows} pixels"
     steps = np.linalg.norm(source.placement[:3, :3], axis=0) * 1e3
     apart = " × ".join(f"{step:.4g}" for step in steps)
     return f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"
@@ -228,13 +229,13 @@ def _blanked(
 ) -> str:
     if undecided:
         return "nothing yet: it has to be said what is kept"
-    marked = f"; {lines} places that may be text" if lines else ""
+    marked = f"; {counted(lines, 'place')} that may be text" if lines else ""
     if settings.part is not None:
         return f"all but columns and rows {settings.part} is cut off{marked}"
     if not regions.kept:
         said = f"no text was found in {len(source.samples)} of {source.shape[2]} images"
         said = "as was said" if settings.keep_whole_image else said
-        return f"{lines} places that may be text" if lines else f"nothing ({said})"
+        return f"{counted(lines, 'place')} that may be text" if lines else f"nothing ({said})"
     kept = ", ".join(map(str, regions.kept))
     others = f", and {regions.blanked} of other kinds" if regions.blanked else ""
     return f"everything outside the ultrasound regions {kept}{others}{marked}"

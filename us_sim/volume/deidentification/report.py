@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.imported import Imported
 from us_sim.volume.deidentification.kept_values import NUMBERS
 from us_sim.volume.deidentification.rectangle import Rectangle
@@ -62,11 +63,11 @@ def summary(imported: Imported) -> str:
     """The report in a sentence or two."""
     said = [imported.what, f"blanked: {imported.blanked}", *imported.conversions]
     dropped = sum(imported.dropped.values())
-    said.append(f"{dropped} elements of the header dropped, {len(imported.kept)} kept")
+    said.append(f"{counted(dropped, 'element')} of the header dropped, {len(imported.kept)} kept")
     if imported.remaining:
         said.append(
-            f"{len(imported.remaining)} places that go on may be text: look at the picture of "
-            f"--report"
+            f"{counted(len(imported.remaining), 'place goes', 'places go')} on that may be text: "
+            f"look at the picture of --report"
         )
     return "; ".join(said)
 
@@ -141,8 +142,8 @@ def _text_lines(imported: Imported) -> list[str]:
         return ["Nothing that looks like text was found, which is no proof that there is none."]
     blanked = len(imported.text) - len(imported.remaining)
     lines = [
-        f"{len(imported.text)} places may be text; {blanked} of them are blanked or cut off, and "
-        f"{len(imported.remaining)} would go on:"
+        f"{counted(len(imported.text), 'place')} may be text; {blanked} of them blanked or cut "
+        f"off, and {len(imported.remaining)} would go on:"
     ]
     if not imported.remaining:
         return [lines[0].replace("would go on:", "would go on.")]

@@ -21,8 +21,10 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.reconstruction import Plan, Progress, Reconstruction, reconstruct
 
-__all__ = ["Prediction", "correlation", "leave_one_out"]
+__all__ = ["APART", "Prediction", "correlation", "leave_one_out"]
 
+APART = 8
+"""Frames from one that is left out to the next: the seven between are enough to predict it."""
 _LEAST = 100  # pixels for a correlation
 
 
@@ -64,7 +66,7 @@ def leave_one_out(planned: Plan, count: int, progress: Progress | None = None) -
         raise VolumeError(
             f"{planned.sweep.path}: has {total} usable frames; leaving one out needs 3 or more"
         )
-    count = max(1, min(count, total // 8))
+    count = max(1, min(count, total // APART))
     chosen = np.unique(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1])
     others = np.setdiff1d(np.arange(total), chosen)
     made = reconstruct(planned, [int(k) for k in others], progress)

@@ -26,7 +26,7 @@ from scipy.stats import theilslopes
 
 from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["Fan", "Rectangle", "fitted_part", "seen_pixels"]
+__all__ = ["Fan", "Rectangle", "box_around", "fitted_part", "seen_pixels"]
 
 _LOOKED_AT = 32  # frames
 _OFTEN = 0.7
@@ -120,6 +120,22 @@ def fitted_part(
         if overlap > least:
             best, least = part, overlap
     return best
+
+
+def box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
+    """The smallest rectangle of pixels around the largest part of those seen (rows, columns).
+
+    Args:
+        seen: some of them.
+        pixel: as in `fitted_part`.
+    """
+    body = _body(seen)
+    rows, columns = np.nonzero(seen if body is None else body)
+    x, z = (
+        (float((each.min() - 0.5) * side), float((each.max() + 0.5) * side))
+        for each, side in ((columns, pixel[0]), (rows, pixel[1]))
+    )
+    return Rectangle(x, z)
 
 
 def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

@@ -15,7 +15,13 @@ from us_sim.geometry.placement import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import PROBES
-from us_sim.volume.reconstruction.scanned_part import Fan, Rectangle, fitted_part, seen_pixels
+from us_sim.volume.reconstruction.scanned_part import (
+    Fan,
+    Rectangle,
+    box_around,
+    fitted_part,
+    seen_pixels,
+)
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
@@ -34,16 +40,20 @@ _WIDEST = 0.08  # m, of a linear array: a wider rectangle is something else
 class ScanningProbe:
     """What scanned, and where."""
 
-    probe: ProbeSettings
+    probe: ProbeSettings | None  # None where nothing says which it was
     poses: tuple[Placement, ...]  # in the sweep's reference frame, evenly along its path
 
 
-def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe | None:
-    """The probe of a sweep; None where its images do not prove one.
+def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe:
+    """The probe of a sweep, and where its face was.
+
+    It is the fan that the part names, or what the images prove, or a linear array as wide as the
+    rectangle that the part names. Where there is none of these, the middle of what is not black at
+    the images' top is taken for the middle of its face.
 
     Args:
         sweep: with poses.
-        part: of the images; the fan that it names is the probe's.
+        part: of the images.
         used: (rows, columns) the pixels of that part.
 
     Raises:
@@ -52,14 +62,19 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
     matrices = sweep.image_to_reference
     steps = np.linalg.norm(matrices[:, :3, :2], axis=1)
     across, down = np.moveaxis(matrices[:, :3, :2] / steps[:, None, :], -1, 0)
-    if np.abs((across * down).sum(axis=1)).max() > _SKEWED:
-        return None
     pixel = np.median(steps, axis=0)
-    shape = _given(part, used, pixel) or fitted_part(seen_pixels(sweep), pixel, used)
-    probe = None if shape is None else _probe(shape)
-    if shape is None or probe is None:
-        return None
-    return ScanningProbe(probe, _poses(matrices, shape, pixel))
+    seen = seen_pixels(sweep)
+    shape: Fan | Rectangle | None = None
+    if np.abs((across * down).sum(axis=1)).max() <= _SKEWED:
+        shape = _given(part, used, pixel) or fitted_part(seen, pixel, used)
+    if shape is not None:
+        return ScanningProbe(_probe(shape), _poses(matrices, shape, pixel))
+    box = box_around(
+        used if part.clip is not None or not (seen & used).any() else seen & used, pixel
+    )
+    return ScanningProbe(
+        _probe(box) if part.clip is not None else None, _poses(matrices, box, pixel)
+    )
 
 
 def _given(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Fan | None:

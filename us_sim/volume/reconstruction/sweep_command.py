@@ -15,12 +15,13 @@ from us_sim.errors import VolumeError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import counted
 from us_sim.volume.cases.provenance import Source, Step, add_step, settings_said
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
-from us_sim.volume.reconstruction.leave_one_out import Prediction, leave_one_out
+from us_sim.volume.reconstruction.leave_one_out import APART, Prediction, leave_one_out
 from us_sim.volume.reconstruction.picture import draw_slices
 from us_sim.volume.reconstruction.reconstruction import (
     Plan,
@@ -232,15 +233,19 @@ def _said(
         sentences.append("its colour images were made grey")
     if prediction is not None:
         worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
+        few = len(prediction.frames) < settings.leave_one_out
+        between = f"{APART - 1} others or more stay between two of them"
+        why = f" (not {settings.leave_one_out}: {between})" if few else ""
         sentences.append(
-            f"{len(prediction.frames)} frames predicted from the others correlate with what was "
-            f"seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at worst "
+            f"{counted(len(prediction.frames), 'frame')}{why} predicted from the others correlate "
+            f"with what was seen by {prediction.median:.3f} in the median and "
+            f"{prediction.worst:.3f} at worst "
             f"({_FRAME} {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
         )
     if case.probe is not None:
         sentences.append(f"its images are those of {_array_said(case.probe)}")
     elif not settings.is_volume:
-        sentences.append("its images do not show the probe's shape, which is guessed")
+        sentences.append("nothing shows the probe's shape, which is guessed")
     return "; ".join([*sentences, f"slices in {picture}"])
 
 
