@@ -59,7 +59,7 @@ def test_a_folder_that_was_removed_is_made_again(bag, tmp_path):
 def test_where_nothing_can_go_on_it_waits_until_it_can(bag, tmp_path):
     shutil.rmtree(tmp_path / "here")
     (tmp_path / "here").touch()
-    with pytest.raises(BagError, match=r"here cannot be written .* 1 messages are lost"):
+    with pytest.raises(BagError, match=r"here cannot be written .* 1 message is lost"):
         bag.flush()
     assert not bag.resume()
     (tmp_path / "here").unlink()
@@ -72,7 +72,7 @@ def test_where_nothing_can_go_on_it_waits_until_it_can(bag, tmp_path):
 @pytest.mark.parametrize("whole_folder", [False, True])
 def test_what_was_removed_before_the_end_is_said_at_the_end(bag, whole_folder):
     shutil.rmtree(bag.path.parent) if whole_folder else bag.path.unlink()
-    with pytest.raises(BagError, match="1 messages are lost with it"):
+    with pytest.raises(BagError, match="1 message is lost with it"):
         bag.close()
     assert bag.lost == {"/note": 1}
     bag.close()

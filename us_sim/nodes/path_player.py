@@ -214,8 +214,8 @@ def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
         BagError: neither rise from pose to pose.
     """
     for stamps in (path.stamps, path.log_times):
-        if stamps[0] > 0 and (np.diff(stamps) > 0).all():
-            return stamps
+        if (np.diff(stamps) > 0).all():  # 0 and less would be no time
+            return stamps if stamps[0] > 0 else stamps - stamps[0] + 10**9
     raise BagError(
         f"{path.topic}: neither stamps nor log times rise from pose to pose, so lockstep cannot "
         f"tell the poses apart; record the path again"

@@ -27,6 +27,7 @@ from us_sim.recording.recorded_poses import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
+from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES
 
 __all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
 
@@ -84,7 +85,8 @@ class ProbePath:
 
 
 def read_path(path: str | Path, topic: str | None = None, *, option: str = "topic") -> ProbePath:
-    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
+    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``)
+    or 3D Slicer (``.mrml``, ``.mrb``).
 
     Poses that are not finite or have no orientation are left out and counted.
 
@@ -119,8 +121,8 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
 
 def is_tracker_recording(path: str | Path) -> bool:
-    """Whether a file's name is that of a sequence of Plus."""
-    return Path(path).suffix.lower() in SEQUENCE_SUFFIXES
+    """Whether a file's name is that of a sequence of Plus, or of a scene of 3D Slicer."""
+    return Path(path).suffix.lower() in (*SEQUENCE_SUFFIXES, *SLICER_SCENES)
 
 
 def write_path(

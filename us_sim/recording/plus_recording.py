@@ -1,4 +1,5 @@
-"""Tracker recordings of Plus: a sequence file (`.igs.mha`, `.igs.nrrd`), with or without images.
+"""Tracker recordings: a sequence file of Plus (`.igs.mha`, `.igs.nrrd`), with or without images, or
+a scene or sequence of 3D Slicer (`.mrml`, `.mrb`).
 
 Every sample has a time and named transforms (``ProbeToTracker``), each with a status.
 
@@ -41,6 +42,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
 from us_sim.volume.sequences.frame_transforms import FrameTransforms, along
 from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, read_slicer_sequences
 from us_sim.volume.sequences.transform_chain import TransformChain, shortest_chain
 from us_sim.volume.sequences.transform_name import is_image_frame, split_transform_name
 
@@ -162,7 +164,7 @@ class TrackerRecording:
 
 
 def read_tracker_recording(path: str | Path) -> TrackerRecording:
-    """The transforms of a sequence file of Plus.
+    """The transforms of a sequence file of Plus, or of a scene or sequence of 3D Slicer.
 
     A transform whose status is not OK, or that is not rigid (Plus writes zeros for what it has
     not seen), is not valid; a sample without a time is left out whole. Both are counted.
@@ -171,27 +173,30 @@ def read_tracker_recording(path: str | Path) -> TrackerRecording:
         TrackingError: the file is missing, is no sequence, is cut, or holds no transform or none
             that is valid.
     """
+    path = Path(path)
     try:
-        sequence = read_sequence(path)
+        if path.suffix.lower() in SLICER_SCENES:
+            times, found = read_slicer_sequences(path)
+        else:
+            sequence = read_sequence(path)
+            times, found = sequence.times, dict(sequence.transforms)
     except VolumeError as error:
         raise TrackingError(str(error)) from error
-    timed = np.flatnonzero(np.isfinite(sequence.times))
+    timed = np.flatnonzero(np.isfinite(times))
     transforms = {
         name: _rigid(series, timed)
-        for name, series in sequence.transforms.items()
+        for name, series in found.items()
         if not any(map(is_image_frame, split_transform_name(name) or ()))
     }
     if not transforms:
         raise TrackingError(
             f"{path}: holds no transforms (Seq_Frame0000_ProbeToTrackerTransform); give a tracker "
-            f"recording of Plus"
+            f"recording of Plus or 3D Slicer"
         )
-    recording = TrackerRecording(
-        sequence.path, sequence.times[timed], transforms, sequence.count - len(timed)
-    )
+    recording = TrackerRecording(path, times[timed], transforms, len(times) - len(timed))
     if not any(series.valid.any() for series in transforms.values()):
         raise TrackingError(
-            f"{path}: none of its {sequence.count} samples holds a time and a valid transform"
+            f"{path}: none of its {len(times)} samples holds a time and a valid transform"
             f"{recording.why(transforms)}"
         )
     return recording

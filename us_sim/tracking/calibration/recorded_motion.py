@@ -1,4 +1,4 @@
-"""The motion of a body in a recording: a bag, a tracker recording of Plus, or images.
+"""The motion of a body in a recording: a bag, a tracker recording of Plus or 3D Slicer, or images.
 
 >>> import pathlib, tempfile
 >>> from us_sim.tracking.calibration.recorded_motion import read_motion
@@ -31,6 +31,7 @@ from us_sim.tracking.calibration.position_signal import (
     signal_of_positions,
 )
 from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
 from us_sim.volume.sequences.transform_name import split_transform_name
 
@@ -41,7 +42,8 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
     """The valid poses of a body.
 
     Args:
-        path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd).
+        path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd) or of 3D
+            Slicer (.mrml, .mrb).
         name: a topic; or a transform such as StylusToTracker, or StylusToReference where both
             are recorded. May be None where there is one.
 
@@ -85,7 +87,8 @@ def read_signal(
     Raises:
         UsSimError: it cannot be read, or shows no motion.
     """
-    if is_tracker_recording(path) and (images or not read_sequence(path).transforms):
+    of_plus = path.suffix.lower() in SEQUENCE_SUFFIXES
+    if of_plus and (images or not read_sequence(path).transforms):
         sweep = read_sweep(path, tracked=False)
         return signal_of_images(sweep.times, _with_progress(sweep, progress))
     if images:

@@ -1,4 +1,4 @@
-"""A rigid transform in a YAML file, with the quality of its calibration.
+"""A rigid transform in a YAML file, with the quality of its calibration, or in a file of 3D Slicer.
 
 `us-sim calibrate` writes it and a scene takes it as `registration:` or `calibration:`. The
 pose is that of the frame `from` in the frame `to`, so it turns points of `from` into points of
@@ -27,13 +27,15 @@ from typing import Any
 import numpy as np
 import yaml
 
-from us_sim.errors import CalibrationError, PoseError
+from us_sim.errors import CalibrationError, PoseError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
+from us_sim.volume.sequences.transform_name import split_transform_name
 
 __all__ = [
     "TransformFile",
@@ -83,9 +85,12 @@ def read_transform_file(path: str | Path) -> TransformFile:
 
     Raises:
         CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
-            these are not 3 and 4 finite numbers.
+            these are not 3 and 4 finite numbers; or a file of 3D Slicer (.h5, .tfm) holds no
+            rigid transform.
     """
     path = Path(path)
+    if path.suffix.lower() in SLICER_TRANSFORMS:
+        return _of_slicer(path)
     document = _document(path)
     written = {key: document[key] for key in ("position", "orientation") if key in document}
     place = Reader(str(path), error=CalibrationError).read(_Written, written)
@@ -101,6 +106,20 @@ def read_transform_file(path: str | Path) -> TransformFile:
     from_frame, to_frame, method, date = (str(document.get(key, "")) for key in keys)
     more = {key: value for key, value in document.items() if key not in known}
     return TransformFile(pose, from_frame, to_frame, method, date, residuals, more)
+
+
+def _of_slicer(path: Path) -> TransformFile:
+    """The transform to the parent, in RAS, with frames by the file's name (``ProbeToTracker``)."""
+    try:
+        matrix = read_slicer_transform(path)
+    except VolumeError as error:
+        raise CalibrationError(str(error)) from error
+    try:
+        pose = Pose.from_matrix(matrix)
+    except PoseError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+    from_frame, to_frame = split_transform_name(path.stem) or ("", "")
+    return TransformFile(pose, from_frame, to_frame, "3D Slicer")
 
 
 def write_transform(
