@@ -3,7 +3,8 @@
 >>> from us_sim.settings.spelling import unknown
 >>> unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
 "'fem_nonlinaer' is not one of fem, fem_nonlinear; did you mean 'fem_nonlinear'?"
->>> >>> counted(1, "place"), counted(0, "place"), counted(2, "is", "are")
+>>> from us_sim.settings.spelling import counted
+>>> counted(1, "place"), counted(0, "place"), counted(2, "is", "are")
 ('1 place', '0 places', '2 are')
 """
 
