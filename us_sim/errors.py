@@ -17,7 +17,21 @@ __all__ = [
     "TrackingError",
     "UsSimError",
     "VolumeError",
+    "printable",
 ]
+
+LONGEST = 2000
+"""Characters of a sentence: it may quote a file or a message."""
+
+
+def printable(text: str, longest: int = LONGEST) -> str:
+    """The text on one line, not too long, and of nothing that a terminal obeys.
+
+    >>> printable("a \\x1b[31mname\\nof a stranger", 15)
+    'a ?[31mname of  …'
+    """
+    cut = text if len(text) <= longest else f"{text[:longest]} …"
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in cut)
 
 
 class UsSimError(Exception):
@@ -30,7 +44,7 @@ class UsSimError(Exception):
 
     def __str__(self) -> str:
         """The sentence in one line, whatever the names in it are made of."""
-        return "".join(c if c.isprintable() else " " for c in super().__str__())
+        return printable(super().__str__())
 
 
 class SettingsError(UsSimError):

@@ -10,8 +10,11 @@ from types import TracebackType
 
 from tqdm import tqdm
 
+from us_sim.errors import printable
+
 __all__ = ["Progress", "end_late_bars", "late_progress"]
 
+_LONGEST = 200  # characters of what is being done
 _PATIENCE = 1.0  # s, for which work goes on without a bar
 _UNMEASURED = "{desc}{postfix}, {elapsed}"
 _late: list[Progress] = []  # bars that are drawn and not at their end
@@ -57,13 +60,13 @@ class Progress:
         if self._bar.total is not None:
             done = min(done, self._bar.total)
         self._bar.bar_format = self._layout
-        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
         self._bar.update(done - self._bar.n)
 
     def tell(self, text: str) -> None:
         """Show what is being done where nobody knows how much of it there is."""
         self._bar.bar_format = _UNMEASURED
-        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
         self._bar.update(0)
 
     def __enter__(self) -> Progress:

@@ -9,7 +9,16 @@ from pathlib import Path
 
 from us_sim.errors import UsSimError
 
-__all__ = ["find_bag", "shared_path", "shared_roots"]
+__all__ = ["find_bag", "full_path", "shared_path", "shared_roots"]
+
+
+def full_path(name: str | Path) -> Path:
+    """The absolute path of what a person wrote: with their home for ``~``, and links followed.
+
+    Unlike `Path.resolve` and `Path.expanduser` it never fails: links that lead in a circle, and
+    the home of nobody, are left for whoever opens the file to refuse.
+    """
+    return Path(os.path.realpath(os.path.expanduser(name)))
 
 
 def shared_roots() -> Iterator[Path]:
@@ -47,7 +56,7 @@ def shared_path(relative: str) -> Path:
 
 def find_bag(name: str | Path) -> Path:
     """The bag at that path, or the installed one of that name."""
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     if not os.path.exists(path) and path.name == str(name):
         for root in shared_roots():
             if os.path.exists(root / "bags" / path):

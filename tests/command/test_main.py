@@ -1,5 +1,7 @@
 """The command's error paths: one sentence, status 1, no traceback."""
 
+import errno
+import io
 import re
 import subprocess
 import sys
@@ -7,6 +9,10 @@ import sys
 import pytest
 
 from us_sim.command.main import main
+from us_sim.progress import Progress
+from us_sim.recording.writer import BagWriter
+from us_sim.run.graph import ProcessGroup
+from us_sim.run.supervision import say
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 
 LONG = "x" * 300  # more than a file's name may have
@@ -55,6 +61,63 @@ def test_bad_input_is_one_sentence(args, words, capsys):
     assert words in error
     assert error.startswith("us-sim: ")
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["run", "LOOP.yaml", "--dry-run"],
+        ["run", "upper_arm", "--dry-run", "--volume", "LOOP.mha"],
+        ["run", "upper_arm", "--dry-run", "--path", "LOOP.mcap"],
+        ["bag", "repair", "LOOP.mcap"],
+        ["play", "LOOP.mcap"],
+        ["play", "~nobody-of-that-name/a.mcap"],
+        ["bag", "info", "LOOP.mcap"],
+        ["demo", "upper_arm", "--out", "LOOP"],
+        ["cases", "LOOP"],
+        ["import", "LOOP", "--out", "a"],
+        ["run", "~nobody-of-that-name/a.yaml"],
+    ],
+)
+def test_links_that_lead_in_a_circle_are_one_sentence(args, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for end in ("", ".yaml", ".mha", ".mcap"):
+        (tmp_path / f"LOOP{end}").symlink_to(f"LOOP{end}")
+    assert main(args) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("us-sim: ")
+    assert error.count("\n") == 1
+    assert args[-1].rpartition("/")[2] in error or "LOOP" in error
+
+
+class Full(io.StringIO):
+    """A stream to a full disk."""
+
+    def write(self, _):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("stream", [None, Full()])
+def test_without_standard_error_work_goes_on(stream, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert main(["bag", "info", "nowhere.mcap"]) == 1
+    file = tmp_path / "a.mcap"
+    BagWriter(file).close()
+    assert main(["bag", "repair", str(file)]) == 0
+    assert "0 messages are in" in capsys.readouterr().out
+    assert sys.stderr is stream
+
+
+def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
+    hostile = "\x1b[2J\x1b]0;owned\x07\r\u202e" + "x" * 10_000
+    say(hostile)
+    with Progress("running", 1, "s") as bar:
+        bar.update(0.5, hostile)
+    group = ProcessGroup()
+    group._show(hostile)
+    error = capsys.readouterr().err
+    assert not set("\x1b\x07\u202e") & set(error)
+    assert len(error) < 6_000
 
 
 @pytest.mark.parametrize("module", ["argparse", "us_sim.command.run", "us_sim.recording.reader"])

@@ -9,7 +9,9 @@ from bench import pose_at
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -138,10 +140,42 @@ def test_a_request_that_fails_has_an_answer(bench, broken):
     client = bench.peer.create_client(SetParameters, "set")
     bench.spin_until(client.service_is_ready)
     for count in (1, 2):
-        answer = client.call_async(SetParameters.Request())
+        request = SetParameters.Request(parameters=[ParameterMessage(name="depth")] * 2)
+        answer = client.call_async(request)
         bench.spin_until(answer.done)
-        assert list(answer.result().results) == []
+        assert [each.successful for each in answer.result().results] == [False, False]
         assert broken.failures["service set"] == count
+
+
+@pytest.mark.parametrize("kind", [10, 200, 255])
+def test_a_parameter_of_a_type_that_there_is_not_is_refused(bench, broken, kind):
+    broken.declare_parameter("depth", 1)
+    unknown = ParameterMessage(name="depth", value=ParameterValue(type=kind))
+    known = Parameter("depth", value=5).to_parameter_msg()
+    for service, name in (
+        (SetParameters, "set_parameters"),
+        (SetParametersAtomically, "set_parameters_atomically"),
+    ):
+        client = bench.peer.create_client(service, f"broken/{name}")
+        bench.spin_until(client.service_is_ready)
+        answer = client.call_async(service.Request(parameters=[unknown, known]))
+        bench.spin_until(answer.done)
+        told = answer.result()
+        results = list(told.results) if name == "set_parameters" else [told.result]
+        assert not results[0].successful
+        assert results[0].reason
+    assert len(results) == 1
+
+
+def test_a_clock_that_does_not_come_is_said(bench, monkeypatch):
+    monkeypatch.setattr(guarded_node, "CLOCK_S", 0.05)
+    said = []
+    monkeypatch.setattr(
+        type(bench.peer.get_logger()), "warning", lambda _, text, **__: said.append(text)
+    )
+    bench.make(Broken, use_sim_time=True)
+    bench.spin_until(lambda: said)
+    assert "/clock" in said[0]
 
 
 def test_an_answer_does_not_say_that_what_failed_was_done(bench, broken):

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,19 @@ def test_where_the_server_has_ended_nodes_are_programs(tmp_path):
         os.kill(forks.pid, signal.SIGKILL)
         try:
             assert not is_forked(started(group, recorder(tmp_path)))
+        finally:
+            group.stop()
+
+
+def test_where_the_server_is_stopped_nodes_are_programs_at_once(tmp_path):
+    with server() as forks:
+        group = ProcessGroup(tmp_path / "nodes.log", forks)
+        os.kill(forks.pid, signal.SIGSTOP)
+        began = time.monotonic()
+        try:
+            group.start([recorder(tmp_path)])
+            assert time.monotonic() - began < 20.0  # it was a minute
+            assert not is_forked(group.pids["session_recorder"])
         finally:
             group.stop()
 

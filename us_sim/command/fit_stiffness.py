@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from us_sim.command.scene_options import scene_name
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.errors import BagError, SceneError, StiffnessError
+from us_sim.share import full_path
 from us_sim.tissue.identification.settings import StiffnessSettings
 
 if TYPE_CHECKING:
@@ -88,8 +90,8 @@ def _base(asked: str, scene: Scene) -> dict[str, str]:
 
     if scene.origin.startswith(CASE_PREFIX):
         return {"case": scene.origin.removeprefix(CASE_PREFIX)}
-    is_file = Path(asked).expanduser().exists()
-    return {"based_on": str(Path(scene.origin).resolve()) if is_file else asked}
+    is_file = os.path.exists(os.path.expanduser(asked))
+    return {"based_on": str(full_path(scene.origin)) if is_file else asked}
 
 
 def _write_into_case(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from us_sim.errors import UsSimError
+from us_sim.errors import UsSimError, printable
 
 if TYPE_CHECKING:
     from us_sim.command.chosen_parser import ChosenParser
@@ -27,6 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
         raise KeyboardInterrupt
 
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
+    said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
     try:
         parsed = _parser().parse_args(args)
         return int(parsed.command(parsed) or 0)
@@ -50,8 +53,34 @@ def main(args: Sequence[str] | None = None) -> int:
             raise
         return _interrupted()  # a library that is broken off while it is imported fails in its way
     finally:
+        sys.stderr = said
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class _Lasting:
+    """Standard error that may be closed, or lead to a full disk: no work ends for that."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        if stream is None:  # nothing else may get its descriptor
+            while (file := os.open(os.devnull, os.O_WRONLY)) < 2:
+                pass
+            if file > 2:
+                os.close(file)
+            stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _parser() -> ChosenParser:
@@ -107,4 +136,4 @@ def _say(sentence: str) -> None:
     progress = sys.modules.get("us_sim.progress")  # which costs time to import
     if progress is not None:
         progress.end_late_bars()
-    print(f"us-sim: {sentence}", file=sys.stderr)
+    print(f"us-sim: {printable(sentence)}", file=sys.stderr)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import CameraDriverSettings
+from us_sim.share import full_path
 from us_sim.tracking.camera.info import read_camera_info
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.video_source import VideoSource
@@ -52,7 +52,7 @@ class CameraDriver(GuardedNode):
         self._grey = settings.encoding == "mono8"
         self._latency = round(1e9 * settings.latency)
         self._begun = round(1e9 * settings.begun)  # ns, when a file's first image was due
-        self._camera = read_camera_info(Path(info).expanduser()) if info else None
+        self._camera = read_camera_info(full_path(info)) if info else None
         size = (self._camera.width, self._camera.height) if self._camera else None
         self._video = VideoSource(source, size=size, rate=settings.rate)
         self.finished = Future()

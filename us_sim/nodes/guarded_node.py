@@ -10,11 +10,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
-from us_sim.errors import MessageError, UsSimError
+from us_sim.errors import MessageError, UsSimError, printable
 from us_sim.nodes.conversions.serialized import require_sequences
 from us_sim.nodes.conversions.stamps import require_stamp
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["GuardedNode", "decoded", "kind_of", "shown"]
 
+CLOCK_S = 5.0
+"""For simulated time to begin, before it is said that it does not."""
 SAY_S = 1.0
 """How long the same failure is not said again."""
 HEADER_SIZE = 4
@@ -54,6 +57,19 @@ class GuardedNode(Node):
         """When what is being worked on came, ns of the monotonic clock."""
         self._said: dict[str, float] = {}
         super().__init__(name, **kwargs)
+        if self.get_clock().ros_time_is_active:
+            by_itself = Clock(clock_type=ClockType.STEADY_TIME)
+            self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock, clock=by_itself)
+
+    def _look_for_a_clock(self) -> None:
+        """Say that simulated time does not begin: no other timer of this node runs before."""
+        if self.get_clock().now().nanoseconds:
+            self._clockless.cancel()
+            return
+        self.get_logger().warning(
+            "use_sim_time is true, and nothing has come on /clock: this node waits for it, also "
+            "with its reports; start what publishes it, or set use_sim_time to false"
+        )
 
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
@@ -193,8 +209,13 @@ def kind_of(error: UsSimError) -> str:
     return type(error).__name__.removesuffix("Error").lower()
 
 
-def _refusing(_: Any, response: Any) -> Any:
+def _refusing(request: Any, response: Any) -> Any:
     """The response, which says that what was asked for has failed where it has a field for that."""
+    refused = SetParametersResult(successful=False, reason=FAILED)
+    if hasattr(response, "results") and hasattr(request, "parameters"):
+        response.results = [refused for _ in request.parameters]
+    if hasattr(getattr(response, "result", None), "successful"):
+        response.result = refused
     for name in response.get_fields_and_field_types():
         if name in _DONE:
             setattr(response, name, False)
@@ -210,6 +231,5 @@ def _name(callback: Any) -> str:
 
 
 def shown(sentence: str) -> str:
-    """The sentence on one line, not too long, of what can be printed: it may quote a message."""
-    cut = sentence if len(sentence) <= LONGEST else f"{sentence[:LONGEST]} …"
-    return "".join(c if c.isprintable() else "?" for c in " ".join(cut.split()))
+    """The sentence as it may be logged: it may quote a message."""
+    return printable(" ".join(sentence[: LONGEST + 1].split()), LONGEST)

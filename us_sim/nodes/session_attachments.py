@@ -17,6 +17,7 @@ from us_sim.recording.attached import versions
 from us_sim.recording.storage import bag_files
 from us_sim.scene.reading import parse_scene, scene_document, with_path, with_volume
 from us_sim.settings.setting import rules_of
+from us_sim.share import full_path
 
 __all__ = ["session_attachments"]
 
@@ -39,7 +40,7 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
     listed: dict[Path, str] = {}  # checksums
     for name in settings.attach:
         try:
-            path = Path(name).expanduser()
+            path = full_path(name)
             is_large = path.stat().st_size > LARGEST
         except (OSError, ValueError, RuntimeError) as error:  # the last where `~` is nobody's
             why = getattr(error, "strerror", None) or error

@@ -14,6 +14,7 @@ from itertools import count
 from pathlib import Path
 
 from us_sim.errors import BagError
+from us_sim.share import full_path
 
 __all__ = ["BagNames"]
 
@@ -34,7 +35,7 @@ class BagNames:
 
     def __init__(self, path: Path, *, sidecar: bool, further: bool) -> None:
         is_folder = path.suffix != ".mcap"
-        self._stem = path.resolve().name if is_folder else path.stem
+        self._stem = full_path(path).name if is_folder else path.stem
         self.first = path / f"{self._stem}_0.mcap" if is_folder else path
         self.metadata: Path | None = None
         if further and self.first.exists():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+from us_sim.errors import printable
 from us_sim.recording.reader import Bag
 
 __all__ = ["describe"]
@@ -46,17 +47,12 @@ def describe(bag: Bag) -> str:
         "attached",
         [f"{each['name']} ({each['size']} bytes)" for each in summary["attachments"]],
     )
-    return "\n".join(_printable(line) for line in lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def _section(title: str, entries: list[str]) -> list[str]:
     """Lines under a title, or none."""
     return ["", title, *(f"  {entry}" for entry in entries)] if entries else []
-
-
-def _printable(line: str) -> str:
-    """A line without what a stranger's names could do to a terminal."""
-    return "".join(c if c.isprintable() else " " for c in line)
 
 
 def _date(nanoseconds: int) -> str:

@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import IO
 
 from us_sim.run.end_with_parent import end_with_parent
+from us_sim.run.process_state import process_state
 
 __all__ = ["ForkServer", "ForkedProcess", "package_on_path"]
 
@@ -35,6 +36,8 @@ _PATIENCE_S = 60.0
 """For a process to be there: what it is forked from may have to be imported first."""
 _END_S = 1.0
 _LONGEST_LOOK_S = 0.05
+_STOPPED_LOOKS = 10
+"""How often in a row it is seen stopped before it is given up."""
 
 
 class ForkedProcess:
@@ -156,7 +159,7 @@ class ForkServer:
             except OSError:  # it has ended, or that is too long for it
                 return None
             theirs.close()
-            pid = os.read(ready, 32) if select.select([ready], [], [], _PATIENCE_S)[0] else b""
+            pid = self._answer(ready)
             if not pid:
                 self.close()
                 return None
@@ -164,6 +167,17 @@ class ForkServer:
         os.close(ready)
         stdin = None if feed is None else os.fdopen(feed, "w", encoding="utf-8")
         return ForkedProcess(int(pid), stdin, os.fdopen(heard, encoding="utf-8", errors="replace"))
+
+    def _answer(self, ready: int) -> bytes:
+        """What it says there; nothing where it has ended, is stopped, or takes too long."""
+        assert self._process is not None
+        until, stopped = time.monotonic() + _PATIENCE_S, 0
+        while time.monotonic() < until and stopped < _STOPPED_LOOKS:
+            if select.select([ready], [], [], _LONGEST_LOOK_S)[0]:
+                return os.read(ready, 32)
+            state = process_state(self._process.pid)
+            stopped = stopped + 1 if state is None or state.is_stopped else 0
+        return b""
 
     def close(self) -> None:
         """End it; nodes go on."""
@@ -173,6 +187,7 @@ class ForkServer:
         _adopt_orphans(False)
         self._control.close()
         process.terminate()
+        process.send_signal(signal.SIGCONT)  # one that is stopped ends only then
         try:
             process.wait(_END_S)
         except subprocess.TimeoutExpired:

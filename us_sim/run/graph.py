@@ -16,7 +16,7 @@ from typing import IO, Any
 import yaml
 from tqdm import tqdm
 
-from us_sim.errors import UsSimError
+from us_sim.errors import UsSimError, printable
 from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.nodes.settings import checked_parameters
 from us_sim.run.deferred_signals import deferred_signals
@@ -24,6 +24,7 @@ from us_sim.run.forking import ForkServer
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
+from us_sim.share import full_path
 from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = [
@@ -122,7 +123,7 @@ def player_settings(
 ) -> dict[str, object]:
     """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
     return {
-        "path": str(path.expanduser().resolve()),
+        "path": str(full_path(path)),
         "topic": topic,
         **_awaited(["tracker/pose", *scene.ready_topics], recorder),
     }
@@ -209,7 +210,7 @@ class ProcessGroup:
         """Show a line to the person, too, whom it tells where the page is."""
         self._show(line)
         if self._log is not None and not line.startswith(COMPLAINT):
-            tqdm.write(line.rstrip(), file=sys.stderr)
+            tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
     def _show(self, line: str) -> None:
         """Put a node's line where it belongs."""
@@ -218,7 +219,7 @@ class ProcessGroup:
                 self._log.write(line)
                 self._log.flush()
         elif not line.startswith(COMPLAINT):  # which is said when the node has ended
-            tqdm.write(line.rstrip(), file=sys.stderr)
+            tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
     @property
     def pids(self) -> dict[str, int]:

@@ -32,6 +32,7 @@ from us_sim.run.watch import Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
+from us_sim.share import full_path
 from us_sim.viewer.viewer_settings import ViewerSettings
 
 if TYPE_CHECKING:
@@ -240,7 +241,7 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
 
     keep_on_this_host(network=network)
     settings: dict[str, object] = {
-        "path": str(bag.expanduser().resolve()),
+        "path": str(full_path(bag)),
         "rate": rate,
         "loop": loop,
     }

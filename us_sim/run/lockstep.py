@@ -28,6 +28,7 @@ from us_sim.run.monitored import refuse_unknown
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.spelling import counted
+from us_sim.share import full_path
 
 __all__ = ["render", "render_scene", "truth_folders"]
 
@@ -178,7 +179,7 @@ def _nodes(
         "exclude": ["/diagnostics"],
         "max_cache_size": 0,  # lose nothing, wait for the disk
         **scene_settings(scene),
-        "path": str(path.expanduser().resolve()),
+        "path": str(full_path(path)),
         "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
     }
     recording = NodeProcess("session_recorder", recorder)

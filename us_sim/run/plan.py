@@ -19,6 +19,7 @@ from us_sim.run.graph import (
 )
 from us_sim.run.request import Request
 from us_sim.scene.building import path_of
+from us_sim.share import full_path
 from us_sim.viewer.listening import require_free
 
 __all__ = ["PLAYERS", "Plan", "goes_on", "plan_of"]
@@ -91,7 +92,7 @@ def plan_of(request: Request) -> Plan:
         processes.append(NodeProcess("session_player", settings | dict(request.playing)))
         return Plan(processes, duration=request.duration, player="session_player")
     if request.record is not None:
-        settings = {"file": str(request.record.expanduser().resolve())}
+        settings = {"file": str(full_path(request.record))}
         settings |= scene_settings(scene)
         if request.path is not None:
             settings["path"] = _absolute(request)
@@ -127,4 +128,4 @@ def plan_of(request: Request) -> Plan:
 
 
 def _absolute(request: Request) -> str:
-    return str(request.path.expanduser().resolve()) if request.path is not None else ""
+    return str(full_path(request.path)) if request.path is not None else ""

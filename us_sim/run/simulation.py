@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -25,7 +24,7 @@ from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
-from us_sim.share import find_bag
+from us_sim.share import find_bag, full_path
 
 __all__ = ["Simulation"]
 
@@ -106,7 +105,7 @@ class Simulation:
             load_scene(wanted.scene, volume=wanted.volume)
             return
         if "record" in named and wanted.record:
-            self._check_recording(_file(wanted.record), wanted)
+            self._check_recording(full_path(wanted.record), wanted)
         if {"replay", "replay_as"} & set(named) and wanted.replay:
             file = find_bag(wanted.replay)
             if wanted.replay_as == "path":
@@ -127,7 +126,7 @@ class Simulation:
             return
         request = replace(
             self._request,
-            record=_file(wanted.record) if wanted.record else None,
+            record=full_path(wanted.record) if wanted.record else None,
             is_changed=True,
         )
         if not wanted.replay:
@@ -298,7 +297,7 @@ class Simulation:
             key: player[key] for key in ("position", "duration") if request.path and key in player
         }
         recorder = self._monitor.node.reports.get(RECORDER, {})
-        record = request.record.resolve() if request.record else None
+        record = full_path(request.record) if request.record else None
         if time.monotonic() - self._recording_at > _RECORDING_EVERY_S:
             self._recording_at = time.monotonic()
             self._recording = self._supervisor.recordings.progress(record) if record else {}
@@ -342,11 +341,6 @@ class Simulation:
             replay_as="recording" if request.everything else "path",
             **changes,
         )
-
-
-def _file(name: str) -> Path:
-    """A file by its name; that of an unknown user's home stays as it is."""
-    return Path(os.path.expanduser(name))
 
 
 def _listed(names: list[str]) -> str:

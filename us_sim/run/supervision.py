@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
+from us_sim.errors import printable
 from us_sim.run.graph import (
     INTERRUPTED,
     RECORDER,
@@ -290,4 +291,4 @@ class Supervisor:
 
 def say(sentence: str) -> None:
     """To the person, above the bar."""
-    tqdm.write(f"us-sim: {sentence}", file=sys.stderr)
+    tqdm.write(f"us-sim: {printable(sentence)}", file=sys.stderr)

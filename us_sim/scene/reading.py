@@ -20,7 +20,7 @@ from us_sim.scene.document import merged, read_document
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.settings.reading import Reader
 from us_sim.settings.spelling import nearest, shown
-from us_sim.share import shared_roots
+from us_sim.share import full_path, shared_roots
 
 __all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_path", "with_volume"]
 
@@ -31,7 +31,7 @@ def find_scene(name: str | Path) -> Path:
     Raises:
         SceneError: there is no such file; the sentence lists the installed scenes.
     """
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     if os.path.isfile(path):
         return path.resolve()
     known: dict[str, Path] = {}
@@ -62,7 +62,7 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
     if volume:
         if not isinstance(document, dict) or not isinstance(document.get("volume", {}), dict):
             raise SceneError(f"{origin}: volume: must be a mapping of keys")
-        document = with_volume(document, str(Path(volume).expanduser().resolve()))
+        document = with_volume(document, str(full_path(volume)))
     return parse_scene(document, origin=origin, folders=folders)
 
 
@@ -169,7 +169,7 @@ def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
             return str(_find_case(name, folders))
         except CaseError as error:
             raise SceneError(f"{origin}: {key}: {error}") from error
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     candidates = [path] if path.is_absolute() else [folder / path for folder in folders]
     if key == "path" and not path.is_absolute():
         candidates += [root / "bags" / path for root in shared_roots()]

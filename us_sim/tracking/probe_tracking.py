@@ -27,7 +27,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,11 @@ __all__ = ["ProbeTracking"]
 
 RESTART_NS = 1_000_000_000
 """A stamp that jumps back by more is a restarted source, not a late measurement."""
+
+_LEAST_JUMP = 0.005
+"""m from pose to pose, and back to a quarter of it within `_BACK` poses: no hand does that."""
+_BACK, _WINDOW, _JUMPS = 4, 12, 4
+"""Poses among which a pose comes back; and of so many in a row, how many have to."""
 
 LARGEST_DEVIATION = 1e3
 """m or rad: drivers write any large number where they know nothing, and filters lose digits."""
@@ -89,6 +94,14 @@ class ProbeTracking:
         self.refused: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
         self.last_refused = self.last_problem = ""
+        self._places: deque[NDArray[np.float64]] = deque(maxlen=_BACK + 1)
+        self._jumps: deque[float] = deque(maxlen=_WINDOW)
+
+    @property
+    def jump(self) -> float:
+        """How far poses jump to and fro, m, as those of two sources do; 0 where they do not."""
+        jumps = [jump for jump in self._jumps if jump]
+        return float(np.median(jumps)) if len(jumps) >= _JUMPS else 0.0
 
     def reset(self) -> None:
         """Forget all poses: the next one is the first. What was counted stays."""
@@ -123,6 +136,7 @@ class ProbeTracking:
             self.refuse("covariance", "the pose's covariance has a negative variance")
             return None
         probe = self._of_probe(measurement)
+        self._note_jump(probe.pose.position)
         found = self._believed is not None and probe.stamp - self._believed > self._longest_gap
         if found:
             self.filter.reset()
@@ -139,6 +153,14 @@ class ProbeTracking:
         self._believed = probe.stamp
         self._clock.seen(now_ns)
         return self.filter.update(probe)
+
+    def _note_jump(self, place: NDArray[np.float64]) -> None:
+        """Whether the probe has jumped, back to about where it was a few poses ago."""
+        *earlier, last = self._places or [place]
+        step = float(np.linalg.norm(place - last))
+        nearest = min((float(np.linalg.norm(place - each)) for each in earlier), default=step)
+        self._jumps.append(step if step > _LEAST_JUMP and nearest < 0.25 * step else 0.0)
+        self._places.append(place)
 
     def _in_order(self, stamp: int) -> bool:
         """Whether a stamp is newer, or so much older that the source was started again."""

@@ -69,15 +69,11 @@ class ParameterService:
 
     def _set_parameters(self, request: Any, response: Any) -> Any:
         node = self._require_node()
-        response.results = [
-            _set_atomically(node, [Parameter.from_parameter_msg(parameter)])
-            for parameter in request.parameters
-        ]
+        response.results = [_set_atomically(node, [parameter]) for parameter in request.parameters]
         return response
 
     def _set_parameters_atomically(self, request: Any, response: Any) -> Any:
-        parameters = [Parameter.from_parameter_msg(parameter) for parameter in request.parameters]
-        response.result = _set_atomically(self._require_node(), parameters)
+        response.result = _set_atomically(self._require_node(), request.parameters)
         return response
 
     def _require_node(self) -> Any:
@@ -87,10 +83,12 @@ class ParameterService:
         return node
 
 
-def _set_atomically(node: Any, parameters: list[Parameter]) -> Any:
+def _set_atomically(node: Any, messages: list[Any]) -> Any:
     try:
+        parameters = [Parameter.from_parameter_msg(message) for message in messages]
         return node.set_parameters_atomically(parameters)
-    except ParameterNotDeclaredException as error:
+    # The others: a parameter of a type that there is not.
+    except (ParameterNotDeclaredException, ValueError, TypeError) as error:
         return message_class("rcl_interfaces/msg/SetParametersResult")(
             successful=False, reason=str(error)
         )

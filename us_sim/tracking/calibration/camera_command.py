@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Sequence
 from itertools import compress
@@ -77,7 +78,7 @@ def find_photos(patterns: Sequence[str]) -> list[Path]:
     """
     photos: dict[Path, None] = {}
     for text in patterns:
-        path = Path(text).expanduser()
+        path = Path(os.path.expanduser(text))
         if path.is_file():
             photos[path] = None
             continue

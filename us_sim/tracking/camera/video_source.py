@@ -47,7 +47,7 @@ class VideoSource:
         self.name = source.strip()
         self._size, self._rate = size, rate
         self._capture: cv2.VideoCapture | None = None
-        path = Path(self.name).expanduser()
+        path = Path(os.path.expanduser(self.name))
         is_live = self.name.isdigit() or "://" in self.name
         if not is_live and not os.path.exists(path):
             if self.name.startswith("/dev/"):

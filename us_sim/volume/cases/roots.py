@@ -31,7 +31,7 @@ __all__ = ["case_roots", "cases_in", "find_case"]
 def case_roots() -> list[Path]:
     """Folders of cases; the first of them goes before the others where a name is in several."""
     given = os.environ.get("US_SIM_CASES", "")
-    roots = [Path(part).expanduser() for part in given.split(os.pathsep) if part]
+    roots = [Path(os.path.expanduser(part)) for part in given.split(os.pathsep) if part]
     return roots or [platformdirs.user_data_path("us_sim") / "cases"]
 
 
@@ -60,7 +60,7 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     Raises:
         CaseError: there is none; the sentence says which there are.
     """
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     for folder in (*folders, Path.cwd()):
         if str(name) and is_case(folder / path):
             return (folder / path).resolve()

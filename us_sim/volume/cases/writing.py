@@ -112,7 +112,7 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
 
 
 def _place(folder: str | os.PathLike[str]) -> Path:
-    path = Path(os.path.abspath(Path(folder).expanduser()))
+    path = Path(os.path.abspath(os.path.expanduser(folder)))
     if problem := check_name(path.name):
         raise CaseError(f"{folder}: {problem}")
     return path
