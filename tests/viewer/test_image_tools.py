@@ -317,6 +317,35 @@ def test_the_kept_picture_has_the_image_its_scale_and_the_values(
     assert (picture[: rows[0]].max(axis=2) > 150).any()  # scene and time, above
 
 
+def test_an_image_is_compared_with_those_that_come_as_it_is_seen_and_saved(
+    page: Any, images: Images, tmp_path: Path
+) -> None:
+    def seen() -> int:
+        """The grey value at the image's middle, as the page is painted."""
+        box = page.locator(".us-image").bounding_box()
+        clip = {"x": box["x"] + 99, "y": box["y"] + 99, "width": 2, "height": 2}
+        encoded = np.frombuffer(page.screenshot(clip=clip), np.uint8)
+        return int(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)[0, 0])
+
+    until(lambda: seen() == 40, "the image is seen")
+    page.get_by_role("button", name="Compare").click()
+    until(lambda: seen() == 0, "it does not differ from itself")
+    images.show(100)
+    until(lambda: seen() == 60, "how far they are apart is seen")
+    assert "difference from" in page.locator(".us-facts").inner_text()
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    download.value.save_as(tmp_path / "difference.png")
+    assert (cv2.imread(str(tmp_path / "difference.png"))[400, 400] == 60).all()
+    images.show(101, matrix=[*MATRIX[:9], 2 * DOWN, *MATRIX[10:]])
+    until(lambda: seen() == 101, "an image of other places is not compared")
+    images.show(102)
+    until(lambda: seen() == 62, "and the next again is")
+    page.keyboard.press("v")
+    until(lambda: seen() == 102, "it is compared no more")
+    assert page.locator(".us-facts").inner_text() == ""
+
+
 def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> None:
     """A picture in colour in place of the image, as wide and high as that."""
     encoded = cv2.imencode(".jpg", np.full((rows, columns, 3), 90, np.uint8))[1].tobytes()

@@ -192,7 +192,7 @@ def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
     page.wait_for_function("document.querySelector('.us-modes')")
     until(lambda: NODE in simulator.nodes.watched, "the page looks at the node")
     page.close()
-    until(lambda: NODE not in simulator.nodes.watched, "nobody looks at it any more")
+    until(lambda: not simulator.nodes.watched, "nobody looks at any node any more")
 
 
 def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(

@@ -75,8 +75,8 @@ class _Modes:
         self._remarks: list[str] = []
         board, status = simulator.nodes, simulator.status
         board.watch(NODE)
-        status.watch(pages=1)
         ui.context.client.on_delete(lambda: board.unwatch(NODE))
+        status.watch(pages=1)
         ui.context.client.on_delete(lambda: status.watch(pages=-1))
         ui.timer(_LOOK_S, self._look)
 

@@ -34,6 +34,7 @@ canvas.setAttribute("role", "img");
 canvas.setAttribute("aria-label", "Ultrasound image");
 const context = canvas.getContext("2d", { alpha: false, willReadFrequently: true });
 
+const layers = [canvas];
 let shownFrame = null;
 /** The shown frame's matrix: 16 numbers, row by row, or null while they are not known. */
 let geometry = null;
@@ -43,6 +44,13 @@ const handlers = [];
 /** The canvas that holds the image, one canvas pixel an image pixel. */
 export function imageCanvas() {
   return canvas;
+}
+
+/** Lay a canvas over the image, as large as that. */
+export function addLayer(layer) {
+  layers.at(-1).after(layer);
+  layers.push(layer);
+  drawScale();
 }
 
 /** Whether there is an image in it. */
@@ -221,12 +229,14 @@ function sizeInMillimetres() {
 /** Lay out the image, and draw ticks every 5 mm with numbers every 10 mm of depth. */
 function drawScale() {
   const box = imageBox();
-  Object.assign(canvas.style, {
-    left: `${box.left}px`,
-    top: `${box.top}px`,
-    width: `${box.width}px`,
-    height: `${box.height}px`,
-  });
+  for (const layer of layers) {
+    Object.assign(layer.style, {
+      left: `${box.left}px`,
+      top: `${box.top}px`,
+      width: `${box.width}px`,
+      height: `${box.height}px`,
+    });
+  }
   mark.hidden = !geometry || !hasImage();
   if (geometry) {
     const isLeft = geometry[0] > 0;

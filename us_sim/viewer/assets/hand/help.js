@@ -19,7 +19,7 @@ const PARTS = {
     ["Space", "freeze, go on"],
     ["C  ,  .", "play, step through the last 10 s"],
     ["D O T", "distance, ellipse, text"],
-    ["Esc, P", "no tool, save"],
+    ["Esc, V, P", "no tool, compare, save"],
     ["X, Ctrl Z", "clear or have back, undo"],
   ],
   Keys: [

@@ -3,9 +3,10 @@
 import { element, events } from "../events.js";
 import { frameShown, hasImage } from "../image.js";
 import { isTyping } from "../hand/typing.js";
+import { compare } from "./compare.js";
 import { freeze } from "./freeze.js";
 import { overlay } from "./overlay.js";
-import { KINDS, factsOf, save } from "./picture.js";
+import { KINDS, comparedWith, factsOf, save } from "./picture.js";
 
 const style = document.createElement("link");
 style.rel = "stylesheet";
@@ -50,6 +51,11 @@ const tools = {
   note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
 };
 const clearing = button("Clear", "", clearOrUndo);
+const comparing = button(
+  "Compare",
+  "Hold this image over those that come, and see how far they are apart (key V)",
+  () => compare.toggle(),
+);
 const saving = button("Save", "Keep this as a file (key P)", saveChosen);
 const kinds = document.createElement("select");
 kinds.className = "us-kinds";
@@ -94,7 +100,7 @@ function press(pressed, on) {
 
 /** What needs an image waits for the first. */
 function showWhetherUsable() {
-  for (const made of [freezing, playing, saving]) {
+  for (const made of [freezing, playing, comparing, saving]) {
     made.disabled = !hasImage();
     made.title = made.disabled ? "There is no image yet" : made.dataset.title;
   }
@@ -106,13 +112,21 @@ function showFreeze() {
   freezing.textContent = freeze.isFrozen ? "Go on" : "Freeze";
   press(playing, freeze.isPlaying);
   playing.textContent = freeze.isPlaying ? "Stop" : "Play";
-  scrubber.hidden = moment.hidden = facts.hidden = !freeze.isFrozen;
+  scrubber.hidden = moment.hidden = !freeze.isFrozen;
+  showFacts();
   if (!freeze.isFrozen || !frames.length) return;
-  facts.textContent = factsOf(frameShown()).join(" · ");
   scrubber.max = frames.length - 1;
   scrubber.value = freeze.number;
   const before = (frames[freeze.number].time - frames.at(-1).time) / 1000;
   moment.textContent = `${before.toFixed(1)} s`;
+}
+
+/** Of a frozen image, and of what the image is compared with. */
+function showFacts() {
+  press(comparing, Boolean(compare.held));
+  const frame = frameShown();
+  const said = frame && freeze.isFrozen ? factsOf(frame) : [];
+  facts.textContent = [...said, ...comparedWith(frame)].join(" · ");
 }
 
 function showMeasures() {
@@ -152,6 +166,7 @@ const KEYS = {
   o: () => overlay.use("ellipse"),
   t: () => overlay.use("note"),
   x: clearOrUndo,
+  v: () => hasImage() && compare.toggle(),
   p: saveChosen,
 };
 addEventListener("keydown", (event) => {
@@ -170,6 +185,7 @@ addEventListener("keydown", (event) => {
 
 freeze.on(showFreeze);
 overlay.on(showMeasures);
+compare.on(showFacts);
 events.on("connection", showFreeze);
 events.on("image-drawn", () => freezing.disabled && showWhetherUsable());
 showFreeze();

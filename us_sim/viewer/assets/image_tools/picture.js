@@ -3,12 +3,13 @@
 import { events } from "../events.js";
 import { frameShown, painter, pixelToMillimetres } from "../image.js";
 import { stripsShown } from "../strips.js";
+import { compare } from "./compare.js";
 import { Ellipse, Note } from "./measures.js";
 
 /** Pixels: the least height of the image, and what is around it. */
 const LEAST = 768;
 const LEFT = 56;
-const TOP = 72;
+const TOP = 96;
 const EDGE = 20;
 const LINE = 24;
 
@@ -17,6 +18,11 @@ function timeOf({ header }) {
   const milliseconds = Number(BigInt(header.stamp) / 1_000_000n);
   const fraction = String(milliseconds % 1000).padStart(3, "0");
   return `${new Date(milliseconds).toLocaleString("sv-SE")}.${fraction}`;
+}
+
+/** What a frame is compared with, in words; nothing where it is not. */
+export function comparedWith(frame) {
+  return compare.isWith(frame) ? [`difference from ${factsOf(compare.held).join(" · ")}`] : [];
 }
 
 /** What is known of a frame, in words, as far as it is known. */
@@ -49,7 +55,12 @@ export async function picture(frame = frameShown(), below = []) {
   const { measures } = frame;
   const lines = measures.filter((measure) => !(measure instanceof Note));
   const image = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
-  (await painter(frame))(image.getContext("2d"));
+  const pixels = image.getContext("2d");
+  (await painter(frame))(pixels);
+  if (compare.isWith(frame)) {
+    pixels.globalCompositeOperation = "difference";
+    pixels.drawImage(compare.canvas, 0, 0);
+  }
   const canvas = document.createElement("canvas");
   canvas.width = LEFT + width + EDGE;
   const end = TOP + height + EDGE + LINE * lines.length;
@@ -64,7 +75,8 @@ export async function picture(frame = frameShown(), below = []) {
   draw.textBaseline = "middle";
   const [when, ...facts] = factsOf(frame);
   const what = [frame.header.scene || "us_sim", frame.mode, when, "simulated"];
-  for (const [row, text] of [what.join("   "), facts.join("   ")].entries()) {
+  const words = [what.join("   "), facts.join("   "), ...comparedWith(frame)];
+  for (const [row, text] of words.entries()) {
     draw.fillText(text, LEFT, EDGE + LINE * row, width);
   }
   draw.beginPath(); // the probe's mark is at its -x
