@@ -74,7 +74,7 @@ def page(bench):
 @pytest.fixture
 def tracked(bench):
     """Poses that the probe's tracker publishes."""
-    tracker = bench.make(ProbeTracker)
+    tracker = bench.tracker = bench.make(ProbeTracker)
     poses = bench.collect(PoseStamped, "probe/pose")
     bench.spin_until(lambda: tracker.count_subscribers("probe/pose") > 0)
     return poses
@@ -188,6 +188,12 @@ def test_the_page_that_moved_the_probe_last_holds_it_until_another_does_or_it_go
     for leave in simulator.leaving:
         leave(2)
     bench.spin_until(lambda: told("", is_moving=False))
+    # A page that comes back may hold what nobody holds, and takes it from nobody else.
+    simulator.commands["take"]("other", 3)
+    bench.spin_until(lambda: told("other", is_moving=False))
+    simulator.commands["take"]("page", 4)
+    bench.spin_for(5)
+    assert told("other", is_moving=False)
 
 
 def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):
@@ -288,6 +294,17 @@ def test_no_tracker_that_listens_is_said(bench, page):
     bench.peer.create_publisher(PoseStamped, "probe/pose", 10)
     page.await_leader("tracker")
     assert "follows the scene's own tracker" in page(go="home")
+
+
+def test_a_simulator_that_does_not_follow_is_said(bench, page, tracked, monkeypatch):
+    monkeypatch.setattr("us_sim.nodes.viewer_hand.UNANSWERED", 0.5)
+    page.open()
+    bench.spin_until(lambda: len(tracked) > 2)
+    assert page.state["warning"] == ""
+    bench.executor.remove_node(bench.tracker)  # as one that hangs
+    bench.spin_until(lambda: "does not answer" in page.state["warning"])
+    bench.executor.add_node(bench.tracker)
+    bench.spin_until(lambda: page.state["warning"] == "")
 
 
 def test_a_page_that_comes_back_finds_the_probe_where_it_was(bench, page, tracked):

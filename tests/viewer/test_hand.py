@@ -139,7 +139,7 @@ def test_a_number_beyond_its_range_is_put_to_the_nearest_end_and_that_is_said(
     fan.fill("20")
     page.keyboard.press("Enter")
     viewer.until(lambda: viewer.asked[-1]["to"] == {"fan": pytest.approx(math.radians(20))})
-    assert line.inner_text() == "You hold the probe"
+    assert line.inner_text().startswith("Nobody holds the probe")
     assert "us-wrong" not in line.get_attribute("class")
 
 
@@ -388,7 +388,7 @@ def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
     page.wait_for_function("document.querySelector('.us-quantity input').disabled")
     viewer.say()
     page.wait_for_function("!document.querySelector('.us-quantity input').disabled")
-    assert told.inner_text() == "You hold the probe"
+    assert told.inner_text().startswith("Nobody holds the probe")
 
 
 def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
@@ -404,6 +404,38 @@ def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
     for is_moving in (True, False):
         viewer.say(holder=viewer.asked[-1]["source"], is_moving=is_moving)
         page.wait_for_function(said, arg="You hold the probe")
+
+
+def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_took_it(
+    page: Any, viewer: FakeHand
+) -> None:
+    said = "text => document.querySelector('.us-said').textContent.includes(text)"
+    page.keyboard.press("s")
+    viewer.until(lambda: viewer.asked)
+    source = viewer.asked[-1]["source"]
+    viewer.say(holder=source)
+    page.wait_for_function(said, arg="You hold the probe")
+    lost = "() => import('/us_sim/assets/stream.js').then(m => m.stream.reconnect())"
+    viewer.say(holder="")  # its connection has ended
+    viewer.until(lambda: viewer.takes == [source])
+    page.evaluate(lost)
+    page.wait_for_function(said, arg="The viewer does not answer")
+    viewer.say(holder="another")
+    page.wait_for_function(said, arg="Another page held the probe last")
+    viewer.say(holder="")
+    page.wait_for_function(said, arg="Nobody holds the probe")
+    assert viewer.takes == [source]
+
+
+def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: FakeHand) -> None:
+    said = "text => document.querySelector('.us-said').textContent.includes(text)"
+    viewer.say(every=0.2)
+    page.wait_for_function(said, arg="Nobody holds the probe")
+    page.wait_for_function(said, arg="The viewer does not answer")
+    assert not page.get_by_role("button", name="Centre").is_enabled()
+    assert "us-wrong" in page.locator(".us-said").get_attribute("class")
+    viewer.say(every=0.2)
+    page.wait_for_function(said, arg="Nobody holds the probe")
 
 
 @pytest.mark.parametrize("width", [768, 1024, 1280])

@@ -53,6 +53,8 @@ NEAR = 0.02
 """m from the old place to a new surface: it is another one of the same patient."""
 KEPT = 512
 """Poses whose press is remembered until their image is made."""
+UNANSWERED = 3.0
+"""s without a pose of the tracked probe, after which it is said that nobody answers."""
 ASTRAY, SETTLED = 3e-3, 1.0
 """m, and s of rest, from which on the tracked probe is not where it was put."""
 
@@ -94,8 +96,9 @@ class ViewerHand:
         self._last_stamp = 0  # ns, of the last pose
         self.asked = AskedPoses()
         self._presses: dict[int, float] = {}  # m, by stamp, ns
-        self._sent_at = self._rests_since = 0.0  # s, of the monotonic clock
+        self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
         self._warning = ""
+        self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
         self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
         self._moving_timer.cancel()
@@ -202,7 +205,7 @@ class ViewerHand:
         self._publisher = self._node.create_publisher(
             PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
         )
-        self._rests_since = time.monotonic()
+        self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
         """Publish no more."""
@@ -215,10 +218,11 @@ class ViewerHand:
             self._motion.rest_at(self._motion.stance)
 
     def _ask_for_probe(self, value: Any, page: int) -> str | None:
-        """End what is replayed, so that the page's hand may go on; in the page's thread."""
-        if not self._lead.can_take:
+        """Hold the probe that nobody holds, or that a replay moves, which ends; in its thread."""
+        if self._lead.can_take:
+            self._session.ask(replay="")
+        elif self._lead.obstacle or self.asked.holder not in ("", value):
             return self._lead.obstacle or None
-        self._session.ask(replay="")
         if is_source(value):
             self._post(lambda: self.asked.hold(value, page))
         return None
@@ -236,6 +240,7 @@ class ViewerHand:
 
     def _follow(self, pose: Pose) -> None:
         """Where the probe is: there somebody else has it, or there it should not be."""
+        self._followed_at = time.monotonic()
         if self._publisher is None or self._motion is None or self._standing is None:
             self._elsewhere, self._is_found = pose, True
         elif (
@@ -302,6 +307,13 @@ class ViewerHand:
         self._node.health.published(LEAD_TOPIC)
         self._tell()
 
+    def _unanswered(self) -> str:
+        """Whether nobody follows the poses any more that are published; "" if somebody does."""
+        silent = time.monotonic() - max(self._followed_at, self._taken_at)
+        if self._publisher is None or silent < UNANSWERED:
+            return ""
+        return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
+
     def _tell(self) -> None:
         """The pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
@@ -313,10 +325,11 @@ class ViewerHand:
             "leader": self._lead.who,
             "holder": self.asked.holder,
             "is_moving": self.asked.is_moving,
+            "every": 1.0 / RESTING,  # s, at the latest
             "is_resting": self._publisher is not None and self._moving_timer.is_canceled(),
             "obstacle": self._lead.obstacle,
             "can_take": self._lead.can_take,
-            "warning": self._warning,
+            "warning": self._unanswered() or self._warning,
             **hand_state(surface, stance, goal),
         }
         self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))

@@ -18,6 +18,12 @@ let wish = null;
 let earliest = 0;
 let sent = -TOGETHER_MS;
 let isDue = false;
+/** Whether this page was the last that held the probe, as far as it knows. */
+let isMine = false;
+let heard = 0;
+let isSilent = false;
+/** ms without a state, after which the viewer does not answer, where it says how often it tells. */
+const SILENT_MS = 3000;
 const handlers = [];
 
 export const hand = {
@@ -29,9 +35,19 @@ export const hand = {
     handlers.push(handler);
   },
 
+  /** Whether the viewer answers. */
+  get isAnswered() {
+    return stream.isOpen && !isSilent;
+  },
+
   /** Whether the page may move the probe. */
   get leads() {
-    return this.state?.leader === "hand";
+    return this.isAnswered && this.state?.leader === "hand";
+  },
+
+  /** Whether no page holds the probe. */
+  get isFree() {
+    return this.leads && !this.state.holder;
   },
 
   /** Whether another page acted last. */
@@ -84,11 +100,26 @@ function flush() {
   wish = null;
 }
 
+function tell() {
+  if (hand.state) for (const handle of handlers) handle(hand.state);
+}
+
 stream.on("hand", (header) => {
   hand.state = header;
-  for (const handle of handlers) handle(header);
+  heard = performance.now();
+  isSilent = false;
+  if (header.holder) isMine = header.holder === source;
+  else if (isMine && hand.leads) hand.take(); // the connection was lost, and nobody took it since
+  tell();
 });
 stream.watch("hand");
+events.on("connection", tell);
+document.addEventListener("visibilitychange", () => (heard = performance.now()));
+setInterval(() => {
+  if (isSilent || document.hidden || !hand.state?.every) return;
+  isSilent = performance.now() - heard > SILENT_MS;
+  if (isSilent) tell();
+}, SILENT_MS / 6);
 
 events.on("image-drawn", ({ command }) => {
   if (command?.[0] === source) requestAnimationFrame(() => latency.seen(command[1]));

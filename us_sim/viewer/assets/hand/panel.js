@@ -154,14 +154,16 @@ function show() {
   if (!state) return;
   for (const row of rows) row.show(state, hand.leads);
   for (const button of moves) button.disabled = !hand.leads;
-  take.hidden = !state.can_take;
+  take.hidden = !state.can_take || !hand.isAnswered;
   if (hand.leads && !led) problemEnds = 0; // what was in the way is not any more
   led = hand.leads;
   const isProblem = performance.now() < problemEnds;
-  said.classList.toggle("us-wrong", isProblem || Boolean(state.warning));
+  const silent = hand.isAnswered ? "" : "The viewer does not answer: nobody holds the probe";
+  said.classList.toggle("us-wrong", isProblem || Boolean(silent || state.warning));
   const other = state.is_moving ? "Another page moves the probe" : "Another page held the probe last";
-  const holder = hand.isHeldElsewhere ? other : "You hold the probe";
-  const words = isProblem ? problem : state.warning || state.obstacle || holder;
+  const own = hand.isFree ? "Nobody holds the probe: move it to take it" : "You hold the probe";
+  const holder = hand.isHeldElsewhere ? other : own;
+  const words = isProblem ? problem : silent || state.warning || state.obstacle || holder;
   put(said, "textContent", words);
   put(said, "title", words);
 }
