@@ -10,20 +10,26 @@ from pydicom.uid import ExplicitVRBigEndian, ImplicitVRLittleEndian, JPEG2000Los
 
 from tests.fuzz.target import target
 from tests.volume.files.dicom.made_dicom import (
+    LIVER,
+    SEGMENTED,
     US_IMAGE,
     US_MULTI_FRAME,
     compressed,
     enhanced,
     header,
     item,
+    segmentation,
     turned,
     write,
 )
 from us_sim.volume.deidentification.importing import import_files
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.dicom.placed_images import placed_images
+from us_sim.volume.files.labels import read_labels
+from us_sim.volume.volume import Volume
 
 VOXELS = np.arange(7 * 6 * 5, dtype=np.uint8).reshape(7, 6, 5)
+LABELLED = Volume(np.zeros(LIVER.shape, np.uint8), SEGMENTED)
 CINE = np.arange(4 * 12 * 10, dtype=np.uint8).reshape(4, 12, 10)
 
 
@@ -83,3 +89,17 @@ def cine(path: Path) -> None:
         assert not out.exists()
         raise
     assert out.stat().st_size > 0
+
+
+def segmentation_seeds(folder: Path) -> Iterator[bytes]:
+    """Masks of one bit, fractions, and a label map."""
+    for kind in ("BINARY", "FRACTIONAL", "LABELMAP"):
+        yield segmentation(folder / "labels.dcm", kind).read_bytes()
+
+
+@target("dicom-labels", ".dcm", segmentation_seeds)
+def labels(path: Path) -> None:
+    """Labels on a volume's grid, each with a name."""
+    read = read_labels(path, LABELLED, resample=True)
+    assert read.labels.shape == LABELLED.shape
+    assert set(np.unique(read.labels)) - {0} <= set(read.names)

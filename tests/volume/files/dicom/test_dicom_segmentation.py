@@ -3,9 +3,8 @@
 import numpy as np
 import pydicom
 import pytest
-from made_dicom import header, item, write
+from made_dicom import LIVER, SEGMENTED, VEIN, segmentation
 from pydicom.data import get_testdata_file
-from pydicom.pixels.utils import pack_bits
 
 from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.importing import look_at
@@ -16,64 +15,7 @@ from us_sim.volume.files.dicom.image_format import image_format
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.volume import Volume
 
-SHAPE = (7, 5, 6)
-PLACED = np.diag([0.5e-3, 0.25e-3, 2e-3, 1.0])
-PLACED[:3, 3] = (0.01, -0.02, 0.03)
-VOLUME = Volume(np.zeros(SHAPE, np.uint8), PLACED)
-LIVER = np.zeros(SHAPE, bool)
-LIVER[1:4, 1:3, 2:5] = True
-VEIN = np.zeros(SHAPE, bool)
-VEIN[3:6, 2:4, 0] = VEIN[3:6, 2:4, 4] = True  # of its slices three in between have no frame
-
-SCT = {"CodingSchemeDesignator": "SCT"}
-
-
-def segment(number, label, code, side=None):
-    kind = item(CodeValue=code, CodeMeaning="Doe Jane", **SCT)
-    if side:
-        modifier = item(CodeValue=side, CodeMeaning="x", **SCT)
-        kind.SegmentedPropertyTypeModifierCodeSequence = [modifier]
-    made = item(SegmentNumber=number, SegmentLabel=label, SegmentAlgorithmType="MANUAL")
-    made.SegmentedPropertyTypeCodeSequence = [kind]
-    made.RecommendedDisplayCIELabValue = [34885, 53485, 50171]  # a red
-    return made
-
-
-def segmentation(path, kind="BINARY"):
-    """LIVER as segment 1 and VEIN as segment 2, each slice with a voxel a frame."""
-    frames, groups = [], []
-    masks = {1: LIVER, 2: VEIN}
-    for number, mask in masks.items() if kind != "LABELMAP" else [(0, LIVER | VEIN)]:
-        for k in range(SHAPE[2]):
-            if not mask[:, :, k].any():
-                continue
-            values = np.where(VEIN, 2, LIVER)[:, :, k] if kind == "LABELMAP" else mask[:, :, k]
-            frames.append(values.T.astype(np.uint8) * (200 if kind == "FRACTIONAL" else 1))
-            at = (PLACED @ [0, 0, k, 1])[:3] * 1e3
-            group = item(PlanePositionSequence=[item(ImagePositionPatient=at.tolist())])
-            if number:
-                referenced = item(ReferencedSegmentNumber=number)
-                group.SegmentIdentificationSequence = [referenced]
-            groups.append(group)
-    uid = "1.2.840.10008.5.1.4.1.1.66." + ("7" if kind == "LABELMAP" else "4")
-    made = header(np.array(frames), uid, Modality="SEG", SegmentationType=kind)
-    if kind == "BINARY":
-        made.BitsAllocated = made.BitsStored = 1
-        made.HighBit = 0
-        made.PixelData = pack_bits(np.array(frames))
-    if kind == "FRACTIONAL":
-        made.MaximumFractionalValue = 255
-    measures = item(PixelSpacing=[0.25, 0.5], SpacingBetweenSlices=2.0)
-    along = item(ImageOrientationPatient=[1, 0, 0, 0, 1, 0])
-    made.SharedFunctionalGroupsSequence = [
-        item(PixelMeasuresSequence=[measures], PlaneOrientationSequence=[along])
-    ]
-    made.PerFrameFunctionalGroupsSequence = groups
-    made.SegmentSequence = [
-        segment(1, "Doe Jane", "64033007", "7771000"),
-        segment(2, "portal vein", "32764006"),
-    ]
-    return write(path, made)
+VOLUME = Volume(np.zeros(LIVER.shape, np.uint8), SEGMENTED)
 
 
 @pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL", "LABELMAP"])
