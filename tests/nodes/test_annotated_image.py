@@ -20,7 +20,9 @@ from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.probe_lead import is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.building import probe_of
+from us_sim.slicing.cutting.located import Located
 from us_sim.slicing.drawing.overlay import ColourScale, Overlay
+from us_sim.volume.volume import Volume
 
 TOPIC = "ultrasound/image_annotated"
 LABELS = {5: "artery", 6: "vein"}
@@ -43,6 +45,17 @@ class Shown:
 
     pixels: np.ndarray
     labels: np.ndarray | None = None
+
+    @property
+    def volume(self):
+        """A volume of one layer, whose voxels are the pixels."""
+        layer = self.labels[..., None]
+        return Volume(layer, np.eye(4), layer, {})
+
+    @property
+    def placed(self):
+        pixels = np.array([[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]])
+        return Located(np.zeros(self.labels.shape, np.int32), pixels, np.empty(0, np.intp))
 
 
 class Asked:

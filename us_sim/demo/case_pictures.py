@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.scene.structures import colour_of
+from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.label_outlines import label_outlines
 
 __all__ = ["picture_cases"]
@@ -59,11 +61,13 @@ def _draw(axes: Any, scene: Scene, name: str) -> None:
     extent = (-width / 2, width / 2, top + height, top)
     axes.imshow(scanner.image(Pose()), cmap="gray", vmin=0, vmax=255, extent=extent)
     if volume.labels is not None:
-        labels = scanner.labels(Pose())
+        frame = scanner.frame(Pose())
+        settle = partial(onto_border, frame)
         numbers = {label: number for number, label in volume.label_names.items()}
         scale = np.array([width, height]) / (scanner.probe.columns, scanner.probe.rows)
         for structure, given in scene.structures.items():
-            for outline in label_outlines(labels, numbers[given.label or structure]):
+            number = numbers[given.label or structure]
+            for outline in label_outlines(frame.labels, number, settle=settle):
                 x, y = ((outline + 0.5) * scale + (-width / 2, top)).T
                 axes.plot(
                     np.append(x, x[0]), np.append(y, y[0]), color=colour_of(scene, structure), lw=1

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation
+from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
@@ -67,7 +69,9 @@ def colour_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint
         if stamp in titles:
             velocity = colour.estimate(blood, frame)
             overlay = Overlay(velocity, colour.scale, 0.9, outline=colour.outline)
-            pictures[titles[stamp]] = annotation.draw(frame.pixels, frame.labels, overlay=overlay)
+            pictures[titles[stamp]] = annotation.draw(
+                frame.pixels, frame.labels, overlay=overlay, settle=partial(onto_border, frame)
+            )
     return pictures
 
 

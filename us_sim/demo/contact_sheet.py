@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
 from us_sim.scene.structures import colour_of
+from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.frame import Frame
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
 __all__ = ["contact_sheet"]
@@ -51,8 +54,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
         seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
         if scanner is not None and seen:  # through air nothing is
-            found = scanner.labels(session.poses[stamp], session.nodes[stamp])
-            _outline(axes, found, {numbers[name]: _colour(scene, name) for name in numbers}, extent)
+            frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
+            _outline(axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent)
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
@@ -123,15 +126,16 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
 
 def _outline(
     axes: Any,
-    labels: NDArray[np.uint8],
+    frame: Frame,
     colours: Mapping[int, Colour],
     extent: tuple[float, float, float, float],
 ) -> None:
-    """Draw the outlines of labels (rows, columns) over an image whose extent is in mm."""
+    """Draw the outlines of labels over a frame's image whose extent is in mm."""
     left, right, bottom, top = extent
-    scale = np.array([right - left, bottom - top]) / labels.shape[::-1]
+    scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
+    settle = partial(onto_border, frame)
     for label, colour in colours.items():
-        for outline in label_outlines(labels, label):
+        for outline in label_outlines(frame.labels, label, settle=settle):
             x, y = ((outline + 0.5) * scale + (left, top)).T
             axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
     axes.set(xlim=(left, right), ylim=(bottom, top))

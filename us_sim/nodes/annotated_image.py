@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
@@ -19,6 +20,7 @@ from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
+from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
@@ -180,7 +182,8 @@ class AnnotatedImage:
                 self._probe, self._structures, is_flipped=not self._annotation.is_flipped
             )
         lines = [line for each in self._streams if each.is_wanted for line in each.lines]
-        picture = self._annotation.draw(image, self._labels, badge, overlay, lines)
+        settle = None if frame is None else partial(onto_border, frame)
+        picture = self._annotation.draw(image, self._labels, badge, overlay, lines, settle)
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])

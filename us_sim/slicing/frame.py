@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+from us_sim.slicing.cutting.located import BLACK, Located
+from us_sim.slicing.cutting.resampling import pixel_to_index, sample_labels, sample_plane
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import Probe
 
 if TYPE_CHECKING:
-    from us_sim.slicing.cutting.located import Located
     from us_sim.slicing.cutting.slicer import Slicer
     from us_sim.volume.volume import Volume
 
@@ -143,6 +143,23 @@ class Frame:
             raise MeshError("no tissue carries the volume, so no pixel lies in its mesh")
         assert self.nodes is not None
         return self._slicer.locate(self.nodes, self.plane, self._cut)
+
+    @property
+    def placed(self) -> Located:
+        """Where each pixel lies in the mesh, or in the volume as it is.
+
+        Raises:
+            MeshError: as for `pixels`.
+        """
+        return self.located if self._slicer is not None else self._rigid
+
+    @cached_property
+    def _rigid(self) -> Located:
+        plane = self.plane
+        elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
+        if plane.spans is not None:
+            elements[~plane.is_shown()] = BLACK
+        return Located(elements, pixel_to_index(self.volume, plane)[None], np.empty(0, np.intp))
 
     def locate_some(self, steps: tuple[int, int]) -> Located:
         """Where every so many-th pixel lies in the mesh, see `Slicer.locate_some`.

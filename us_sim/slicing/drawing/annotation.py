@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.slicing.drawing.colour_bar import ColourBar
-from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.drawing.label_outlines import Settle, label_outlines
 from us_sim.slicing.drawing.lettering import Colour, Label, lettering
 from us_sim.slicing.drawing.overlay import mirrored
 
@@ -93,6 +93,7 @@ class Annotation:
         badge: Badge | None = None,
         overlay: Overlay | None = None,
         lines: Sequence[NDArray[np.floating]] = (),
+        settle: Settle | None = None,
     ) -> NDArray[np.uint8]:
         """A new (rows, columns, 3) picture of red, green and blue.
 
@@ -102,12 +103,12 @@ class Annotation:
             badge: for an image that is not live.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
+            settle: of the labels' outlines, as for `label_outlines`.
 
         All as in an image that is not flipped.
         """
         if self.is_flipped:
             pixels = np.ascontiguousarray(pixels[:, ::-1])
-            labels = None if labels is None else np.ascontiguousarray(labels[:, ::-1])
             overlay = None if overlay is None else overlay.flipped()
             lines = [mirrored(line, self._columns) for line in lines]
         picture = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
@@ -122,7 +123,7 @@ class Annotation:
         cv2.polylines(picture, drawn, False, _SHADOW, self._line + 2, cv2.LINE_AA, _FINE)
         cv2.polylines(picture, drawn, False, _FOCUS, self._line, cv2.LINE_AA, _FINE)
         if labels is not None:
-            self._outline(picture, labels, [bar.box] if bar else [])
+            self._outline(picture, labels, [bar.box] if bar else [], settle)
         if bar is not None:
             bar.draw(picture)
         cv2.polylines(picture, self._ticks, False, _SHADOW, self._line + 2)
@@ -194,14 +195,21 @@ class Annotation:
             self._occupied.append(box)
 
     def _outline(
-        self, picture: NDArray[np.uint8], labels: NDArray[np.uint8], drawn: list[Box]
+        self,
+        picture: NDArray[np.uint8],
+        labels: NDArray[np.uint8],
+        drawn: list[Box],
+        settle: Settle | None,
     ) -> None:
         """Thin outlines of the structures, and the name of each once, at its longest outline."""
         named: list[tuple[Label, Box]] = []
         for number, (name, colour) in self._structures.items():
-            outlines = label_outlines(labels, number, smoothing=self._text / 2.5)
+            smoothing = self._text / 2.5
+            outlines = label_outlines(labels, number, smoothing=smoothing, settle=settle)
             if not outlines:
                 continue
+            if self.is_flipped:
+                outlines = [np.asarray(mirrored(each, self._columns), float) for each in outlines]
             chains = [_fine(outline) for outline in outlines]
             cv2.polylines(picture, chains, True, colour, self._line, cv2.LINE_AA, _FINE)
             left, top = np.floor(outlines[0].min(axis=0)).astype(int).tolist()

@@ -11,20 +11,29 @@ array([9., 5.])
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["label_outlines"]
+__all__ = ["Settle", "label_outlines"]
+
+Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+"""Moves points (P, 2) of a label's outline, see `us_sim.slicing.drawing.label_border`."""
 
 _MOST = 64
 """Most outlines of one label; the longest are taken."""
 
 
 def label_outlines(
-    labels: NDArray[np.uint8], label: int, *, least: float = 6.0, smoothing: float = 1.0
+    labels: NDArray[np.uint8],
+    label: int,
+    *,
+    least: float = 6.0,
+    smoothing: float = 1.0,
+    settle: Settle | None = None,
 ) -> list[NDArray[np.float64]]:
     """Closed outlines of the areas and holes of one label, the longest first.
 
@@ -32,6 +41,7 @@ def label_outlines(
         labels: (rows, columns).
         least: pixels that an outline must enclose.
         smoothing: pixels, about the length of the steps between pixels that are smoothed away.
+        settle: moves points of a label's outline to where it runs between voxels.
 
     Returns:
         (P, 2) column and row of each outline, in pixels, between pixels with the label and those
@@ -45,7 +55,8 @@ def label_outlines(
     found, _ = cv2.findContours(around, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=(left, top))
     enclosing = [chain[:, 0] for chain in found if cv2.contourArea(chain) + len(chain) / 2 >= least]
     enclosing.sort(key=len, reverse=True)
-    return [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
+    outlines = [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
+    return outlines if settle is None else [settle(label, outline) for outline in outlines]
 
 
 def _smooth(chain: NDArray[Any], smoothing: float) -> NDArray[np.float64]:

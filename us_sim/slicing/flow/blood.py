@@ -30,8 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.located import Located
-from us_sim.slicing.cutting.resampling import pixel_to_index
 from us_sim.slicing.flow.vessel import Vessel
 from us_sim.slicing.frame import Frame, Mesh
 from us_sim.slicing.probe.probe import Probe
@@ -118,7 +116,7 @@ class Blood:
         self, frame: Frame, window: Window, factors: Sequence[float]
     ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
         self.at(frame)
-        located = _located(frame)
+        located = frame.placed
         velocity = np.full(len(window.pixel), np.nan, dtype=np.float32)
         which = np.full(len(window.pixel), -1, dtype=np.int8)
         in_image = frame.pose.rotation[:, [0, 2]]
@@ -131,16 +129,6 @@ class Blood:
                 np.int8(number), velocity, which,
             )  # fmt: skip
         return velocity.reshape(window.shape), which.reshape(window.shape)
-
-
-def _located(frame: Frame) -> Located:
-    """Where pixels lie in the mesh, or in the volume as it is."""
-    if frame.nodes is not None:
-        return frame.located
-    plane = frame.plane
-    elements = np.zeros((plane.rows, plane.columns), dtype=np.int32)
-    maps = pixel_to_index(frame.volume, plane)[None]
-    return Located(elements, maps, np.empty(0, dtype=np.intp))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
