@@ -160,6 +160,30 @@ def test_the_area_of_an_ellipse_and_its_circumference(page: Any) -> None:
     assert len(values(page)) == 1
 
 
+@pytest.mark.parametrize("tool", ["Distance", "Ellipse"])
+def test_measures_are_put_and_moved_by_keys_alone(page: Any, tool: str) -> None:
+    page.get_by_role("button", name=tool, exact=True).focus()
+    page.keyboard.press("Enter")
+    for key in ("ArrowUp", "Shift+ArrowLeft", "Tab", "ArrowDown"):
+        page.keyboard.press(key)
+    page.keyboard.press("Shift+ArrowRight")
+    box = page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")
+    pixel = 40 / box["width"]  # mm
+    length = math.hypot(8 + 20 * pixel, 2 * pixel)
+    shown = {"Distance": length, "Ellipse": math.pi * length**2 / 4}[tool]
+    (value,) = values(page)
+    assert float(value.split()[0]) == pytest.approx(shown, rel=0.01)
+    focused = page.evaluate("document.activeElement.getAttribute('aria-label')")
+    assert focused == f"Point 2 of measure 1: {value}"
+    page.keyboard.press("Delete")
+    assert values(page) == []
+    page.keyboard.press("t")
+    page.keyboard.press("Enter")
+    page.keyboard.type("vein")
+    page.keyboard.press("Enter")
+    assert values(page) == ["vein"]
+
+
 @pytest.mark.parametrize(
     ("a", "b", "known"),  # 4 a E(m) with E of Abramowitz and Stegun, table 17.1
     [(1, 1, 2 * math.pi), (2, 1, 9.688448220547675), (5, 4, 28.361667888974484), (1, 0, 4)],

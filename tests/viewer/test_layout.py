@@ -77,8 +77,11 @@ def opened(browser: Any, served: Any, hand: FakeHand) -> Iterator[Open]:  # noqa
 
 def chosen(page: Any, tab: str) -> None:
     """Choose a tab, and wait until it has slid in."""
-    page.get_by_role("tab", name=tab).click()
-    page.get_by_role("tab", name=tab, selected=True).wait_for()
+    one = page.get_by_role("tab", name=tab)
+    if one.get_attribute("aria-selected") != "true":
+        before = page.query_selector(".us-panels [role=tabpanel]")
+        one.click()
+        page.wait_for_function("panel => !panel.isConnected", arg=before)
     page.wait_for_function(
         "!document.querySelector('.us-panels').getAnimations({ subtree: true }).length"
     )
@@ -143,9 +146,12 @@ def test_sliders_are_as_long_as_the_window_allows(opened: Open, size: tuple[int,
 def test_fingers_find_room_on_every_control(opened: Open, size: tuple[int, int]) -> None:
     page = opened(size, touch=True)
     page.get_by_role("button", name="Layers").tap()
+    page.get_by_role("button", name="Distance").focus()
+    page.keyboard.press("Enter")
+    page.locator(".us-handle").first.wait_for()
     small = """() => [...document.querySelectorAll(
             "button, input:not([type=checkbox]):not(.q-field *), .us-row label, .q-field--dense," +
-            " [role=tab], [role=switch], .q-slider__track-container, .q-item")]
+            " select, .us-handle, [role=tab], [role=switch], .q-slider__track-container, .q-item")]
         .filter((control) => control.checkVisibility())
         .map((control) => [control, control.getBoundingClientRect()])
         .filter(([, { width, height }]) => Math.min(width, height) < 40)

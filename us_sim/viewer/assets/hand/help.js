@@ -19,6 +19,7 @@ const PARTS = {
     ["Space", "freeze, go on"],
     ["C  ,  .", "play, step through the last 10 s"],
     ["D O T", "distance, ellipse, text"],
+    ["Enter; Tab, arrows", "put it in the middle; move its points"],
     ["Esc, V, P", "no tool, compare, save"],
     ["X, Ctrl Z", "clear or have back, undo"],
   ],

@@ -46,10 +46,19 @@ const moment = Object.assign(document.createElement("span"), { className: "us-mo
 moment.title = "Time before the image was frozen";
 bar.append(scrubber, moment);
 const tools = {
-  distance: button("Distance", "Drag from point to point: mm (key D)", () => overlay.use("distance")),
-  ellipse: button("Ellipse", "Drag an axis, then its other end: mm² (key O)", () => overlay.use("ellipse")),
-  note: button("Text", "Click where it shall be, and write (key T)", () => overlay.use("note")),
+  distance: button("Distance", "Drag from point to point: mm (key D)", take("distance")),
+  ellipse: button("Ellipse", "Drag an axis, then its other end: mm² (key O)", take("ellipse")),
+  note: button("Text", "Click where it shall be, and write (key T)", take("note")),
 };
+
+/** Takes a tool in hand; pressed without a pointer, which has no detail, it is also used at once. */
+function take(tool) {
+  return (event) => {
+    overlay.use(tool);
+    if (!event.detail) overlay.place();
+  };
+}
+
 const clearing = button("Clear", "", clearOrUndo);
 const comparing = button(
   "Compare",
@@ -177,6 +186,7 @@ addEventListener("keydown", (event) => {
     overlay.undo();
   }
   if (isTyping(event)) return;
+  if (event.key === "Enter" && overlay.tool) overlay.place();
   const act = event.key === " " ? () => freeze.toggle() : KEYS[event.key.toLowerCase()] ?? KEYS[event.key];
   if (!act || event.repeat) return;
   event.preventDefault();

@@ -6,7 +6,7 @@
  */
 
 import { element, events } from "../events.js";
-import { frameShown } from "../image.js";
+import { frameShown, imageBox } from "../image.js";
 import { freeze } from "./freeze.js";
 import { Distance, Ellipse, Note } from "./measures.js";
 import { plane } from "./plane.js";
@@ -14,8 +14,11 @@ import { plane } from "./plane.js";
 const SVG = "http://www.w3.org/2000/svg";
 const COLOURS = ["#ffd166", "#6fd08c", "#ff9f68", "#8fb8ff", "#f28fd0"];
 const KINDS = { distance: Distance, ellipse: Ellipse, note: Note };
-/** CSS pixels by which an arrow key moves a point. */
+/** CSS pixels by which an arrow key moves a point, and with shift. */
 const NUDGE = 1;
+const FAR = 10;
+/** Part of the image's width from its middle to an end of what is put there by keys. */
+const REACH = 0.1;
 
 const place = await element("ultrasound");
 const sheet = document.createElementNS(SVG, "svg");
@@ -85,9 +88,9 @@ function drawPoint(measure, number, index, [x, y], group) {
   const handle = add("circle", { cx: x, cy: y, r: 11, class: "us-handle", tabindex: 0 }, group);
   handle.dataset.point = `${number} ${index}`;
   handle.setAttribute("role", "button");
-  handle.setAttribute("aria-label", `Point ${index + 1} of ${number + 1}: ${measure.text}`);
+  handle.setAttribute("aria-label", `Point ${index + 1} of measure ${number + 1}: ${measure.text}`);
   const title = document.createElementNS(SVG, "title");
-  title.textContent = "Drag, or move with the arrow keys; Delete removes it";
+  title.textContent = "Drag, or move with the arrow keys, with Shift farther; Delete removes it";
   handle.append(title);
 }
 
@@ -106,23 +109,31 @@ function pointOf(target) {
   return { measure: measuresShown()[number], index };
 }
 
+/** A measure of the tool in hand between points, mm, in a colour of its own; a text is asked for. */
+function begin(...points) {
+  const measures = measuresShown();
+  const isFree = (colour) => measures.every((other) => other.colour !== colour);
+  const colour = COLOURS.find(isFree) ?? COLOURS[measures.length % COLOURS.length];
+  const measure = Object.assign(new KINDS[tool](...points), { colour });
+  if (tool !== "note") measures.push(measure);
+  else {
+    askWords(measure);
+    overlay.use(null);
+  }
+  return measure;
+}
+
 sheet.addEventListener("pointerdown", (event) => {
   const map = plane();
   if (event.button !== 0 || !map) return;
   if (tool) {
     const point = map.toPlane(at(event));
-    const measures = measuresShown();
-    const isFree = (colour) => measures.every((other) => other.colour !== colour);
-    const colour = COLOURS.find(isFree) ?? COLOURS[measures.length % COLOURS.length];
-    const measure = Object.assign(new KINDS[tool](point), { colour });
-    if (tool === "note") {
+    const measure = begin(point);
+    if (measure instanceof Note) {
       event.preventDefault();
-      askWords(measure);
-      overlay.use(null);
       event.stopPropagation();
       return;
     }
-    measures.push(measure);
     drag = { measure, index: 1, from: point };
   } else if (event.target.dataset?.point) {
     const taken = pointOf(event.target);
@@ -163,8 +174,8 @@ sheet.addEventListener("keydown", (event) => {
   else if (event.key in STEPS) {
     const map = plane();
     const [x, y] = map.toScreen(measure.points[index]);
-    const [dx, dy] = STEPS[event.key];
-    measure.move(index, map.toPlane([x + NUDGE * dx, y + NUDGE * dy]));
+    const [dx, dy] = STEPS[event.key].map((way) => way * (event.shiftKey ? FAR : NUDGE));
+    measure.move(index, map.toPlane([x + dx, y + dy]));
   } else return;
   event.preventDefault();
   event.stopPropagation();
@@ -251,6 +262,20 @@ export const overlay = {
     events.tell("image-tool", tool);
     if (tool) freeze.hold();
     draw();
+  },
+
+  /** Use the tool in hand in the middle of the image, without a pointer; arrows move its points. */
+  place() {
+    const map = tool && plane();
+    if (!map) return;
+    const { left, top, width, height } = imageBox();
+    const across = (part) => map.toPlane([left + part * width, top + height / 2]);
+    if (tool === "note") begin(across(0.5));
+    else {
+      begin(across(0.5 - REACH), across(0.5 + REACH));
+      overlay.use(null);
+      sheet.querySelector(`[data-point="${measuresShown().length - 1} 0"]`).focus();
+    }
   },
 
   remove(measure) {
