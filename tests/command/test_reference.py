@@ -85,3 +85,10 @@ def test_a_part_that_is_not_there_is_said(name, capsys):
 def test_the_page_is_written_to_a_file(tmp_path):
     assert main(["reference", "--out", str(tmp_path / "page.md")]) == 0
     assert (tmp_path / "page.md").read_text(encoding="utf-8") == reference_page()
+
+
+@pytest.mark.parametrize("name", ["fem_nonlinear", "convex", "flow"])
+def test_what_stands_within_another_section_is_found_by_its_own_name(name, capsys):
+    assert main(["reference", name]) == 0
+    said = capsys.readouterr().out
+    assert re.match(rf"#+ .*\b{name}\n", said)

@@ -5,10 +5,11 @@ import pytest
 import yaml
 
 from us_sim.demo.colour_pictures import colour_pictures
-from us_sim.demo.session import Session
+from us_sim.demo.session import LumenAreas, Session
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
+from us_sim.slicing.flow.colour_doppler import ColourDoppler
 
 VEIN = {"kind": "venous", "direction": [0, -1, 0], "peak_velocity": 0.5, "mean_velocity": 0.2}
 
@@ -48,6 +49,28 @@ def test_flow_shows_before_and_after_a_press_and_not_in_it(session, scene):
     assert touched > 30
     assert let_go > 30
     assert pressed < 0.3 * touched  # what is left is the vein's outline and its name
+
+
+def test_moments_are_of_images_that_show_the_vessel_whole(session, scene):
+    """It is out of the image at first, at the deepest, and at the end."""
+    deepest = min(session.poses) + int(2.5e9)
+    session.poses[deepest] = Pose([0.0, 0.0, 0.02])
+    times = np.arange(80) / 10
+    rest = np.where((times < 1.4) | (abs(times - 2.5) < 0.2) | (times > 7.5), np.nan, 1e-5)
+    areas = LumenAreas(times, np.zeros(80), {"vein": np.full(80, 1e-5)}, {"vein": rest})
+    moments = []
+    original = ColourDoppler.estimate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            ColourDoppler,
+            "estimate",
+            lambda self, blood, frame: moments.append(frame.time) or original(self, blood, frame),
+        )
+        assert len(colour_pictures(session, scene, areas)) == 3
+    since = np.array(moments) - 1.0  # s
+    assert ((since > 1.3) & (abs(since - 2.5) > 0.1) & (since < 7.6)).all()
+    areas.at_rest["vein"][:] = np.nan
+    assert colour_pictures(session, scene, areas) == {}
 
 
 def test_there_are_none_of_a_scene_without_flows(session, small_scene):

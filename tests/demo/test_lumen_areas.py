@@ -77,3 +77,15 @@ def test_a_plane_that_hardly_cuts_the_vessel_is_compared_with_nothing(monkeypatc
 def test_a_vessel_that_no_image_cuts_is_not_told(monkeypatch):
     with pytest.raises(AssertionError):  # None
         measured(monkeypatch, [Pose([0.05, 0.0, 0.0])] * 2, [BLOCK.nodes] * 2)
+
+
+def test_a_vessel_that_the_image_cuts_or_that_left_it_is_not_taken_for_a_closed_one(monkeypatch):
+    aside = [0.0, 0.0, 0.008, 0.016, 0.024, 0.024]  # m, by which the vessel is pushed away
+    nodes = [np.add(BLOCK.nodes, [x, 0.0, 0.0]) for x in aside]
+    nodes[1] = BLOCK.nodes * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.03]  # closed where it is
+    poses = [Pose([-0.005, 0.01, 0.0])] * len(nodes)
+    areas = measured(monkeypatch, poses, nodes)
+    fraction = areas.fraction("vein")
+    np.testing.assert_allclose(fraction[[0, 2]], 1.0, atol=0.03)
+    assert fraction[1] < 0.1
+    assert np.isnan(fraction[3:]).all()

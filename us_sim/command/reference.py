@@ -111,11 +111,9 @@ def _part(name: str) -> str:
         UsSimError: there are none of that name.
     """
     sections = list(reference_sections())
-    found = [
-        (level, section)
-        for level, section in sections
-        if section.path == name or section.path.startswith(f"{name}.")
-    ]
+    found = [each for each in sections if f"{each[1].path}.".startswith(f"{name}.")]
+    if not found:  # what stands within another, such as a solver or a kind of probe
+        found = [each for each in sections if f".{name}." in f"{each[1].path}."]
     if not found:
         known = dict.fromkeys(section.path.split(".")[0] for _, section in sections)
         raise UsSimError(f"reference: {unknown(name, [key for key in known if key])}")

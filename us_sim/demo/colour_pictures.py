@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.demo.session import Session
+from us_sim.demo.session import LumenAreas, Session
 from us_sim.geometry.pose import Pose
 from us_sim.scene.blood import blood_of
 from us_sim.scene.building import scanner_of, volume_of
@@ -35,10 +35,17 @@ TILT = 20.0
 _LET_GO = 0.35  # of the deepest press, from which on the vessels are open again
 
 
-def colour_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint8]]:
+def colour_pictures(
+    session: Session, scene: Scene, areas: LumenAreas | None = None
+) -> dict[str, NDArray[np.uint8]]:
     """Pictures (rows, columns, 3) of red, green and blue, by their titles, in order.
 
-    None of a scene without flows or without tissue.
+    None of a scene without flows or without tissue, or whose vessels no image shows.
+
+    Args:
+        session: that was recorded.
+        scene: of the session.
+        areas: of its vessels: moments are chosen among those whose images show the vessels whole.
     """
     if not scene.flows or session.rest is None or session.tetrahedra is None:
         return {}
@@ -60,7 +67,13 @@ def colour_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint
     }
     annotation = Annotation(scanner.probe, outlined)
     aim = settings.depth or 0.5 * scanner.probe.depth
-    titles = {stamp: title for title, stamp in _moments(session, stamps, blood).items()}
+    seen = stamps
+    if areas is not None:
+        named = {scene.structures[name].label or name for name in scene.flows} & {*areas.area}
+        seen = [stamp for stamp in stamps if _is_seen(areas, named, stamp - min(session.poses))]
+    if not seen:
+        return {}
+    titles = {stamp: title for title, stamp in _moments(session, seen, blood).items()}
     pictures = {}
     for stamp in stamps:  # all of them, as a closed vein fills up
         pose = _tilted(session.poses[stamp], aim)
@@ -75,6 +88,12 @@ def colour_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint
     return pictures
 
 
+def _is_seen(areas: LumenAreas, vessels: Collection[str], since: int) -> bool:
+    """Whether the image so long after the first pose (ns) shows vessels whole."""
+    sample = int(np.abs(areas.time - 1e-9 * since).argmin())
+    return all(np.isfinite(areas.at_rest[name][sample]) for name in vessels)
+
+
 def _moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, int]:
     """Stamps by what happens then."""
     times = 1e-9 * np.array(stamps)
@@ -82,7 +101,8 @@ def _moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, 
     deepest = max(float(depth.max()), 1e-9)
     full = int(np.argmax(depth >= deepest - 1e-4))
     held = int(np.flatnonzero(depth >= deepest - 1e-4)[-1])
-    let_go = held + int(np.argmax(depth[held:] < _LET_GO * deepest))
+    after = depth[held:] < _LET_GO * deepest
+    let_go = held + int(np.argmax(after) if after.any() else np.argmin(depth[held:]))
     # The pulse of the first vessel that has the greatest peak: an artery, where there is one.
     pulses = [vessel.pulse(times) for vessel in blood.vessels]
     pulse = max(pulses, key=lambda each: float(each.max()))

@@ -35,7 +35,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         BagError: the session has no image.
     """
     moments = _moments(session)
-    strained, colours = strain_pictures(session, scene), colour_pictures(session, scene)
+    strained, colours = strain_pictures(session, scene), colour_pictures(session, scene, areas)
     more = [each for each in (strained, _flowing(colours)) if each]
     heights = [1.0, 1.0, *[1.0] * len(more), *[0.55] * (areas is not None)]
     height = 4.5 * sum(heights[:-1]) + (4.5 if areas is None else 3.5)
@@ -119,8 +119,8 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
     said = []
     for name, area in areas.area.items():
         percent = 100 * areas.fraction(name)[sample]
-        of_rest = "" if np.isnan(percent) else f" ({percent:.0f} %)"
-        said.append(f"{name} {area[sample] * 1e6:.1f} mm²{of_rest}")
+        of_rest = f"{area[sample] * 1e6:.1f} mm² ({percent:.0f} %)"
+        said.append(f"{name} {'not whole in the image' if np.isnan(percent) else of_rest}")
     return ",   ".join(said)
 
 

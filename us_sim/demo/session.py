@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
@@ -18,6 +19,7 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.tissue_kinds import kind_of
 from us_sim.volume.measure import label_area
 
@@ -115,7 +117,8 @@ class Session:
         """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
 
         Where the probe slides or tilts it sees other cross-sections, so each is compared with that
-        of the same plane at rest, from the skin on. A vessel that no image cuts has none.
+        of the same plane at rest, from the skin on. A vessel that no image cuts has none; of one
+        that reaches the image's edge, now or at rest, nobody knows how large it is.
 
         Args:
             scene: that was recorded.
@@ -135,17 +138,23 @@ class Session:
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
         chosen = [stamps[i] for i in picked]
         pixel = float(np.prod(scanner.probe.pixel_spacing))
+        edge = _edge(scanner.probe)
         found = np.empty((2, len(vessels), len(chosen)))  # m², now and at rest
+        whole = np.ones(found.shape[1:], dtype=bool)  # in the image
         for k, stamp in enumerate(chosen):
             pose = self.poses[stamp]
             seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
             for i, labels in enumerate(seen):
                 found[i, :, k] = [label_area(labels, numbers[name], pixel) for name in vessels]
+                whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
             if progress is not None:
                 progress((k + 1) / len(chosen))
         now, rest = found
+        for k in [*range(1, len(chosen)), *range(len(chosen) - 2, -1, -1)]:
+            for beside in {max(k - 1, 0), min(k + 1, len(chosen) - 1)}:
+                whole[:, k] &= whole[:, beside] | (now[:, k] > 0.0)  # pushed out, maybe not closed
         hardly = rest <= _HARDLY_CUT * rest.max(axis=1, keepdims=True)
-        rest = np.where(hardly, np.nan, rest)
+        rest = np.where(hardly | ~whole, np.nan, rest)
         cut = [i for i in range(len(vessels)) if np.isfinite(rest[i]).any()]
         if not cut:
             return None
@@ -214,6 +223,12 @@ class Session:
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
             for topic, count in said.items()
         }
+
+
+def _edge(probe: Probe) -> NDArray[np.bool_]:
+    """(rows, columns) the last pixels of an image that its beams reach."""
+    reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
+    return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
 
 
 def _lifted(pose: Pose) -> Pose:

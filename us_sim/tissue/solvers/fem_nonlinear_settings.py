@@ -30,9 +30,9 @@ class FemNonlinearSettings(SolverSettings):
     )
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
-        "time after which a frame ends with what it has, and the next goes on. Not given: live, "
-        "what the rate leaves, and up to three times that until the forces are balanced; in "
-        "lockstep no limit, lest results depend on the machine",
+        "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
+        "parameter: live, what the rate leaves, and up to three times that until the forces are "
+        "balanced; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(

@@ -118,12 +118,6 @@ class CaseSettings(Settings):
         "how deep the proposed path presses; not given: a third of the image, 22 mm at most",
         default=None,
     )
-    slide: float | None = setting(
-        Quantity("length", -0.05, 0.05),
-        "how far it slides along the probe's y, and rocks with it; not given: 8 mm, or as far as "
-        "something was scanned beside a proposed start",
-        default=None,
-    )
     around: Material | str = setting(
         description="elastic constants, or a kind of tissue, of what is in no structure",
         choices=tuple(KINDS),
@@ -150,6 +144,12 @@ class CaseSettings(Settings):
         description="poses of the probe along the sweep that the volume was made of, in the "
         "volume's own frame; a proposed start is one of them",
         default=(),
+    )
+    slide: float | None = setting(
+        Quantity("length", -0.05, 0.05),
+        "how far it slides along the probe's y, and rocks with it; not given: 8 mm, or as far as "
+        "something was scanned beside a proposed start",
+        default=None,
     )
 
     def check(self) -> None:
