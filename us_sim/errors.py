@@ -17,6 +17,7 @@ __all__ = [
     "TrackingError",
     "UsSimError",
     "VolumeError",
+    "memory_limit",
     "printable",
 ]
 
@@ -32,6 +33,18 @@ def printable(text: str, longest: int = LONGEST) -> str:
     """
     cut = text if len(text) <= longest else f"{text[:longest]} …"
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in cut)
+
+
+def memory_limit() -> str:
+    """How much memory a process may take here, for a person; nothing where that is not limited."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return ""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return ""
+    return f"a process may take {limit / 1e6:.0f} MB of memory (ulimit -v), which may be too little"
 
 
 class UsSimError(Exception):

@@ -172,3 +172,20 @@ def test_bag_info_lists_the_demos_path(capsys):
     text = capsys.readouterr().out
     assert "/tracker/pose" in text
     assert "600" in text
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_too_little_memory_is_named():
+    program = (
+        "import resource, sys\n"
+        "from us_sim.command import main as command\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))\n"
+        "command._parser = lambda: bytearray(4 << 30)\n"
+        "sys.exit(command.main([]))"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 1
+    assert "2147 MB" in ran.stderr
+    assert "Traceback" not in ran.stderr

@@ -1,5 +1,8 @@
 """The recorder: every topic as soon as it appears, readable at every moment."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from bench import pose_at
@@ -154,3 +157,29 @@ def test_diagnostics_say_that_a_recording_beside_another_gets_no_metadata(bench,
     bench.make(SessionRecorder, file=str(tmp_path / "second.mcap"))
     bench.spin_until(lambda: notes() and notes()[-1])
     assert "metadata.yaml in this folder belongs to another recording" in notes()[-1]
+
+
+GIVEN_BACK = """
+import os, sys
+from us_sim.nodes.session_recorder import give_back_large_buffers
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+give_back_large_buffers()
+larger = bytearray(1 << 22)
+del larger  # from then on glibc takes from its heap what is smaller
+before = resident()
+messages = [bytearray(b"x") * (1 << 20) for _ in range(200)]
+last = bytearray(b"x") * 1000
+assert resident() - before > 150
+del messages
+print(resident() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+def test_memory_of_large_messages_is_given_back():
+    command = [sys.executable, "-c", GIVEN_BACK]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert float(ran.stdout.split()[-1]) < 20

@@ -3,6 +3,9 @@
 import doctest
 import importlib
 import os
+import shutil
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -94,3 +97,12 @@ def test_examples(name):
     result = doctest.testmod(importlib.import_module(f"us_sim.standalone.{name}"))
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_a_loopback_without_ipv4_is_named():
+    program = "import us_sim.nodes, rclpy; rclpy.init()"
+    isolated = ["unshare", "-rn", sys.executable, "-c", program]
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-rn", "true"]).returncode:
+        pytest.skip("no network namespaces here")
+    ran = subprocess.run(isolated, capture_output=True, text=True, check=False)
+    assert "IPv4" in ran.stderr

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from us_sim.errors import UsSimError, printable
+from us_sim.errors import UsSimError, memory_limit, printable
 
 if TYPE_CHECKING:
     from us_sim.command.chosen_parser import ChosenParser
@@ -42,7 +42,7 @@ def main(args: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 0
     except MemoryError:
-        _say("there is not enough memory")
+        _say("; ".join(filter(None, ["there is not enough memory", memory_limit()])))
         return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""

@@ -16,7 +16,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from us_sim.errors import UsSimError
+from us_sim.errors import UsSimError, memory_limit
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.realtime import go_first
 from us_sim.nodes.standby import STANDBY, stand_by
@@ -63,6 +63,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         return _interrupted(node)
     except (UsSimError, ParameterException) as error:
         return _refused(error)
+    except MemoryError:
+        told = ["there is not enough memory", memory_limit()]
+        return _refused(UsSimError("; ".join(filter(None, told))))
     except Exception:
         if rclpy.ok():
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import os
 import sys
@@ -34,6 +35,7 @@ from us_sim.settings.spelling import counted
 
 __all__ = ["SessionRecorder", "main"]
 
+_M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
 MARKERS = "session/marker"
 """What is said there marks a moment."""
 _WITHOUT_METADATA = (
@@ -264,8 +266,18 @@ class SessionRecorder(GuardedNode):
             self.health.state = "waiting" if self._settings.snapshot_mode else "recording"
 
 
+def give_back_large_buffers() -> None:
+    """Have memory of large messages go back to the system as soon as they are written.
+
+    glibc keeps what is freed once such sizes were freed before, unless it is told a threshold.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE)
+
+
 def main(args: list[str] | None = None) -> int:
     """Record until interrupted."""
+    give_back_large_buffers()
     return run_node(SessionRecorder, args)
 
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 import yaml
 from tqdm import tqdm
 
-from us_sim.errors import UsSimError, printable
+from us_sim.errors import UsSimError, memory_limit, printable
 from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.nodes.settings import checked_parameters
 from us_sim.run.deferred_signals import deferred_signals
@@ -256,7 +256,8 @@ class ProcessGroup:
         """Why a node cannot work, in its own words where it has said so."""
         see = f"; see {self._log_path}" if self._log_path else ""
         complaint = self._running[node].complaint
-        return UsSimError(complaint or f"{node} {ending(status)}{see}")
+        limit = f"; {hint}" if (hint := memory_limit()) else ""
+        return UsSimError(complaint or f"{node} {ending(status)}{see}{limit}")
 
     def end(self, node: str) -> None:
         """End one that hangs: it may do so by itself for a moment, also if it was stopped."""

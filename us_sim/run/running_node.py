@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from us_sim.errors import UsSimError
+from us_sim.errors import UsSimError, memory_limit
 from us_sim.run.end_with_parent import end_with_parent
 from us_sim.run.forking import ForkedProcess, ForkServer, package_on_path
 from us_sim.run.parameter_texts import require_texts
@@ -100,7 +100,8 @@ class RunningNode:
         except RuntimeError as error:
             self.process.kill()
             self.process.wait()
-            raise UsSimError(f"{node.node} cannot be followed: {error}") from None
+            told = [f"{node.node} cannot be followed: {error}", memory_limit()]
+            raise UsSimError("; ".join(filter(None, told))) from None
 
     def _read(self) -> None:
         assert self.process.stdout is not None

@@ -11,6 +11,7 @@ DiscoveryRange(name='SUBNET', static_peers=('10.0.0.5', 'pc2'))
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -119,7 +120,7 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
             configuration = f"{reach.configuration()},{os.environ.get('CYCLONEDDS_URI', '')}"
             handle = check(
                 lib.dds_create_domain(domain_id, configuration.encode()),
-                f"DDS domain {domain_id} cannot be set up; check CYCLONEDDS_URI if it is set",
+                f"DDS domain {domain_id} cannot be set up; {_what_to_check()}",
             )
             _domains[domain_id] = _Domain(handle, reach)
         elif domain.reach != reach:
@@ -129,6 +130,20 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
             )
         else:
             domain.users += 1
+
+
+def _what_to_check() -> str:
+    """What may keep DDS from being set up here."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            probe.connect(("127.0.0.1", 9))
+    except OSError as error:
+        return (
+            f"this computer's loopback interface has no IPv4 ({error.strerror}): give it the "
+            f"address 127.0.0.1/8 and bring it up"
+        )
+    return "check CYCLONEDDS_URI if it is set"
 
 
 def release_domain(domain_id: int) -> None:
