@@ -47,6 +47,16 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
             image = np.ascontiguousarray(voxels[:, :, k].T)
             yield image if keep is None else np.where(keep, image, np.uint8(0))
 
+    def sides(keep: NDArray[np.bool_] | None) -> Iterator[list[NDArray[np.uint8]]]:
+        for axis in (0, 1):
+            stack = []
+            for n in spread(voxels.shape[axis]):
+                image = np.ascontiguousarray(np.take(voxels, n, axis))
+                if keep is not None:
+                    image[~np.take(keep, n, 1 - axis)] = 0
+                stack.append(image)
+            yield stack
+
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
     kinds = (kind for start, kind in _KINDS.items() if ending.startswith(start))
     return Source(
@@ -62,9 +72,5 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
         pixel_mm=(1.0, 1.0),
         voxels=blanked,
         images=slices,
-        # A program may have stored the axes of a scanner's images in another order.
-        sides=tuple(
-            [np.ascontiguousarray(np.take(voxels, n, axis)) for n in spread(voxels.shape[axis])]
-            for axis in (0, 1)
-        ),
+        sides=sides,
     )

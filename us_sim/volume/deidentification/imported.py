@@ -30,5 +30,6 @@ class Imported:
     text: tuple[Rectangle, ...]  # where text may be, in `first`
     remaining: tuple[Rectangle, ...]  # of these, what is kept: partly or wholly
     undecided: str = ""  # why nothing can be written before a person has decided
+    blanking_settles: bool = False  # that --blank-text would be a decision
     proposal: Rectangle | None = None  # what to keep, by what moves and shines
     counts: Mapping[str, int] = field(default_factory=dict)

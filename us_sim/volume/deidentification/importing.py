@@ -64,7 +64,7 @@ class Import:
         assert self.out is not None
         if self.imported.undecided:
             raise VolumeError(
-                f"{self.paths[0]}: {self.imported.undecided}; {_advice(self.source, self.imported)}"
+                f"{self.paths[0]}: {self.imported.undecided}; {_advice(self.imported)}"
             )
         if self.source.placement is None:
             write_images(self.out, self.source, self.keep, self.settings.part, progress)
@@ -157,7 +157,8 @@ def _looked_at(
     for line in marked:
         keep[line.grown(_MARGIN).slices] = False
     remaining = tuple(line for line in found if keep[line.slices].any())
-    across = 0 if settings.blank_text else sum(len(find_text(side)) for side in source.sides)
+    sides = source.sides(None if keep.all() else keep) if source.sides else ()
+    across = sum(len(find_text(side)) for side in sides)
     is_told = settings.part is not None or settings.keep_whole_image
     if (remaining or across) and not undecided and not is_told:
         others = f", and {across} in slices across its other axes" if across else ""
@@ -177,6 +178,7 @@ def _looked_at(
         text=tuple(found),
         remaining=remaining,
         undecided=undecided,
+        blanking_settles=bool(undecided) and not source.regions.doubt and not across,
         proposal=proposed_part(source.samples, found) if undecided else None,
     )
     return imported, None if keep.all() else keep
@@ -203,8 +205,8 @@ def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
     return source.regions, ""
 
 
-def _advice(source: Source, imported: Imported) -> str:
-    blank = "" if source.regions.doubt else "--blank-text, "
+def _advice(imported: Imported) -> str:
+    blank = "--blank-text, " if imported.blanking_settles else ""
     proposed = f"{imported.proposal} (a proposal)" if imported.proposal else "X0,Y0,X1,Y1"
     return (
         f"look at the picture of --report, then give --crop {proposed}, {blank}or "

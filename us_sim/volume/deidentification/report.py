@@ -134,7 +134,8 @@ def _files(imported: Imported) -> str:
 
 def _decide(imported: Imported) -> str:
     proposed = f" `{imported.proposal}` is proposed: the yellow box." if imported.proposal else ""
-    return f"Say `--crop X0,Y0,X1,Y1` or `--keep-whole-image`.{proposed}"
+    blank = "`--blank-text` or " if imported.blanking_settles else ""
+    return f"Say `--crop X0,Y0,X1,Y1`, {blank}`--keep-whole-image`.{proposed}"
 
 
 def _text_lines(imported: Imported) -> list[str]:

@@ -33,6 +33,12 @@ class Images(Protocol):
     def __call__(self, keep: NDArray[np.bool_] | None, /) -> Iterator[NDArray[np.uint8]]: ...
 
 
+class Sides(Protocol):
+    """Some slices across each of the other two axes, of what is kept of the images."""
+
+    def __call__(self, keep: NDArray[np.bool_] | None, /) -> Iterator[list[NDArray[np.uint8]]]: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Source:
     """Images of one volume or of one recording, as they come."""
@@ -49,7 +55,7 @@ class Source:
     pixel_mm: tuple[float, float]  # their width and height
     voxels: Voxels | None
     images: Images | None
-    sides: tuple[list[NDArray[np.uint8]], ...] = ()  # some slices across other axes of a volume
+    sides: Sides | None = None  # of a volume whose axes may be in another order than a scanner's
 
 
 def spread(count: int) -> list[int]:
