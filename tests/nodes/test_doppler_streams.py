@@ -167,6 +167,26 @@ def test_why_an_image_shows_no_flow_is_on_diagnostics_at_once(bench, scene, send
     assert waits < 2.0  # else it comes once a second
 
 
+@pytest.mark.parametrize(("kind", "steering"), [("colour", 0.2), ("spectrum", 0.2)])
+def test_what_is_to_follow_a_vessel_finds_it_and_stays_on_it(bench, send, kind, steering):
+    given = {f"{kind}.follow": True, f"{kind}.steering": steering, "overlay": "velocity"}
+    node, pose = send(**given)
+    pictures = bench.collect(Image, "ultrasound/image_annotated")
+    bench.collect(Image, "ultrasound/spectrum")
+    bench.spin_until(lambda: node._annotated.is_wanted and node._streams[-2].is_wanted)
+
+    def place(second):
+        count = len(pictures)
+        pose(second)
+        bench.spin_until(lambda: len(pictures) > count)
+        return [node.get_parameter(f"{kind}.{name}").value for name in ("lateral", "depth")]
+
+    found = place(3)
+    assert abs(found[0] - getattr(node.scene, kind).lateral) > 0.01
+    assert place(4) == pytest.approx(found, abs=0.02)
+    assert node.health.values["no_spectrum" if kind == "spectrum" else "no_colour"] == ""
+
+
 @pytest.mark.parametrize("kind", ["m_mode", "spectrum"])
 def test_a_strip_goes_on_when_the_line_or_the_gate_is_moved(bench, send, kind):
     node, pose = send(**{"spectrum.gain": 30.0})  # so that noise lights the columns

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from us_sim.nodes.conversions import field_message
+from us_sim.nodes.frame_streams.following import Following
 from us_sim.nodes.frame_streams.settable_stream import SettableStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.drawing.overlay import Overlay
@@ -31,6 +32,7 @@ class ColourStream(SettableStream[ColourDoppler]):
     def __init__(self, node: SceneNode, blood: Blood) -> None:
         super().__init__(node, node.scene.colour, "colour.")
         self._blood = blood
+        self._following = Following(node, "colour.", blood)
         self._frame: Frame | None = None
 
     def _make(self, probe: Probe, settings: ColourSettings) -> ColourDoppler:
@@ -52,6 +54,7 @@ class ColourStream(SettableStream[ColourDoppler]):
         """Made once, since frames before it count, too."""
         if frame is not self._frame:
             doppler = self.for_frame(frame)
+            self._following.look(frame, doppler.settings, 0.0)
             self._shown = doppler.estimate(self._blood, frame)
             self._frame = frame
             why = doppler.absence(self._blood, frame, self._shown)

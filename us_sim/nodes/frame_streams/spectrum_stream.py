@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from us_sim.nodes.conversions import colour_image_message
+from us_sim.nodes.frame_streams.following import Following
 from us_sim.nodes.frame_streams.settable_stream import SettableStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.flow.blood import Blood
@@ -29,6 +30,7 @@ class SpectrumStream(SettableStream[Spectrum]):
     def __init__(self, node: SceneNode, blood: Blood) -> None:
         super().__init__(node, node.scene.spectrum, "spectrum.")
         self._blood = blood
+        self._following = Following(node, "spectrum.", blood)
 
     @property
     def lines(self) -> Sequence[NDArray[np.float64]]:
@@ -43,6 +45,7 @@ class SpectrumStream(SettableStream[Spectrum]):
 
     def _message(self, frame: Frame, stamp: Time) -> Image:
         spectrum = self.for_frame(frame)
+        self._following.look(frame, spectrum.settings, spectrum.settings.steering)
         picture = spectrum.show(self._blood, frame)
         self._node.health.values["no_spectrum"] = spectrum.absence(self._blood, frame).value
         return colour_image_message(picture, stamp, "probe")

@@ -31,6 +31,9 @@ class DopplerSettings(Settings):
     depth: float | None = setting(
         Quantity("length", 1e-3, 0.4), "of the middle; not given: the image's middle", default=None
     )
+    follow: bool = setting(
+        description="keep the middle on the vessel nearest to it in the image", default=False
+    )
     steering: float = setting(
         Quantity("angle", math.radians(-30), math.radians(30)),
         "of the beams towards +x of the probe; linear probes only",
