@@ -7,8 +7,12 @@ from typing import Any
 
 import pytest
 from chromium import chromium
+from hypothesis import settings
 
 import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
+
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 

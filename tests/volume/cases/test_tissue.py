@@ -59,7 +59,7 @@ def test_arrays_that_do_not_go_together_are_refused(tmp_path, tissue):
     np.savez(path, **{**arrays, "tetrahedra": arrays["tetrahedra"] + 100})
     with pytest.raises(CaseError, match="remove it"):
         read_tissue(path)
-    np.savez(path, **{**arrays, "made_from": np.array(["x"], dtype=object)}, allow_pickle=True)
+    np.savez(path, **{**arrays, "made_from": np.array(["x"], dtype=object)})
     with pytest.raises(CaseError, match="remove it"):
         read_tissue(path)
 

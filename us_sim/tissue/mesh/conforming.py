@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,14 +113,12 @@ def conforming_mesh(
     return _within(box, nodes, tetrahedra, tolerance)
 
 
-def _run(
-    arrays: dict[str, NDArray[np.generic]], seconds: float
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """What fTetWild makes of it, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder).resolve()
         given, made = place / "given.npz", place / "made.npz"
-        np.savez(given, allow_pickle=False, **arrays)
+        np.savez(given, **arrays)
         # -P: this folder is no place to import from.
         command = [sys.executable, "-P", str(Path(wild_mesher.__file__)), str(given), str(made)]
         try:

@@ -73,7 +73,7 @@ def write_tissue(path: Path, tissue: CaseTissue) -> None:
     Raises:
         CaseError: it cannot be written.
     """
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, Any] = {
         "nodes": tissue.mesh.nodes,
         "tetrahedra": tissue.mesh.tetrahedra,
         "labels": tissue.labels,
@@ -88,7 +88,7 @@ def write_tissue(path: Path, tissue: CaseTissue) -> None:
         raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
     try:
         with os.fdopen(number, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            np.savez(file, **arrays)
         mask = os.umask(0)
         os.umask(mask)
         os.chmod(name, 0o666 & ~mask)
