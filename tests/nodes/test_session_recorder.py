@@ -171,7 +171,7 @@ larger = bytearray(1 << 22)
 del larger  # from then on glibc takes from its heap what is smaller
 before = resident()
 messages = [bytearray(b"x") * (1 << 20) for _ in range(200)]
-last = bytearray(b"x") * 1000
+last = [bytearray(b"x") * 100_000 for _ in range(20)]
 assert resident() - before > 150
 del messages
 print(resident() - before)
