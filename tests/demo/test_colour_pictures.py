@@ -51,6 +51,12 @@ def test_flow_shows_before_and_after_a_press_and_not_in_it(session, scene):
     assert pressed < 0.3 * touched  # what is left is the vein's outline and its name
 
 
+def test_a_press_shorter_than_a_heartbeat_has_a_picture_of_its_own(session, scene):
+    for k, stamp in enumerate(session.poses):
+        session.poses[stamp] = Pose([0.0, 0.0, 0.012 if 20 <= k < 23 else 0.0])
+    assert list(colour_pictures(session, scene)) == ["touched", "full press", "let go"]
+
+
 def test_moments_are_of_images_that_show_the_vessel_whole(session, scene):
     """It is out of the image at first, at the deepest, and at the end."""
     deepest = min(session.poses) + int(2.5e9)

@@ -108,10 +108,15 @@ def _moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, 
     pulse = max(pulses, key=lambda each: float(each.max()))
     beat = 1.0 / max(flow.settings.heart_rate for flow in blood.vessels)
     found = {}
-    for title, begin in (
-        ("touched", int(np.argmax(depth >= 0.0))), ("full press", full), ("let go", let_go),
-    ):  # fmt: skip
+    for title, begin, lasts in (
+        ("touched", int(np.argmax(depth >= 0.0)), depth < 0.9 * deepest),
+        ("full press", full, depth >= 0.9 * deepest),
+        ("let go", let_go, depth < 0.9 * deepest),
+    ):
         within = (times >= times[begin]) & (times < times[begin] + beat)
+        over = within & ~lasts & (times > times[begin])
+        if over.any():  # a quick hand does not wait for the systole
+            within &= times < times[over][0]
         found[title] = stamps[int(np.argmax(np.where(within, pulse, -np.inf)))]
     return found
 
