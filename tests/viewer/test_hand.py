@@ -86,8 +86,12 @@ def test_most_of_the_press_slider_presses_and_it_goes_by_keys(page: Any, viewer:
         slider.value = +slider.min + part * (slider.max - slider.min);
         slider.dispatchEvent(new Event("input"));
     }"""
-    contact = float(press.evaluate("s => s.style.getPropertyValue('--contact')"))
+    contact = float(press.evaluate("s => s.parentNode.style.getPropertyValue('--contact')"))
     assert contact < 0.25
+    mark = press.evaluate(
+        "s => parseFloat(getComputedStyle(s.parentNode, '::before').marginLeft) / s.clientWidth"
+    )
+    assert mark == pytest.approx(contact, abs=0.05)
     middle = (1 + contact) / 2
     for part, metres in ((0, -0.05), (contact, 0), (middle, 0.0125), (1, 0.025)):
         press.evaluate(slide, part)

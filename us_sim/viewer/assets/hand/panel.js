@@ -114,7 +114,7 @@ function makeRow([name, label, title, { unit, factor, digits, step, notch, air =
       }
       if (limits && air !== 1) {
         const contact = slider.min / (slider.min - slider.max);
-        slider.style.setProperty("--contact", contact);
+        all.style.setProperty("--contact", contact);
       }
       if (!goal) return;
       const text = (goal[name] * factor).toFixed(digits).replace(/^-(0\.?0*)$/, "$1");
