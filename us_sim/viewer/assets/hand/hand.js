@@ -11,7 +11,12 @@ import { latency } from "./latency.js";
 
 /** ms: wishes that come closer together than a picture are sent as one. */
 const TOGETHER_MS = 14;
-const source = Array.from(crypto.getRandomValues(new Uint32Array(2)), (n) => n.toString(36)).join("");
+/** The name of a page that held the probe, for when it is loaded anew: it holds it again. */
+const KEPT = "us-hand";
+const kept = sessionStorage.getItem(KEPT);
+sessionStorage.removeItem(KEPT); // or a copy of the page would bear it, too
+const made = Array.from(crypto.getRandomValues(new Uint32Array(2)), (n) => n.toString(36)).join("");
+const source = kept ?? made;
 
 let sequence = 0;
 let wish = null;
@@ -19,7 +24,8 @@ let earliest = 0;
 let sent = -TOGETHER_MS;
 let isDue = false;
 /** Whether this page was the last that held the probe, as far as it knows. */
-let isMine = false;
+let isMine = Boolean(kept);
+addEventListener("pagehide", () => isMine && sessionStorage.setItem(KEPT, source));
 let heard = 0;
 let isSilent = false;
 /** ms without a state, after which the viewer does not answer, where it says how often it tells. */
