@@ -91,7 +91,7 @@ def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None)
     settings: dict[str, object] = {"host": view.host, "port": view.port}
     if view.recordings:
         settings["recordings"] = view.recordings
-    return NodeProcess(VIEWER, settings, given or {}, {TOKEN: _viewer_token()})
+    return NodeProcess(VIEWER, settings, given or {}, secrets={TOKEN: _viewer_token()})
 
 
 @functools.cache

@@ -34,8 +34,8 @@ class NodeProcess:
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # more, which a person gave
-    kept: dict[str, object] = field(default_factory=dict)  # and more, which were set as it ran
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
+    kept: dict[str, object] = field(default_factory=dict)  # and more, which were set as it ran
 
     def __post_init__(self) -> None:
         require_texts(self.all_parameters)
