@@ -1,6 +1,7 @@
 """Parameters: what ROS shows of each setting, what may change, and what a change does."""
 
 import importlib
+import math
 import threading
 from typing import Any
 
@@ -169,7 +170,7 @@ def test_the_frequency_is_one_that_the_probe_has_while_artefacts_are_live(bench,
 
 @pytest.fixture
 def pressed(bench, small_scene):
-    """A node that is pressed once, its forces, and what presses."""
+    """A node, and what presses it once and returns its force, NaN where it is not in balance."""
 
     def begin(**parameters: object) -> Any:
         node = bench.make(TissueDeformer, scene=str(small_scene), **parameters)
@@ -179,10 +180,13 @@ def pressed(bench, small_scene):
         turn = iter(range(1, 10_000))
 
         def press(depth: float = 0.004) -> float:
-            count = len(wrenches)
+            count, before = len(wrenches), unbalanced()
             publisher.publish(pose_at(depth, next(turn)))
-            bench.spin_until(lambda: len(wrenches) > count)
-            return wrenches[-1].wrench.force.z
+            bench.spin_until(lambda: len(wrenches) > count or unbalanced() > before)
+            return wrenches[-1].wrench.force.z if len(wrenches) > count else math.nan
+
+        def unbalanced() -> int:
+            return int(node.health.values.get("unbalanced", "0"))
 
         return node, press
 
