@@ -26,12 +26,15 @@ LONGEST = 2000
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
-    """The text on one line, not too long, and of nothing that a terminal obeys.
+    """The text on one line, of nothing that a terminal obeys, without its middle if it is long.
 
-    >>> printable("a \\x1b[31mname\\nof a stranger", 15)
-    'a ?[31mname of  …'
+    The end stays, since it says what is wrong and what to do.
+
+    >>> printable("a \\x1b[31mname\\nof a stranger", 20)
+    'a ?[31mnam … a stranger'
     """
-    cut = text if len(text) <= longest else f"{text[:longest]} …"
+    half = longest // 2
+    cut = text if len(text) <= longest else f"{text[:half]} … {text[len(text) - half :]}"
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in cut)
 
 

@@ -86,7 +86,8 @@ def _block(name: str) -> None:
 
 def _section(name: str, label: str) -> ui.element:
     """A part of the page that assistive technology lists by its label."""
-    section = ui.element("section").classes(name)
+    section = ui.element("section")
+    section.classes.append(name)
     section.props["aria-label"] = label
     return section
 

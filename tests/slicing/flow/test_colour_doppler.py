@@ -178,7 +178,13 @@ def test_the_same_moment_has_the_same_noise_and_others_have_other(scanner, blood
 )
 def test_colour_is_shown_within_its_box_only(lateral, width, depth, height, steering):
     asked = ColourSettings(
-        lateral, depth, steering, width=width, height=height, gain=30.0, resolution=0.0
+        lateral,
+        depth,
+        steering=steering,
+        width=width,
+        height=height,
+        gain=30.0,
+        resolution=0.0,
     )
     doppler = ColourDoppler(PROBE, asked)
     scanner, blood = BMode(SMALL.volume, PROBE), SMALL.blood

@@ -145,7 +145,7 @@ def test_what_cannot_be_tracked_is_said(shape, window, sentence):
         ({"since": "then"}, "strain.since: 'then' is not one of rest, image"),
         ({"interval": 0}, "strain.interval: 0 is outside 1 to 60"),
         ({"colours": 0.0}, "strain.colours: 0 is outside"),
-        ({"window": 3}, "strain.window: 3 m is outside .* did you mean '3 cm'"),
+        ({"window": 3}, "strain.window: 3 m is outside .* did you mean '3 mm'"),
         ({"correlation": 1.5}, "strain.correlation"),
     ],
 )

@@ -29,7 +29,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from us_sim.kernels import njit
 from us_sim.slicing.frame import Frame
@@ -126,6 +125,8 @@ def _share_of(volume: Volume, label: int) -> _Share:
 
 
 def _made(mask: NDArray[np.bool_]) -> _Share:
+    from scipy import ndimage  # which no other part of an image needs
+
     (box,) = ndimage.find_objects(mask.astype(np.uint8), max_label=1)
     # Beyond the volume it goes on as it is at its sides.
     crop = mask[box].astype(np.float32)
