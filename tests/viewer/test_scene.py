@@ -413,8 +413,8 @@ def test_what_is_older_than_the_image_is_marked_until_it_is_not(
     patient.show(90, noon)
     patient.push(noon, noon)
     patient.move(np.zeros(3), noon)
-    page.wait_for_timeout(1000)
-    assert not old.is_visible()
+    scene.page.wait_for_function("() => window.usSim.images() > 0")
+    old.wait_for(state="hidden")  # what was seen at first is drawn late on a busy computer
     patient.show(95, noon + 400_000_000)
     page.wait_for_timeout(600)
     assert not old.is_visible()
