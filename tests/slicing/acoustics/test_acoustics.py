@@ -127,6 +127,41 @@ def test_a_frequency_below_the_volumes_own_blurs():
     assert steps[1] < 0.7 * steps[0]
 
 
+@pytest.mark.parametrize("flat", [0.35, 0.2])
+def test_the_walls_of_a_crushed_vein_are_drawn_without_steps(flat):
+    voxel, radius, middle = 2.5e-4, 4e-3, 0.0121
+    x, _, z = np.indices((121, 9, 121)) * voxel
+    labels = np.where(np.hypot(x - 0.0152, z - middle) < radius, 3, 1).astype(np.uint8)
+    dark = Volume(np.zeros_like(labels), np.diag([voxel] * 3 + [1.0]), labels, NAMES)
+    walls = {"vein": TissueAcoustics(reflection=-11.0)}
+    probe = LinearProbe(aperture=0.024, depth=0.024, columns=320, rows=320)
+    scanner = BMode(dark, probe, acoustics=dataclasses.replace(LIVE, frequency=12e6, tissues=walls))
+    depths = np.linspace(-0.002, 0.028, 14)
+    mesh = box_mesh(np.linspace(0.0, 0.03, 9), [0.0, 0.002], depths)
+    scanner.carry(mesh.nodes, mesh.tetrahedra)
+    # Layers of tetrahedra that the vein lies in are crushed, others are not; all slope.
+    crushed = (depths[1:] > middle - radius) & (depths[:-1] < middle + radius)
+    heights = np.concatenate([[0.0], np.cumsum(np.diff(depths) * np.where(crushed, flat, 1.0))])
+
+    def pressed(x, z):
+        return np.interp(z, depths, depths[0] + heights) + 0.15 * (x - 0.0152)
+
+    nodes = mesh.nodes.copy()
+    nodes[:, 2] = pressed(nodes[:, 0], nodes[:, 2])
+    image = scanner.image(Pose([0.0152, 0.001, 0.0]), nodes).astype(float)
+    pixel = probe.depth / probe.rows
+    column, row = np.arange(120, 200), np.arange(probe.rows)[:, None]
+    x = 0.0152 + (column + 0.5) * pixel - 0.012
+    for side in (-1, 1):
+        z = middle + side * np.sqrt(radius**2 - (x - 0.0152) ** 2)
+        wall = pressed(x, z) / pixel - 0.5  # row
+        level = image[:, column] * (side * (row - wall) > -5.0) * (abs(row - wall) < 8.0)
+        weight = level**4
+        off = (weight * (row - wall)).sum(axis=0) / weight.sum(axis=0)
+        assert np.sqrt(np.mean(off**2)) < 0.2
+        assert np.abs(np.diff(off)).max() < 0.3
+
+
 @pytest.mark.parametrize("radius", [5.0, 8.0])
 def test_normals_of_a_ball_of_voxels_point_to_its_middle(radius):
     labels = (np.linalg.norm(np.indices((32, 32, 32)) - 15.3, axis=0) < radius).astype(np.uint8)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
-from us_sim.slicing.acoustics.beam_grid import BeamGrid
+from us_sim.slicing.acoustics.beam_grid import LOCATED, BeamGrid
 from us_sim.slicing.acoustics.fibres import Fibres
 from us_sim.slicing.acoustics.media import decibels_per_metre, media_of, surface_levels
 from us_sim.slicing.acoustics.noise import Noise
@@ -84,7 +84,7 @@ class BeamAcoustics:
             rise = 0.0
         self._time_gain = (rise * grid.distance).astype(np.float32)
         self._rise = np.float32(rise * grid.step)
-        self._steps = np.array(grid.steps)
+        self._steps = np.array(LOCATED)
         self._fibres = Fibres(directions) if len(directions) else None
         self._no_fibres = np.zeros((1, 1, 2), dtype=np.float32)
         self._pulse = _PULSE * SPEED_OF_SOUND / frequency
@@ -96,8 +96,8 @@ class BeamAcoustics:
         self._corners = np.empty((0, 4), dtype=np.int32)
         self._gain = _apart((grid.samples, grid.beams), np.float32)
         self._blocked, self._blocker = np.zeros_like(self._gain), np.zeros_like(self._gain)
-        columns = -(-probe.columns // grid.steps[1])
-        self._elements = _apart((-(-probe.rows // grid.steps[0]), columns), np.int32)
+        columns = -(-probe.columns // LOCATED[1])
+        self._elements = _apart((-(-probe.rows // LOCATED[0]), columns), np.int32)
         places = grid.places.astype(np.int64)
         places = places // columns * self._elements.shape[1] + places % columns
         self._places = np.ascontiguousarray(places, dtype=np.int32)
@@ -133,8 +133,8 @@ class BeamAcoustics:
         if self._fibres is not None:
             fibre = self._fibres.now(located, nodes, frame.plane)
         self._found, first = follow_beams(
-            self._elements.reshape(-1), located.maps, self._voxels, self._shape, self._places,
-            self._lines, self._across, self._along, self._media, self._time_gain, fibre,
+            self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
+            self._voxels, self._shape, self._places, self._lines, self._across, self._along, self._media, self._time_gain, fibre,
             self._gain, self._blocked, self._blocker, self._crossings,
         )  # fmt: skip
         sharpen_edges(
@@ -165,15 +165,15 @@ class BeamAcoustics:
         if self.grid.is_linear:
             sharpen_borders(
                 self._found, self._crossings, self._gain, self._blocked, self._media, self._rise,
-                self._steps, gain,
+                np.array(self.grid.pixels), gain,
             )  # fmt: skip
         return gain
 
     def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
         """Where pixels lie in the mesh, and the mesh; without one all are rigid."""
         if frame.nodes is not None:
-            return frame.locate_some(self.grid.steps), frame.nodes
-        plane, (row_step, step) = frame.plane, self.grid.steps
+            return frame.locate_some(LOCATED), frame.nodes
+        plane, (row_step, step) = frame.plane, LOCATED
         shape = -(-plane.rows // row_step), -(-plane.columns // step)
         elements = np.zeros(shape, dtype=np.int32)
         maps = np.ascontiguousarray(pixel_to_index(self._volume, plane)[None])

@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["BeamGrid", "aperture"]
+__all__ = ["LOCATED", "BeamGrid", "aperture"]
+
+LOCATED = (2, 2)
+"""Rows and columns from one pixel to the next of those that beams know the place of."""
 
 _STEP = 0.45e-3  # m, between samples, where the image is as fine as that
 _PIXELS_ACROSS = 2  # a beam
@@ -39,19 +42,18 @@ class BeamGrid:
         lateral, axial = probe.pixel_spacing
         self.is_linear = is_linear = isinstance(probe, LinearProbe)
         rows = min(max(round(_STEP / axial), _ROWS[0]), _ROWS[1])
+        self.pixels = (rows, _PIXELS_ACROSS)  # rows a sample, columns a beam of a linear array
         self.step = float(rows * axial)  # m
         self.samples = max(2, math.ceil(probe.depth / self.step - 1e-6))
         self.distance = (np.arange(self.samples) + 0.5) * self.step  # (samples,) m
         if is_linear:
             self.beams = max(1, -(-probe.columns // _PIXELS_ACROSS))
             part = (np.arange(self.beams) + 0.5) * _PIXELS_ACROSS / probe.columns
-            self.steps = (rows, _PIXELS_ACROSS)  # of the pixels that are located
         else:
             ends = (probe.beam_starts, probe.beam_starts + probe.depth * probe.beam_directions)
             widest = max(np.linalg.norm(np.diff(end, axis=0), axis=1).sum() for end in ends)
             self.beams = max(2, math.ceil(widest / (_PIXELS_ACROSS * math.sqrt(lateral * axial))))
             part = (np.arange(self.beams) + 0.5) / self.beams
-            self.steps = (2, 2)
         self.starts, self.directions = probe.rays(np.minimum(part, 1.0))  # m, and unit: x and z
         x = self.starts[:, 0] + self.distance[:, None] * self.directions[:, 0]
         z = self.starts[:, 1] + self.distance[:, None] * self.directions[:, 1]
@@ -82,14 +84,11 @@ class BeamGrid:
 
         Of those that beams reach, since the nearest of all may lie beside a fan.
         """
-        row_step, step = self.steps
+        row_step, step = LOCATED
         many = -(-probe.columns // step)
         row = np.clip(np.rint(self.rows / row_step), 0, (probe.rows - 1) // row_step).astype(int)
         column = np.clip(np.rint(self.columns / step), 0, many - 1).astype(int)
-        if nearest is None:
-            row[:], column[:] = np.arange(self.samples)[:, None], np.arange(self.beams)
-            row = np.minimum(row, (probe.rows - 1) // row_step)
-        else:
+        if nearest is not None:
             row, column = nearest[0][row, column], nearest[1][row, column]
         return np.ascontiguousarray((row * many + column).T, dtype=np.int32)
 
@@ -107,14 +106,13 @@ class BeamGrid:
     @property
     def room(self) -> tuple[int, int]:
         """Rows and columns of pixels that all samples and beams of a linear array are on."""
-        return self.samples * self.steps[0], self.beams * self.steps[1]
+        return self.samples * self.pixels[0], self.beams * self.pixels[1]
 
     def on_pixels(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (samples, beams) at the pixels (rows, columns), linear in between."""
         rows, columns = self._shape
         if self._maps is None:
-            size = self.beams * self.steps[1], self.samples * self.steps[0]
-            resized: Any = cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)
+            resized: Any = cv2.resize(values, self.room[::-1], interpolation=cv2.INTER_LINEAR)
             return np.asarray(resized)[:rows, :columns]
         remapped = cv2.remap(values, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(remapped)

@@ -43,7 +43,9 @@ _PER_VOXEL = float(1 << _BITS)
 _UNIT = 1.0 / _PER_VOXEL
 _FARTHEST = 1e6  # voxels
 _CLOSE = 4  # voxels from one look to the next, at most
-_MOST_PARTS = 8  # looks from one sample to the next
+_LEAP = _CLOSE << _BITS
+_MOST_PARTS = 8  # looks from one place on a beam to the next
+_LEGS = 3  # from one sample to the next, where these lie in different tetrahedra
 _HALF = 0.5 + SLACK  # of a voxel, from its face to its centre, and rounding
 _HALVINGS = 6  # of a sample, to find where a beam crosses a border
 _DARK = 30.0  # dB after which it does not matter where more is lost
@@ -90,14 +92,14 @@ def room_for_crossings(count: int) -> Crossings:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def follow_beams(
-    elements, maps, voxels, shape, places, lines, across, along, media, time_gain, fibre,
-    gain, blocked, blocker, crossings,
+    elements, wide, steps, maps, voxels, shape, places, lines, across, along, media, time_gain,
+    fibre, gain, blocked, blocker, crossings,
 ):  # fmt: skip
     """Fills gain, blocked and blocker; returns the numbers of crossings and of clear samples.
 
     Args:
-        elements: (pixels,) as `Located.elements`, flat; maps: as there. voxels: (I*J*K,) uint8
-            labels, shape: (3,) its sides.
+        elements: (pixels,) as `Located.elements`, flat, ``wide`` a row, every ``steps`` (2,) rows
+            and columns; maps: as there. voxels: (I*J*K,) uint8 labels, shape: (3,) its sides.
         places: (beams, samples) int32, of the element at each sample.
         lines: (beams, 4) column and row of the first sample, and from each to the next.
         across, along: (beams,) float32, the beams' directions as x and z.
@@ -112,7 +114,6 @@ def follow_beams(
     found = 0
     first_blocked = samples
     half = np.float32(0.5)
-    one = np.float32(1.0)
     nothing = np.float32(0.0)
     of_label = media.of_label
     sides = (shape[0], shape[1], shape[2])
@@ -150,82 +151,103 @@ def follow_beams(
                     gy = _fixed(m[1, 1] * to_column + m[1, 2] * to_row)
                     gz = _fixed(m[2, 1] * to_column + m[2, 2] * to_row)
                 medium = _medium_in(x, y, z, voxels, sides, of_label)
+            legs = 1
+            if element != held and element >= 0 and held >= 0 and was != NOTHING:
+                # Another tetrahedron is squeezed otherwise, which matters where a border may be.
+                if medium != was or max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP:
+                    legs = _LEGS
             held = element
-            # Where tissue is squeezed there is more of it between two samples.
-            parts = np.int64(1)
-            if element >= 0 and was != NOTHING:
-                apart = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >> _BITS
-                parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
-            length = half if s == 0 else np.float32(1.0 / parts)
-            lx, ly, lz = px, py, pz
-            for q in range(1, parts + 1):
-                nx, ny, nz, now = x, y, z, medium
-                if q < parts:
-                    nx, ny, nz = (
-                        px + (x - px) * q // parts,
-                        py + (y - py) * q // parts,
-                        pz + (z - pz) * q // parts,
-                    )
-                    now = _medium_in(nx, ny, nz, voxels, sides, of_label)
-                if now == was:
-                    soft += length * media.loss[now]
-                    if media.blocks[now]:
-                        loss = length * media.shadow[now]
-                        where = _blocked_at(where, hard, loss, s)
-                        hard += loss
-                else:
-                    high = 1.0
-                    if s == 0:
-                        high = 0.0
-                    elif was != NOTHING and now != NOTHING:
-                        part = 1.0
-                        ax, ay, az = lx, ly, lz  # still before the border
-                        bx, by, bz = nx, ny, nz  # behind it
-                        for _ in range(_HALVINGS):
-                            part *= 0.5
-                            cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
-                            if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
-                                ax, ay, az = cx, cy, cz
-                            else:
-                                bx, by, bz = cx, cy, cz
-                                high -= part
-                        high -= 0.5 * part
+            for leg in range(1, legs + 1):
+                ex, ey, ez, inner, next_medium = x, y, z, element, medium
+                begin = np.float32(s - 1 + (leg - 1) / legs)
+                if leg < legs:
+                    c = column + (s - 1 + leg / legs) * to_column
+                    r = row + (s - 1 + leg / legs) * to_row
+                    i = np.int64(r / steps[0] + 0.5) * wide + np.int64(c / steps[1] + 0.5)
+                    inner = elements[min(max(i, 0), len(elements) - 1)]
+                    if inner < 0:
+                        inner = element
+                    m = maps[np.uint64(inner)]
+                    ex = _fixed(m[0, 0] + m[0, 1] * c + m[0, 2] * r + _HALF)
+                    ey = _fixed(m[1, 0] + m[1, 1] * c + m[1, 2] * r + _HALF)
+                    ez = _fixed(m[2, 0] + m[2, 1] * c + m[2, 2] * r + _HALF)
+                    next_medium = _medium_in(ex, ey, ez, voxels, sides, of_label)
+                # Where tissue is squeezed there is more of it between two samples.
+                parts = np.int64(1)
+                if element >= 0 and was != NOTHING:
+                    apart = max(max(abs(ex - px), abs(ey - py)), abs(ez - pz)) >> _BITS
+                    parts = np.int64(min(int(1 + apart // _CLOSE), _MOST_PARTS))
+                length = half if s == 0 else np.float32(1.0 / (legs * parts))
+                lx, ly, lz = px, py, pz
+                for q in range(1, parts + 1):
+                    nx, ny, nz, now = ex, ey, ez, next_medium
+                    if q < parts:
+                        nx, ny, nz = (
+                            px + (ex - px) * q // parts,
+                            py + (ey - py) * q // parts,
+                            pz + (ez - pz) * q // parts,
+                        )
+                        now = _medium_in(nx, ny, nz, voxels, sides, of_label)
+                    if now == was:
+                        soft += length * media.loss[now]
+                        if media.blocks[now]:
+                            loss = length * media.shadow[now]
+                            where = _blocked_at(where, hard, loss, s)
+                            hard += loss
                     else:
-                        high = 0.5
-                    t = np.float32(high) * length
-                    rest = length - t
-                    border = media.crossing[was, now]
-                    soft += t * media.loss[was]
-                    if media.blocks[was]:
-                        loss = t * media.shadow[was]
-                        where = _blocked_at(where, hard, loss, s)
-                        hard += loss
-                    if was != NOTHING and now != NOTHING and found < room:
-                        crossings.beam[found] = k
-                        crossings.distance[found] = np.float32(s) - one + (q - 1) * length + t
-                        crossings.media[found, 0] = was
-                        crossings.media[found, 1] = now
-                        crossings.element[found] = element
-                        crossings.voxel[found, 0] = bx * _UNIT - _HALF
-                        crossings.voxel[found, 1] = by * _UNIT - _HALF
-                        crossings.voxel[found, 2] = bz * _UNIT - _HALF
-                        crossings.slope[found, 0] = (x - px) * _UNIT
-                        crossings.slope[found, 1] = (y - py) * _UNIT
-                        crossings.slope[found, 2] = (z - pz) * _UNIT
-                        crossings.level[found] = time_gain[s] - soft - hard
-                        found += 1
-                    if media.blocks[was] or media.blocks[now]:
-                        where = _blocked_at(where, hard, border, s)
-                        hard += border
-                    else:
-                        soft += border
-                    soft += rest * media.loss[now]
-                    if media.blocks[now]:
-                        loss = rest * media.shadow[now]
-                        where = _blocked_at(where, hard, loss, s)
-                        hard += loss
-                    was = now
-                lx, ly, lz = nx, ny, nz
+                        high = 1.0
+                        if s == 0:
+                            high = 0.0
+                        elif was != NOTHING and now != NOTHING:
+                            part = 1.0
+                            ax, ay, az = lx, ly, lz  # still before the border
+                            bx, by, bz = nx, ny, nz  # behind it
+                            for _ in range(_HALVINGS):
+                                part *= 0.5
+                                cx, cy, cz = (ax + bx) >> 1, (ay + by) >> 1, (az + bz) >> 1
+                                if _medium_in(cx, cy, cz, voxels, sides, of_label) == was:
+                                    ax, ay, az = cx, cy, cz
+                                else:
+                                    bx, by, bz = cx, cy, cz
+                                    high -= part
+                            high -= 0.5 * part
+                        else:
+                            high = 0.5
+                        t = np.float32(high) * length
+                        rest = length - t
+                        border = media.crossing[was, now]
+                        soft += t * media.loss[was]
+                        if media.blocks[was]:
+                            loss = t * media.shadow[was]
+                            where = _blocked_at(where, hard, loss, s)
+                            hard += loss
+                        if was != NOTHING and now != NOTHING and found < room:
+                            crossings.beam[found] = k
+                            crossings.distance[found] = begin + (q - 1) * length + t
+                            crossings.media[found, 0] = was
+                            crossings.media[found, 1] = now
+                            crossings.element[found] = inner
+                            crossings.voxel[found, 0] = bx * _UNIT - _HALF
+                            crossings.voxel[found, 1] = by * _UNIT - _HALF
+                            crossings.voxel[found, 2] = bz * _UNIT - _HALF
+                            crossings.slope[found, 0] = (ex - px) * legs * _UNIT
+                            crossings.slope[found, 1] = (ey - py) * legs * _UNIT
+                            crossings.slope[found, 2] = (ez - pz) * legs * _UNIT
+                            crossings.level[found] = time_gain[s] - soft - hard
+                            found += 1
+                        if media.blocks[was] or media.blocks[now]:
+                            where = _blocked_at(where, hard, border, s)
+                            hard += border
+                        else:
+                            soft += border
+                        soft += rest * media.loss[now]
+                        if media.blocks[now]:
+                            loss = rest * media.shadow[now]
+                            where = _blocked_at(where, hard, loss, s)
+                            hard += loss
+                        was = now
+                    lx, ly, lz = nx, ny, nz
+                px, py, pz = ex, ey, ez
             level = time_gain[s] - soft + media.scattering[medium]
             direction = media.fibres[medium]
             if direction >= 0:

@@ -108,6 +108,22 @@ def _beside_another(labels, shape, i, j, k):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _touches_another(labels, shape, i, j, k):
+    """Whether a voxel has another label than one that it shares a face, edge or corner with.
+
+    A beam may pass from voxel to voxel through any of these.
+    """
+    own = labels[(i * shape[1] + j) * shape[2] + k]
+    for p in range(max(i - 1, 0), min(i + 2, shape[0])):
+        for q in range(max(j - 1, 0), min(j + 2, shape[1])):
+            row = (p * shape[1] + q) * shape[2]
+            for r in range(max(k - 1, 0), min(k + 2, shape[2])):
+                if labels[row + r] != own:
+                    return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mark_blocks(labels, shape, blocks):
     """Numbers the blocks that have a surface; returns how many there are."""
     count = 0
@@ -142,7 +158,7 @@ def _fill_normals(labels, shape, weights, distances, blocks, normals):
                 for i in range(i0, min(i0 + BLOCK, shape[0])):
                     for j in range(j0, min(j0 + BLOCK, shape[1])):
                         for k in range(k0, min(k0 + BLOCK, shape[2])):
-                            if _beside_another(labels, shape, i, j, k):
+                            if _touches_another(labels, shape, i, j, k):
                                 within = ((i - i0) * BLOCK + j - j0) * BLOCK + k - k0
                                 _gradient(
                                     labels, shape, weights, distances, i, j, k,

@@ -144,7 +144,8 @@ def fill_some_elements(
     """
     rows, places = elements.shape
     row_step = steps[0]
-    step = steps[1]
+    step = np.uint32(steps[1])  # divides much faster than with a sign
+    before = np.uint32(step - 1)
     winding = np.empty(columns + 1, dtype=np.int32)
     covered = np.empty(columns, dtype=np.bool_)
     for number in range(rows):
@@ -152,23 +153,24 @@ def fill_some_elements(
         line = elements[number]
         line[:] = black
         for k in range(2):
-            first = (runs[row, k, 0] + step - 1) // step
-            end = (runs[row, k, 1] + step - 1) // step
-            for i in range(first, end):
-                line[i] = rigid
+            first = (np.uint32(runs[row, k, 0]) + before) // step
+            end = (np.uint32(runs[row, k, 1]) + before) // step
+            if first < end:
+                line[np.int64(first) : np.int64(end)] = rigid
         for k in range(used[row]):
             span = spans[row, k]
-            first = ((span & _COLUMN) + step - 1) // step
-            end = ((span >> END_SHIFT & _COLUMN) + step - 1) // step
-            for i in range(first, end):
-                line[np.uint64(i)] = span >> CUT_SHIFT
+            first = (np.uint32(span & _COLUMN) + before) // step
+            end = (np.uint32(span >> END_SHIFT & _COLUMN) + before) // step
+            element = np.int32(span >> CUT_SHIFT)
+            for i in range(np.int64(first), np.int64(end)):
+                line[np.uint64(i)] = element
         open_places = 0
         for i in range(places):
             open_places += line[i] == rigid
         if open_places:
             mark_covered(outlines, points, turns, outline_number, row, winding, covered)
             for i in range(places):
-                if line[i] == rigid and covered[i * step]:
+                if line[i] == rigid and covered[i * steps[1]]:
                     line[i] = black
 
 
