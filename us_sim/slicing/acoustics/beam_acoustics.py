@@ -134,7 +134,8 @@ class BeamAcoustics:
             fibre = self._fibres.now(located, nodes, frame.plane)
         self._found, first = follow_beams(
             self._elements.reshape(-1), self._elements.shape[1], self._steps, located.maps,
-            self._voxels, self._shape, self._places, self._lines, self._across, self._along, self._media, self._time_gain, fibre,
+            self._voxels, self._shape, self._places, self._lines, self._across, self._along,
+            self._media, self._time_gain, fibre,
             self._gain, self._blocked, self._blocker, self._crossings,
         )  # fmt: skip
         sharpen_edges(

@@ -152,10 +152,11 @@ def follow_beams(
                     gz = _fixed(m[2, 1] * to_column + m[2, 2] * to_row)
                 medium = _medium_in(x, y, z, voxels, sides, of_label)
             legs = 1
-            if element != held and element >= 0 and held >= 0 and was != NOTHING:
-                # Another tetrahedron is squeezed otherwise, which matters where a border may be.
-                if medium != was or max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP:
-                    legs = _LEGS
+            changes = element != held and element >= 0 and held >= 0 and was != NOTHING
+            far = max(max(abs(x - px), abs(y - py)), abs(z - pz)) >= _LEAP
+            # Another tetrahedron is squeezed otherwise, which matters where a border may be.
+            if changes and (far or medium != was):
+                legs = _LEGS
             held = element
             for leg in range(1, legs + 1):
                 ex, ey, ez, inner, next_medium = x, y, z, element, medium
