@@ -267,7 +267,8 @@ class Simulation:
         if self._ready_since is None or now - self._ready_since < CATALOGUE_AFTER_S:
             return
         if now - self._bags_at > _BAGS_EVERY_S:
-            self._bags_at, bags = now, bags_in_reach()
+            view = self._request.view
+            self._bags_at, bags = now, bags_in_reach(view.recordings if view else None)
             if bags != self._bags:
                 self._bags = bags
                 self._control.tell_bags(bags)
