@@ -119,6 +119,26 @@ def test_a_session_is_recorded_and_replayed(page, session):
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
 
 
+@pytest.mark.parametrize("typed", ["/data/other.mcap", "hand.mcap"])
+def test_a_path_or_a_name_that_is_typed_is_replayed_and_stays(page, session, typed):
+    board, asked = session
+    board.tell_bags({"hand.mcap": "/bags/hand.mcap", "hand.mcap.old": "/bags/old"})
+    file = board.bags.get(typed, typed)
+    opened(page, "Session")
+    field = page.get_by_label("recording or path")
+    field.fill(typed)
+    field.press("Enter")
+    board.tell_bags({**board.bags, "new.mcap": "/bags/new.mcap"})
+    page.get_by_role("button", name="Play or pause").click()
+    until(lambda: asked, "it is asked for", 30.0)
+    assert asked[-1].get("replay") == file
+    board.tell_state(dataclasses.replace(RUNNING, replay=file, replay_state="playing"))
+    page.get_by_text("s, playing").wait_for()
+    assert field.input_value() == typed
+    page.get_by_role("button", name="Play or pause").click()
+    until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
+
+
 def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session):
     _, asked = session
     opened(page, "Session")

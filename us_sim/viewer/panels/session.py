@@ -38,7 +38,6 @@ class _Session:
 
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
-        self._bags: dict[str, str] = {}
         self._is_dragging = False
         self._touched = 0.0  # s, monotonic: when a person last asked for something
         self._is_following = False  # while controls are set to what is so
@@ -74,10 +73,13 @@ class _Session:
 
     def _replaying(self) -> None:
         ui.label("Replay").classes("us-cases-title")
-        self._bag = ui.select({}, label="recording or path", with_input=True)
+        self._bag = ui.select(
+            {}, label="recording or path", new_value_mode="add", key_generator=self._file_of
+        )
         self._bag.props("dense outlined").classes("us-wide-field")
         self._bag.props["title"] = (
-            "Bags in the folder that us-sim runs in, and those that came with it"
+            "Bags in the folder that us-sim runs in, in that of recordings, and those that came "
+            "with it; or type the path of another one and press Enter"
         )
         with ui.element("div") as self._kind_told:  # also told while the choice is disabled
             self._kind = ui.toggle(KINDS, value="path").props("no-caps dense")
@@ -117,9 +119,11 @@ class _Session:
         self._recorded.classes(**{"add" if is_short else "remove": "us-wrong"})
         self._note.set_text(state.record_note)
         self._note.set_visibility(bool(state.record_note))
-        if dict(board.bags) != self._bags:
-            self._bags = dict(board.bags)
-            self._bag.set_options({file: name for name, file in self._bags.items()})
+        offered = {file: name for name, file in board.bags.items()}
+        for file in filter(None, (self._bag.value, state.replay)):
+            offered.setdefault(file, file)
+        if offered != self._bag.options:
+            self._bag.set_options(offered)
         self._follow(state)
 
     def _follow(self, state: SessionState) -> None:
@@ -143,8 +147,7 @@ class _Session:
         self._is_following = True
         try:
             if plays:
-                if state.replay in self._bag.options and self._bag.value != state.replay:
-                    self._bag.set_value(state.replay)
+                self._bag.set_value(state.replay)
                 self._kind.set_value(state.replay_as)
             self._loop.set_value(state.loop)
             if state.rate in RATES:
@@ -156,6 +159,10 @@ class _Session:
         """Name the next recording by the present time."""
         self._proposed = _proposed()
         self._file.set_value(self._proposed)
+
+    def _file_of(self, typed: str) -> str:
+        """The bag of a name that is listed; anything else is a path."""
+        return self._board.bags.get(typed.strip(), typed.strip())
 
     async def _begin(self) -> None:
         if self._file.value == self._proposed:
