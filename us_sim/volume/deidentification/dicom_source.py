@@ -5,7 +5,6 @@ from __future__ import annotations
 import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from us_sim.volume.deidentification.source import Source, spread
 from us_sim.volume.files.dicom.frame_times import frame_times
 from us_sim.volume.files.dicom.grey import GreyImages
 from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
-from us_sim.volume.files.dicom.stated_planes import image_times
 from us_sim.volume.files.dicom.values import text
 from us_sim.volume.files.dicom.vendors import is_cartesian
 
@@ -104,12 +102,7 @@ def _times(images: GreyImages) -> list[float] | None:
     """Of all images; those of several files have none in common."""
     if len(images.files) > 1:
         return None
-    times = frame_times(images.files[0], images.form.frames)
-    if times is None:
-        stated = image_times(images.files[0], images.form.frames)
-        if all(a < b for a, b in pairwise(stated)):
-            times = [time - stated[0] for time in stated]
-    return times
+    return frame_times(images.files[0], images.form.frames)
 
 
 def _values(images: GreyImages) -> dict[str, str]:

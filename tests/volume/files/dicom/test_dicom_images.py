@@ -111,6 +111,29 @@ def test_times_of_images(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("key", "stamps", "times"),
+    [
+        (
+            "FrameReferenceDateTime",
+            ["20061231235959.5+0100", "20061231230000", "20070101010000.25+0200", "20061231230001"],
+            [0, 0.5, 0.75, 1.5],
+        ),
+        ("FrameAcquisitionDateTime", [f"2006121912{n:02d}00" for n in range(4)], [0, 60, 120, 180]),
+        ("FrameReferenceDateTime", ["20061219120000"] * 4, None),
+        ("FrameReferenceDateTime", [f"200613191200{n:02d}" for n in range(4)], None),
+        ("FrameReferenceDateTime", [f"200612191200{n:02d}" for n in range(3)], None),
+    ],
+    ids=["zones", "acquired", "all the same", "no month 13", "one without"],
+)
+def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, times):
+    contents = [item(**{key: stamp}) for stamp in stamps] + [item()] * (4 - len(stamps))
+    groups = [item(FrameContentSequence=[content]) for content in contents]
+    made = header(CINE, US_MULTI_FRAME, PerFrameFunctionalGroupsSequence=groups)
+    found = frame_times(open_dicom(write(tmp_path / "a.dcm", made)), 4)
+    assert found == (None if times is None else pytest.approx(times))
+
+
+@pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"Rows": 13}, "holds 480 bytes of images where its header says 520"),
