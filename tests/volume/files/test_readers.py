@@ -126,6 +126,9 @@ def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
     grey = read_volume(tmp_path / "a.nrrd").intensities[:, :, 0]
     np.testing.assert_array_equal(grey[:, 0], [0, 0, 255])
     np.testing.assert_array_equal(grey[:, 1], [255, 0, 128])
+    (_, missing, infinite) = grey_voxels(open_image(tmp_path / "a.nrrd"))[1]
+    assert missing.startswith("1 values")
+    assert infinite.startswith("2 infinite")
 
 
 def test_a_constant_image_is_dark_and_one_without_a_number_is_refused(tmp_path):

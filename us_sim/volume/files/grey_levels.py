@@ -1,7 +1,7 @@
 """Numbers of any kind as grey values from 0 to 255, image by image.
 
 Whole numbers of 8 bits are taken as they are. All others are spread, so that the least finite one
-becomes 0 and the greatest 255; what is no number becomes 0.
+becomes 0 and the greatest 255; what is no number becomes 0, and infinities the end on their side.
 
 >>> import numpy as np
 >>> from us_sim.volume.files.grey_levels import GreyLevels
@@ -34,6 +34,7 @@ class GreyLevels:
     low: float = 0.0
     high: float = 255.0
     missing: int = 0  # how many are no numbers
+    infinite: int = 0  # how many are +Inf or -Inf
 
     @classmethod
     def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
@@ -42,17 +43,18 @@ class GreyLevels:
         Raises:
             VolumeError: there is no finite value.
         """
-        low, high, missing = math.inf, -math.inf, 0
+        low, high, missing, infinite = math.inf, -math.inf, 0, 0
         for image in images:
             values = image
             if image.dtype.kind == "f":
                 missing += int(np.count_nonzero(np.isnan(image)))
+                infinite += int(np.count_nonzero(np.isinf(image)))
                 values = image[np.isfinite(image)]
             if values.size:
                 low, high = min(low, float(values.min())), max(high, float(values.max()))
         if low > high:
             raise VolumeError(f"{path}: holds no finite value")
-        return cls(low, high, missing)
+        return cls(low, high, missing, infinite)
 
     def __call__(self, image: NDArray[Any]) -> NDArray[np.uint8]:
         """An image as grey values."""
@@ -66,5 +68,9 @@ class GreyLevels:
 
     def said(self, bits: int) -> list[str]:
         """What is made of the numbers, for a person."""
-        missing = f"{self.missing} values that are no number are black"
-        return [f"{bits}-bit values spread over 0 to 255", *([missing] if self.missing else [])]
+        said = [f"{bits}-bit values spread over 0 to 255"]
+        if self.missing:
+            said.append(f"{self.missing} values that are no number are black")
+        if self.infinite:
+            said.append(f"{self.infinite} infinite values are white (+Inf) or black (-Inf)")
+        return said
