@@ -209,6 +209,16 @@ def test_a_volume_without_spacing_is_imported_with_that_of_a_person(tmp_path):
     np.testing.assert_allclose(np.diag(there)[:3] * 1e3, (0.5, 0.25, 2))
 
 
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_segmentation_is_no_volume(tmp_path, layers):
+    image = sitk.Image([4, 5, 6], sitk.sitkVectorUInt8 if layers > 1 else sitk.sitkUInt8, layers)
+    image.SetMetaData("Segment0_ID", "Segment_1")
+    image.SetMetaData("Segment0_LabelValue", "none")
+    sitk.WriteImage(image, tmp_path / "a.seg.nrrd")
+    with pytest.raises(VolumeError, match=r"--labels a\.seg\.nrrd"):
+        import_files([tmp_path / "a.seg.nrrd"], tmp_path / "o.nrrd")
+
+
 def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
     path = tmp_path / "a.nii.gz"
     sitk.WriteImage(

@@ -16,6 +16,7 @@ from us_sim.volume.deidentification.header_names import other_names
 from us_sim.volume.deidentification.kept_part import Regions
 from us_sim.volume.deidentification.source import Progress, Source, spread
 from us_sim.volume.files.readers import grey_voxels, open_image
+from us_sim.volume.files.segments import holds_segments, no_grey_values
 
 __all__ = ["file_source"]
 
@@ -32,9 +33,12 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
         spacing: (3,) mm, of a file that does not state it.
 
     Raises:
-        VolumeError: as `read_volume`.
+        VolumeError: as `read_volume`, and of a segmentation of 3D Slicer.
     """
-    image = open_image(path, spacing=spacing)
+    image = open_image(path, layers=True, spacing=spacing)
+    if holds_segments(image.texts):
+        raise no_grey_values(path)
+    image.check(layers=False)
     placement = image.placement()
     voxels, conversions = grey_voxels(image, volume)
     count = voxels.shape[2]

@@ -15,12 +15,13 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
 from us_sim.volume.anatomical_colours import Colour
 
-__all__ = ["Segment", "check_representation", "segments_of"]
+__all__ = ["Segment", "check_representation", "holds_segments", "no_grey_values", "segments_of"]
 
 _FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
 
@@ -49,6 +50,19 @@ def segments_of(pairs: Mapping[str, str]) -> list[Segment]:
             found.setdefault(int(match[1]), {})[match[2]] = value
     shared = any("LabelValue" in fields for fields in found.values())
     return [_segment(number, at, found[number], shared) for at, number in enumerate(sorted(found))]
+
+
+def holds_segments(pairs: Mapping[str, str]) -> bool:
+    """Whether the keys of a header tell of segments, whatever their values are."""
+    return any(map(_FIELD.fullmatch, pairs))
+
+
+def no_grey_values(path: Path) -> VolumeError:
+    """The error of a segmentation where an image belongs."""
+    return VolumeError(
+        f"{path}: is a segmentation, which has labels and no grey values; give it to "
+        f"`us-sim segment CASE --labels {path.name}`"
+    )
 
 
 def check_representation(pairs: Mapping[str, str]) -> None:

@@ -32,6 +32,7 @@ from us_sim.volume.files.dicom.vendors import (
     one_image_after_another,
     vendor_planes,
 )
+from us_sim.volume.files.segments import no_grey_values
 
 __all__ = ["PlacedImages", "is_flat", "opened_images", "placed_images"]
 
@@ -84,10 +85,7 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     files = [one_image_after_another(open_dicom(path)) for path in paths]
     for file in files:
         if text(file.header, "SOPClassUID") in SEGMENTATIONS:
-            raise VolumeError(
-                f"{file.path}: is a segmentation, which has labels and no grey values; give it to "
-                f"`us-sim segment CASE --labels {file.path.name}`"
-            )
+            raise no_grey_values(file.path)
     # A maker's own volume may have a picture of no use beside it, or none at all.
     for file in files:
         if file.pixels is None and (remedy := hidden_volume(file)):
