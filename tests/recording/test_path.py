@@ -1,5 +1,7 @@
 """Probe paths: the poses that real bags and our own hold, and every reason to have none."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -181,6 +183,15 @@ def test_no_bag(tmp_path, missing):
     (tmp_path / "empty.mcap").touch()
     with pytest.raises(BagError, match=missing):
         read_path(tmp_path / missing)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a.xml", "(.mrml, .mrb)"), ("a.yaml", "PLUS"), ("a.tfm", "`registration`")]
+)
+def test_what_else_is_a_path_is_said(tmp_path, name, words):
+    (tmp_path / name).write_text("#Insight Transform File V1.0\n")
+    with pytest.raises(BagError, match=re.escape(words)):
+        read_path(tmp_path / name)
 
 
 def test_arrays_of_different_lengths():

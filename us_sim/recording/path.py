@@ -25,12 +25,17 @@ from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.recorded_poses import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.storage import NoBagError
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
-from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES
+from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, SLICER_TRANSFORMS
 
 __all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
 
+_PATHS = (
+    "give a bag (.mcap, .db3), a tracker recording of PLUS (.igs.mha, .igs.nrrd) or a scene of 3D "
+    "Slicer (.mrml, .mrb)"
+)
 _MOST_NAMES = 20
 """Bodies that are listed where one has to be named."""
 
@@ -111,7 +116,12 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
             names = ", ".join(recording.transforms)
             raise TrackingError(f"{path}: has several transforms: name one by {option}, of {names}")
         return recording.probe_path(topic)
-    bag = read_bag(path)
+    try:
+        bag = read_bag(path)
+    except NoBagError as error:
+        single = Path(path).suffix.lower() in SLICER_TRANSFORMS
+        remedy = "a single transform belongs in `registration` or `calibration`; " if single else ""
+        raise BagError(f"{error}; {remedy}{_PATHS}") from None
     read = _read(bag, topic or _only_body(bag, option))
     if topic is None and len(read.frames) > 1:  # a hand and a device took turns
         poses = [each.name for each in bag.topics if each.type_name == POSE_STAMPED]

@@ -19,12 +19,16 @@ from us_sim.recording.sqlite_file import SqliteFile
 from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import unpack_file
 
-__all__ = ["Scratch", "Storage", "bag_files", "open_storage"]
+__all__ = ["NoBagError", "Scratch", "Storage", "bag_files", "open_storage"]
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _PART = re.compile(r"(.*?)(?:_(\d+))?(\.(?:mcap|db3)(?:\.zstd)?)")
 """A file of a bag: FOLDER_0.mcap, FOLDER_1.mcap or session.mcap, session_1.mcap and so on."""
+
+
+class NoBagError(BagError):
+    """A file that is of another kind."""
 
 
 class Storage(Protocol):
@@ -97,7 +101,8 @@ def open_storage(file: Path, scratch: Scratch) -> Storage:
     """The reader of a file by its first bytes, whatever its name.
 
     Raises:
-        BagError: the file is empty, no bag, or damaged.
+        NoBagError: the file is of another kind.
+        BagError: the file is empty, a bag of ROS 1, or damaged.
     """
     return _open(file, str(file), scratch)
 
@@ -115,7 +120,7 @@ def _open(file: Path, label: str, scratch: Scratch) -> Storage:
         return _open(scratch.unpack(file), label, scratch)
     if start.startswith(b"#ROSBAG"):
         raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
-    raise BagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")
+    raise NoBagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")
 
 
 def _listed_file(folder: Path, listed: str) -> Path:
