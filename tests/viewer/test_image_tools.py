@@ -12,6 +12,7 @@ from awaiting import until
 
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
+from us_sim.viewer.session import SessionState
 from us_sim.viewer.simulator import Simulator
 
 COLUMNS, ROWS = 400, 300
@@ -254,7 +255,7 @@ def test_a_measure_is_seen_with_its_frame_only(page: Any, images: Images) -> Non
     await_grey(page, 42)
     assert values(page) == ["20.0 mm"]
     page.keyboard.press(" ")
-    images.show(44, scene="liver")
+    images.show(44)
     await_grey(page, 44)
     assert values(page) == []
     assert page.locator(".us-handle").count() == 0
@@ -306,6 +307,48 @@ def test_the_loop_keeps_ten_seconds_and_no_more_than_its_bytes(page: Any) -> Non
     assert slow == [301, 599, 30100, pytest.approx(10_000)]
     assert large == [96, 104, 96 * 2**20, 95]
     assert numbers == [150, 0, 300]
+
+
+KEPT = f"import('{TOOLS}/freeze.js').then(m => m.freeze.cine.frames.map(f => f.payload[0]))"
+
+
+def test_the_loop_has_no_image_that_was_taken_long_before_the_others(
+    page: Any, images: Images
+) -> None:
+    def show(grey: int, second: float) -> None:
+        images.show(grey, stamp=str(round(second * 1e9)))
+        await_grey(page, grey)
+
+    show(54, 54)  # the first was taken before another mode was chosen
+    assert page.evaluate(KEPT) == [54]
+    show(55, 55)
+    show(41, 41)  # and so was this, sent again as the mode is chosen
+    show(56, 56)
+    assert page.evaluate(KEPT) == [54, 55, 56]
+
+
+def test_of_another_scene_no_image_is_kept_frozen_or_on_the_plane(
+    page: Any, images: Images, simulator: Simulator
+) -> None:
+    def scene(name: str) -> None:
+        simulator.session.tell_state(SessionState(is_there=True, scene=name))
+        page.locator(f"#us-scene[data-scene={name}]").wait_for(state="attached")
+
+    plane = "import('/us_sim/assets/scene/probe.js').then(m => m.probe.image.visible)"
+    frozen = f"import('{TOOLS}/freeze.js').then(m => m.freeze.isFrozen)"
+    scene("upper_arm")
+    images.show(41, scene="upper_arm")
+    await_grey(page, 41)
+    page.keyboard.press(" ")
+    assert page.evaluate(frozen)
+    assert page.evaluate(plane)
+    scene("neck")
+    until(lambda: not page.evaluate(frozen), "the old scene's image is let go")
+    assert not page.evaluate(plane)
+    images.show(43, scene="neck")
+    await_grey(page, 43)
+    until(lambda: page.evaluate(plane), "the new scene's image is on the plane")
+    assert page.evaluate(KEPT) == [43]
 
 
 def test_the_kept_picture_has_the_image_its_scale_and_the_values(
@@ -374,7 +417,7 @@ def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> 
     """A picture in colour in place of the image, as wide and high as that."""
     encoded = cv2.imencode(".jpg", np.full((rows, columns, 3), 90, np.uint8))[1].tobytes()
     feed = Feed("annotated", rate=None)
-    header = {"stamp": "1", "rows": rows, "columns": columns, "encoding": "jpeg"}
+    header = {"stamp": str(41 * 10**9), "rows": rows, "columns": columns, "encoding": "jpeg"}
     header["matrix"] = MATRIX
     feed.offer(lambda n: Packet("annotated", n, header, encoded))
     simulator.add(feed)
@@ -426,8 +469,8 @@ def test_a_picture_of_another_size_is_not_measured_and_says_why(
 def test_the_last_seconds_are_saved_as_they_are_seen(
     page: Any, images: Images, tmp_path: Path, kind: str, ending: str, begins: bytes
 ) -> None:
-    for grey in (80, 120):
-        images.show(grey)
+    for second, grey in ((41, 80), (42, 120)):
+        images.show(grey, stamp=str(second * 10**9))
         await_grey(page, grey)
     page.locator(".us-kinds").select_option(kind)
     with page.expect_download() as download:
@@ -439,7 +482,7 @@ def test_the_last_seconds_are_saved_as_they_are_seen(
     if ending == "dcm":
         read = pytest.importorskip("pydicom").dcmread(file)
         assert read.pixel_array[:, 5, 5].tolist() == [40, 80, 120]
-        assert list(read.FrameTimeVector) == [0, 40_000, 40_000]  # ms of their own time
+        assert list(read.FrameTimeVector) == [0, 1000, 1000]  # ms of their own time
     else:
         shown, picture = cv2.VideoCapture(str(file)).read()
         assert shown

@@ -46,6 +46,9 @@ def build_headline(simulator: Simulator) -> None:
     def look() -> None:
         scene, told = words_of(board.state)
         name.set_text(scene)
+        if name.props.get("data-scene") != board.state.scene:
+            name.props["data-scene"] = board.state.scene  # as the headers of images say it
+            name.update()
         known = (each.values.get("preparing", "") for each in nodes.nodes(time.monotonic()))
         words.set_text(" · ".join(filter(None, (*known, told))))
         problem.set_text(board.state.problem)

@@ -70,6 +70,22 @@ export function pixelToMillimetres(column, row, matrix = geometry) {
   return [at(0), at(8)];
 }
 
+let scene = ""; // that runs; nothing where it is not known
+const headline = await element("us-scene");
+
+function lookAtScene() {
+  scene = headline.dataset.scene ?? "";
+  events.tell("scene", scene);
+}
+new MutationObserver(lookAtScene).observe(headline, { attributeFilter: ["data-scene"] });
+lookAtScene();
+
+/** Whether the frame that is seen is of another scene than runs. */
+export function isOfOtherScene() {
+  const of = shownFrame?.header.scene;
+  return Boolean(of && scene && of !== scene);
+}
+
 /** Have `handler(frame)` called when an image has come and was drawn. */
 export function onImage(handler) {
   handlers.push(handler);

@@ -1,7 +1,7 @@
 /** Freezing the image, and looking through the last seconds before that. */
 
 import { events } from "../events.js";
-import { drawKept, hasImage, onImage, setLive } from "../image.js";
+import { drawKept, hasImage, isOfOtherScene, onImage, setLive } from "../image.js";
 import { Cine } from "./cine.js";
 
 const cine = new Cine();
@@ -15,6 +15,7 @@ function tell() {
 }
 
 onImage((frame) => cine.keep(frame));
+events.on("scene", () => isFrozen && isOfOtherScene() && freeze.toggle());
 
 export const freeze = {
   cine,

@@ -6,7 +6,7 @@
 
 import { THREE } from "nicegui-scene";
 import { events } from "../events.js";
-import { imageCanvas, onImage } from "../image.js";
+import { imageCanvas, isOfOtherScene, onImage } from "../image.js";
 import { stream } from "../stream.js";
 import { cut } from "./cut.js";
 import { softMaterial, styleOf } from "./shading.js";
@@ -196,6 +196,15 @@ events.on("image-geometry", (matrix) => {
   geometry = matrix;
   layOut();
 });
+/** Whether the image is seen on its plane: never one of another scene than the patient's. */
+function showPlane() {
+  const on = shown.image && !isOfOtherScene();
+  if (image.visible === on) return;
+  image.visible = border.visible = on;
+  texture.needsUpdate = true;
+  stage.move();
+}
+for (const name of ["scene", "image-shown"]) events.on(name, showPlane);
 onImage(({ payload }) => {
   const { width, height } = imageCanvas();
   if (width !== size[0] || height !== size[1]) layOut();
@@ -236,7 +245,7 @@ export const probe = {
   setVisible(name, on) {
     shown[name] = on;
     if (name === "probe") body.visible = on;
-    if (name === "image") image.visible = border.visible = on;
+    if (name === "image") showPlane();
     if (name === "force") force.visible = on && Boolean(last?.force);
     stage.move();
   },
