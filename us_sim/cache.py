@@ -36,8 +36,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 
-__all__ = ["Form", "cache_folder", "kept"]
-
 Thing = TypeVar("Thing")
 
 _WAIT = 0.5  # s, between two words to the person who waits for another process

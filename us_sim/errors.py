@@ -1,26 +1,5 @@
 """Errors that reach a person: each carries one sentence saying what, where and what to do."""
 
-__all__ = [
-    "BagError",
-    "CalibrationError",
-    "CaseError",
-    "MaterialError",
-    "MeshError",
-    "MessageError",
-    "PoseError",
-    "ProbeError",
-    "SceneError",
-    "SettingsError",
-    "SolverError",
-    "StampError",
-    "StiffnessError",
-    "TrackingError",
-    "UsSimError",
-    "VolumeError",
-    "memory_limit",
-    "printable",
-]
-
 LONGEST = 2000
 """Characters of a sentence: it may quote a file or a message."""
 

@@ -33,8 +33,6 @@ from numba.core.serialize import dumps
 
 from us_sim.cache import cache_folder
 
-__all__ = ["kernel_folder", "njit", "warm_up"]
-
 _DIGEST = 32  # bytes of a checksum, at the beginning of a file
 _WRITABLE_BY_OTHERS = 0o022
 

@@ -12,8 +12,6 @@ from tqdm import tqdm
 
 from us_sim.errors import printable
 
-__all__ = ["Progress", "end_late_bars", "late_progress"]
-
 _LONGEST = 200  # characters of what is being done
 _PATIENCE = 1.0  # s, for which work goes on without a bar
 _UNMEASURED = "{desc}{postfix}, {elapsed}"

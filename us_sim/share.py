@@ -9,8 +9,6 @@ from pathlib import Path
 
 from us_sim.errors import UsSimError
 
-__all__ = ["find_bag", "full_path", "shared_path", "shared_roots"]
-
 
 def full_path(name: str | Path) -> Path:
     """The absolute path of what a person wrote: with their home for ``~``, and links followed.

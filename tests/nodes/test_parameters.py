@@ -52,7 +52,7 @@ def given_to(node: str, scene: Any, folder: Any) -> dict[str, object]:
 def made(bench, node: str, scene: Any, folder: Any) -> Any:
     """A node by its name."""
     module = importlib.import_module(f"us_sim.nodes.{node}")
-    name = next(n for n in module.__all__ if n.lower() == node.replace("_", ""))
+    name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
     return bench.make(getattr(module, name), **given_to(node, scene, folder))
 
 

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-__all__ = ["add_bag"]
-
 
 def add_bag(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -9,8 +9,6 @@ from typing import Any
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.registry import CALIBRATIONS
 
-__all__ = ["add_calibrate"]
-
 
 def add_calibrate(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-__all__ = ["add_cases"]
-
 
 def add_cases(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
-__all__ = ["ChosenParser"]
-
 
 class ChosenParser(argparse.ArgumentParser):
     """A parser that has its options added when it is used for the first time.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-__all__ = ["add_compile"]
-
 
 def add_compile(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

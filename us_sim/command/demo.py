@@ -18,8 +18,6 @@ from us_sim.command.scene_options import (
     viewed,
 )
 
-__all__ = ["add_demo"]
-
 
 def add_demo(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -12,8 +12,6 @@ from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.registry import EVALUATIONS
 from us_sim.settings.setting import Settings
 
-__all__ = ["add_evaluate"]
-
 
 def add_evaluate(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from us_sim.tissue.identification.press_record import PressRecord
     from us_sim.tissue.identification.stiffness import StiffnessFit, Tissue
 
-__all__ = ["add_fit_stiffness"]
-
 
 def add_fit_stiffness(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-__all__ = ["add_import"]
-
 _REPORT = Path("us_sim_import")
 
 

@@ -14,8 +14,6 @@ from us_sim.errors import UsSimError, memory_limit, printable
 if TYPE_CHECKING:
     from us_sim.command.chosen_parser import ChosenParser
 
-__all__ = ["main"]
-
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -9,8 +9,6 @@ from us_sim.command.scene_options import add_network_option
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.share import find_bag
 
-__all__ = ["add_play"]
-
 _OF_THE_PLAYER = ("rate", "loop")
 
 

@@ -9,8 +9,6 @@ from typing import Any
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.spelling import counted
 
-__all__ = ["add_print_marker"]
-
 
 def add_print_marker(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

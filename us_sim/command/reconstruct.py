@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from us_sim.volume.reconstruction.settings import ImagePart
     from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["add_reconstruct"]
-
 
 def add_reconstruct(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -25,8 +25,6 @@ from us_sim.settings.tables import (
     values,
 )
 
-__all__ = ["add_reference", "reference_page", "reference_sections"]
-
 INTRODUCTION = """\
 # Reference
 

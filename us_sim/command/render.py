@@ -13,8 +13,6 @@ from us_sim.command.scene_options import (
     scene_name,
 )
 
-__all__ = ["add_render"]
-
 
 def add_render(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

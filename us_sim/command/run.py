@@ -22,8 +22,6 @@ from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["RunSettings", "add_run"]
-
 
 @dataclass(frozen=True)
 class RunSettings(Settings):

@@ -15,20 +15,6 @@ from us_sim.share import find_bag
 if TYPE_CHECKING:
     from us_sim.viewer.viewer_settings import ViewerSettings
 
-__all__ = [
-    "add_network_option",
-    "add_path_option",
-    "add_scene_options",
-    "add_supervision_options",
-    "add_view_option",
-    "add_viewer_options",
-    "node_parameters",
-    "scene_name",
-    "supervision",
-    "viewed",
-    "viewer",
-]
-
 _OF_THE_VIEWER = ("host", "port", "recordings")
 
 

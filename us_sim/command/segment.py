@@ -8,8 +8,6 @@ from typing import Any
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.progress import late_progress
 
-__all__ = ["add_segment"]
-
 
 def add_segment(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

@@ -25,8 +25,6 @@ from typing import Any, TypeVar, get_args, get_origin
 from us_sim.errors import UsSimError
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 
-__all__ = ["add_setting_options", "read_settings"]
-
 S = TypeVar("S", bound=Settings)
 
 

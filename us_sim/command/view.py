@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-__all__ = ["add_view"]
-
 
 def add_view(commands: Any) -> None:
     """Add the command to `us-sim`'s."""

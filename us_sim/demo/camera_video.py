@@ -30,8 +30,6 @@ from us_sim.tracking.camera.info import write_camera_info
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
 
-__all__ = ["CAMERA", "PathVideo", "path_video", "video_poses"]
-
 CAMERA = WEBCAMS["640x480"]
 RATE = 30.0
 """Images per second."""

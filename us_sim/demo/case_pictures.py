@@ -23,8 +23,6 @@ from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.label_outlines import label_outlines
 
-__all__ = ["picture_cases"]
-
 _COLUMNS = 4
 _INCHES = 3.2  # of a picture's side
 

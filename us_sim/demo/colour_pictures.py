@@ -27,8 +27,6 @@ from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
 
-__all__ = ["colour_pictures"]
-
 TILT = 20.0
 """Degrees of the plane, about the array."""
 

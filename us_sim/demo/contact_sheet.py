@@ -25,8 +25,6 @@ from us_sim.slicing.drawing.label_outlines import label_outlines
 from us_sim.slicing.frame import Frame
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
-__all__ = ["contact_sheet"]
-
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
     """Write the picture as PNG.

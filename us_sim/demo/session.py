@@ -23,8 +23,6 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.tissue_kinds import kind_of
 from us_sim.volume.measure import label_area
 
-__all__ = ["LumenAreas", "Session", "read_session", "write_summary"]
-
 VESSELS = ("vein", "artery")
 """Kinds of tissue whose cross-sections are measured."""
 PLAYED = ("/tracker/pose", "/camera/camera_info")

@@ -15,8 +15,6 @@ from us_sim.slicing.strain.colours import strain_scale
 from us_sim.slicing.strain.compression import compression
 from us_sim.slicing.strain.estimate import estimate_strain, require_short_windows
 
-__all__ = ["strain_pictures"]
-
 _APART = 1.5e-4
 """m, that the probe moves on at most between two images that are compared: some samples."""
 

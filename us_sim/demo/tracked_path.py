@@ -13,8 +13,6 @@ from us_sim.demo.session import Session
 from us_sim.errors import BagError
 from us_sim.tracking.camera.body_pose import rotation_angle
 
-__all__ = ["TrackedPath", "tracked_path"]
-
 IMAGES = "/camera/camera_info"
 """Comes with each image, and has its stamp."""
 

@@ -12,8 +12,6 @@ from functools import cache
 
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
-__all__ = ["EXTENT", "LARGEST_MESH", "MESHES", "block"]
-
 EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, along x, y and z
 
 MESHES = ((20, 10, 10), (24, 12, 12), (28, 14, 14), (32, 16, 16))

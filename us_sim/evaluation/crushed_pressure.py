@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["LUMEN_SHEAR", "crowding", "emptied_fraction", "lumen_pressure", "wall_modulus"]
-
 Array = NDArray[np.float64]
 
 _CROWDED, _CRUSHED = 1 / 4, 1 / 50

@@ -9,8 +9,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-__all__ = ["key_beside", "new_figure", "plain", "save"]
-
 
 def new_figure(width: float, height: float, title: str) -> Figure:
     """An empty figure (inches) with its title at the left."""

@@ -29,15 +29,6 @@ from us_sim.evaluation.crushed_pressure import (
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = [
-    "averaged_hooke_forces",
-    "hooke_forces",
-    "neo_hookean_forces",
-    "rounding_of_forces",
-    "spring_forces",
-    "volume_forces",
-]
-
 Array = NDArray[np.float64]
 
 _ELEMENT_BULK = 5.0

@@ -36,14 +36,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import same_pose
 
-__all__ = [
-    "IndependentResidual",
-    "Residual",
-    "SpringSettings",
-    "solid_residual",
-    "spring_residual",
-]
-
 Array = NDArray[np.float64]
 
 _PARTS = 12

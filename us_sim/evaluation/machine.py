@@ -12,8 +12,6 @@ from importlib.metadata import PackageNotFoundError, version
 from os import cpu_count
 from pathlib import Path
 
-__all__ = ["machine"]
-
 
 def machine(*libraries: str) -> str:
     """Processor, cores, system, and the versions of Python and of those libraries it has."""

@@ -15,8 +15,6 @@ from typing import NoReturn, TypeVar
 from us_sim.errors import SettingsError
 from us_sim.settings.spelling import unknown
 
-__all__ = ["Named"]
-
 T = TypeVar("T")
 
 

@@ -6,8 +6,6 @@ import os
 import subprocess
 import sys
 
-__all__ = ["start_module"]
-
 
 def start_module(name: str, *arguments: str) -> subprocess.Popen[str]:
     """Start ``python -m name arguments`` with this process's modules, on this host only."""

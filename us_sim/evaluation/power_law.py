@@ -11,8 +11,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-__all__ = ["exponent"]
-
 
 def exponent(cost_of_size: Mapping[float, float]) -> float:
     """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 
-__all__ = ["flared_distance", "push_directions"]
-
 Array = NDArray[np.float64]
 
 _GRIP = 0.1  # m, how far the probe is taken to go on behind its collider

@@ -16,8 +16,6 @@ from us_sim.errors import UsSimError
 from us_sim.evaluation.machine import machine
 from us_sim.evaluation.row import Row
 
-__all__ = ["ReportFolder", "write_rows"]
-
 _PRINTED = 10  # failures, at the end of a run
 _LISTED = 60  # failures, in the report
 

@@ -20,8 +20,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-__all__ = ["Row", "failures", "not_a_column", "words_of"]
-
 
 @dataclass(frozen=True)
 class Row:

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["frames_until"]
-
 
 def frames_until(residual: Sequence[float] | NDArray[np.float64], small: float) -> int | None:
     """After how many frames a residual is as small as asked and stays so; None where it is not.

@@ -17,8 +17,6 @@ from scipy.sparse.linalg import cg
 
 from us_sim.errors import SolverError
 
-__all__ = ["solved"]
-
 _TOLERANCE = "rtol" if "rtol" in inspect.signature(cg).parameters else "tol"  # before SciPy 1.12
 
 

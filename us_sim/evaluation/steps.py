@@ -7,8 +7,6 @@ from typing import TypeVar
 
 from us_sim.progress import Progress
 
-__all__ = ["steps"]
-
 T = TypeVar("T")
 
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from us_sim.evaluation.markdown_table import markdown_table
 
-__all__ = ["Target", "target_table"]
-
 
 @dataclass(frozen=True)
 class Target:

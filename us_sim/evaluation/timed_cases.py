@@ -13,8 +13,6 @@ from typing import TypeVar
 from us_sim.evaluation.row import words_of
 from us_sim.progress import Progress
 
-__all__ = ["Tell", "timed_cases"]
-
 C = TypeVar("C")
 P = TypeVar("P")
 

@@ -25,8 +25,6 @@ from us_sim.evaluation.independent_forces import (
 from us_sim.evaluation.independent_residual import Residual, solid_residual, spring_residual
 from us_sim.evaluation.named import Named
 
-__all__ = ["TISSUE_METHODS", "Setting", "TissueMethod"]
-
 Setting = Mapping[str, Any]
 """Values of some of a solver's settings, by name."""
 

@@ -19,14 +19,6 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = [
-    "Capsule",
-    "Collider",
-    "Convex",
-    "RoundedBox",
-    "Sphere",
-]
-
 _STEEPEST = math.radians(75)
 """A curved face is refused when it is steeper than this at its ends, rad."""
 _SIZE = Quantity("length", 1e-4, 0.5)

@@ -21,8 +21,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
-__all__ = ["curved_box_distance", "offset_box_distance", "signed_distance"]
-
 
 def signed_distance(
     collider: Collider, pose: Pose, points: NDArray[np.float64]

@@ -14,8 +14,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["connected_parts"]
-
 
 def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
     """(``count``,) the part of each vertex, from 0 in the order of their first vertices.

@@ -17,8 +17,6 @@ from collections.abc import Sequence
 
 from us_sim.geometry.pose import Pose
 
-__all__ = ["FrameTree"]
-
 _MOST = 1000
 """Most frames kept; a tree of more is somebody's mistake."""
 

@@ -11,8 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FACES", "MOST_NODES", "boundary_faces", "boundary_triangles", "face_order"]
-
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """The four outward faces of a positively oriented tetrahedron."""
 

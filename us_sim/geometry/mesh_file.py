@@ -21,8 +21,6 @@ import numpy as np
 
 from us_sim.errors import MeshError
 
-__all__ = ["read_with_meshio"]
-
 _MEMORY = 1 << 30
 """Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size."""
 _MEMORY_PER_BYTE = 64

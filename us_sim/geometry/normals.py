@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
 
-__all__ = ["vertex_normals"]
-
 _Real = TypeVar("_Real", np.float32, np.float64)
 
 

@@ -16,8 +16,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["PLACE", "Placement"]
-
 PLACE = Quantity("length", -10.0, 10.0)
 """A coordinate of something near the patient."""
 

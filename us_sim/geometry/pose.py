@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import PoseError
 
-__all__ = ["Pose"]
-
 _FARTHEST = 1e15
 """m: the coordinates of poses are no larger, so that no product of a few of them overflows."""
 _LONGEST = 1e6

@@ -20,19 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 
-__all__ = [
-    "adjoint",
-    "cross_matrix",
-    "exp",
-    "interpolate",
-    "left_jacobian",
-    "log",
-    "product",
-    "rotation_between",
-    "rotation_exp",
-    "rotation_log",
-]
-
 _SMALL = 1e-3  # rad: below it series to the fourth order are exact to rounding
 
 

@@ -18,8 +18,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["ProbeSettings"]
-
 
 @dataclass(frozen=True)
 class ProbeSettings(Settings):

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 
-__all__ = ["TransducerPart", "transducer_mesh"]
-
 Colour = tuple[float, float, float]
 
 _ALONG, _ROUND, _LATITUDES = 16, 6, 6

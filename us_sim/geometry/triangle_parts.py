@@ -19,8 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TriangleParts", "part_size"]
-
 _FELT, _FINEST = 1.0, 0.25
 """Size of a part over the probe's rounding, and at least over the spacing of the vertices."""
 

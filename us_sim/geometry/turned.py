@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from us_sim.kernels import njit
 
-__all__ = ["turned", "turned_back"]
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def turned(r, x, y, z):

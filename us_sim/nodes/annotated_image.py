@@ -25,8 +25,6 @@ from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["AnnotatedImage"]
-
 CHECKS = 5.0
 """Times a second that the age of the newest pose is looked at."""
 

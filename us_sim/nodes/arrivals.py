@@ -14,8 +14,6 @@ from visualization_msgs.msg import MarkerArray
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import EVERY
 
-__all__ = ["HOPS", "Arrivals"]
-
 HOPS = {
     "tracker/pose": PoseStamped,
     "probe/pose": PoseStamped,

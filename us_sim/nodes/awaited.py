@@ -10,8 +10,6 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.session_settings import AwaitedSettings
 
-__all__ = ["CHECK_S", "Awaited"]
-
 CHECK_S, CHECKS = 0.05, 6
 """How often it is looked, and how often in a row everything must be there.
 

@@ -27,8 +27,6 @@ from us_sim.tracking.camera.info import read_camera_info
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.video_source import VideoSource
 
-__all__ = ["CameraDriver", "main"]
-
 RETRY_S = 1.0
 """How long a camera that is not there is left alone."""
 PATIENCE_S = 1.0

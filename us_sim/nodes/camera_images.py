@@ -13,8 +13,6 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from us_sim.errors import TrackingError
 from us_sim.tracking.camera.model import CameraModel
 
-__all__ = ["camera_from", "grey_from", "grey_from_compressed"]
-
 # Bytes a pixel, and OpenCV's conversion to grey where one is needed. A Bayer pattern is named by
 # ROS after its first row's first two pixels, and by OpenCV after its second row's second two.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {

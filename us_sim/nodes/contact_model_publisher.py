@@ -16,8 +16,6 @@ from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.solvers.switching import SwitchableTissue
 from us_sim.tracking.haptic.contact_model import ContactModel, SecantStiffness, wrench_in_patient
 
-__all__ = ["ContactModelPublisher"]
-
 
 class ContactModelPublisher:
     """``tissue/contact_model``: the wrench at a pose of the probe and how it changes from there.

@@ -12,8 +12,6 @@ import signal
 import sys
 from pathlib import Path
 
-__all__ = ["end_at_once_when_interrupted", "is_node"]
-
 _INTERRUPTED = 130
 _WITH_VALUE = ("-X", "-W")  # the interpreter's options that are followed by a value
 

@@ -22,8 +22,6 @@ from us_sim.nodes.conversions.stamps import require_stamp
 if TYPE_CHECKING:
     from us_sim.nodes.health import Health
 
-__all__ = ["GuardedNode", "decoded", "kind_of", "shown"]
-
 CLOCK_S = 5.0
 """For simulated time to begin, before it is said that it does not."""
 SAY_S = 1.0

@@ -25,8 +25,6 @@ from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.tracker_building import haptic_rendering_of, source_settings
 
-__all__ = ["HapticRenderer", "main"]
-
 LOOKS, REPORTS = 5.0, 1.0
 """Times a second that it is seen who listens, and that diagnostics are told how regular it is.
 

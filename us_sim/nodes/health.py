@@ -15,8 +15,6 @@ from us_sim.nodes.conversions.stamps import nanoseconds_of
 from us_sim.nodes.guarded_node import shown
 from us_sim.nodes.qos import STREAM, overridable
 
-__all__ = ["Health"]
-
 SAY_S = 5.0
 """How long a problem of the same kind is not said again; each time it is twice as long."""
 SAY_AT_LEAST_S = 300.0

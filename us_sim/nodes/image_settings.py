@@ -16,8 +16,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 
-__all__ = ["OVERLAYS", "AnnotatedImageSettings", "PoseAgeSettings", "image_parameters"]
-
 OVERLAYS = ("strain", "strain_estimate", "velocity", "none")
 """Colours over the annotated image, by the names of the streams that they are of."""
 

@@ -18,8 +18,6 @@ from us_sim.nodes.qos import EVERY, overridable
 from us_sim.nodes.settings import ImageWriterSettings
 from us_sim.nodes.truth_files import TruthFiles
 
-__all__ = ["ImageWriter", "main"]
-
 
 class ImageWriter(GuardedNode):
     """``ultrasound/image`` to ``folder/000000.png``, ``000001.png``, …

@@ -20,8 +20,6 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.preparation import Failed, Preparation
 from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
 
-__all__ = ["LiveTissue"]
-
 OWN = "tissue_deformer"
 LOOK_S = 0.1
 """How often it is looked whether what was set is ready, when no pose comes."""

@@ -9,8 +9,6 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.recording.schemas import schema_text
 
-__all__ = ["message_type"]
-
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 """What a message type of ROS 2 is called."""
 

@@ -9,8 +9,6 @@ from typing import Any
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 
-__all__ = ["Newest"]
-
 
 class Newest:
     """A subscription callback that hands ``work`` the newest message once the queue is drained.

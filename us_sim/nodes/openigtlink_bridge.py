@@ -21,8 +21,6 @@ from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
 from us_sim.tracking.openigtlink.message import image_message, transform_message
 from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
 
-__all__ = ["OpenIGTLinkBridge", "main"]
-
 REMEMBERED = 256
 """Poses kept for the images that carry their stamps."""
 LOOK_S = 0.5

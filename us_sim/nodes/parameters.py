@@ -26,8 +26,6 @@ from us_sim.nodes.settings import is_live
 from us_sim.settings.amount import dial_unit
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
 
-__all__ = ["Group", "LiveSettings", "changed", "declared", "parameters_with"]
-
 S = TypeVar("S", bound=Settings)
 
 

@@ -29,8 +29,6 @@ from us_sim.recording.path import ProbePath, read_path
 from us_sim.settings.spelling import counted
 from us_sim.share import find_bag
 
-__all__ = ["PathPlayer", "main"]
-
 HELD = 5.0
 """Poses a second of a probe that is held still; images are called stale after half a second."""
 

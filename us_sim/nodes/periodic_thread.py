@@ -11,8 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["PeriodicThread", "be_punctual"]
-
 _MEASURED = 2000
 """Ticks of which the jitter is told."""
 

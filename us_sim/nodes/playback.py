@@ -10,8 +10,6 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.session_settings import PathPlayerSettings, SessionPlayerSettings
 from us_sim.recording.playhead import Playhead
 
-__all__ = ["Playback"]
-
 
 class Playback:
     """Does as the parameters ``rate``, ``loop``, ``paused`` and ``time`` of a player say.

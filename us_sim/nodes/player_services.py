@@ -11,8 +11,6 @@ from rclpy.parameter import Parameter
 from us_sim.nodes.rosbag2_service import offer_service
 from us_sim.nodes.session_settings import PathPlayerSettings, SessionPlayerSettings
 
-__all__ = ["offer_player_services"]
-
 
 def offer_player_services(
     node: Node,

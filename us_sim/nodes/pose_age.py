@@ -11,8 +11,6 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.image_settings import PoseAgeSettings
 from us_sim.nodes.parameters import Group, LiveSettings
 
-__all__ = ["PoseAge"]
-
 REMEMBERED = 256
 """Poses whose arrival is kept for the images at them."""
 

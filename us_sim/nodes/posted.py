@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 
 from rclpy.node import Node
 
-__all__ = ["Posted"]
-
 T = TypeVar("T")
 
 

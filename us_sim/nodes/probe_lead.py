@@ -8,8 +8,6 @@ from pathlib import PurePath
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.session import SessionState
 
-__all__ = ["LEAD_TOPIC", "NO_PAGE", "Lead", "is_left_by_pages", "probe_lead"]
-
 LEAD_TOPIC = "tracker/pose"
 PLAYERS = ("path_player", "session_player")
 """Nodes that `session_control` starts and ends."""

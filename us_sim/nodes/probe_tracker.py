@@ -44,8 +44,6 @@ from us_sim.tracking.filter.pose_filter import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement
 from us_sim.tracking.state import TrackingState
 
-__all__ = ["ProbeTracker", "main"]
-
 OWN = "probe_tracker"
 FARTHEST = 100.0
 """m from the device's origin, beyond which a pose is in another unit, or nonsense."""

@@ -13,8 +13,6 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.tracking.state import TrackingState
 
-__all__ = ["ProbeWhereabouts"]
-
 
 class ProbeWhereabouts:
     """Each pose of ``probe/pose``, and the last one, which is in the latched ``probe/status``.

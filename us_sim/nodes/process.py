@@ -21,8 +21,6 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.realtime import go_first
 from us_sim.nodes.standby import STANDBY, stand_by
 
-__all__ = ["INTERRUPTED", "run_node"]
-
 INTERRUPTED = 130
 """The exit status of a node that was told to end before its work was done."""
 

@@ -3,8 +3,6 @@
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-__all__ = ["CATALOGUE", "EVERY", "FOREIGN", "LATCHED", "STREAM", "overridable"]
-
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=10,

@@ -11,8 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 
-__all__ = ["go_along", "go_first", "scheduling_of"]
-
 _PRIORITY = 1
 """The lowest of those that go first: drivers of devices may go before."""
 

@@ -13,8 +13,6 @@ from rclpy.subscription import Subscription
 
 from us_sim.recording.qos import QosProfile
 
-__all__ = ["RecordedTopic"]
-
 QUEUE = 1000
 """Messages that may wait for the executor."""
 OVERLAP_S = 2.0

@@ -11,8 +11,6 @@ from us_sim.nodes.rosbag2_service import offer_service
 from us_sim.nodes.session_settings import LOST
 from us_sim.recording.losses import Loss
 
-__all__ = ["Controlled", "RecorderEvents", "offer_services"]
-
 
 class Controlled(Protocol):
     """A recorder."""

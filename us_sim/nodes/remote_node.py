@@ -15,8 +15,6 @@ from us_sim.nodes.conversions.parameters import parameter_from, parameter_messag
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.parameters import NodeParameters, Parameter, State
 
-__all__ = ["RemoteNode"]
-
 ANSWER_S = 10.0
 """How long an answer is waited for: a node that makes images anew may need seconds."""
 SERVICES_S = 5.0

@@ -15,8 +15,6 @@ from us_sim.nodes.remote_node import RemoteNode
 from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.parameters import NodeParameters, Parameter
 
-__all__ = ["RemoteParameters"]
-
 EVENTS = "/parameter_events"
 EVERY_EVENT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 """As rclpy publishes them."""

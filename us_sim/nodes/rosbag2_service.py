@@ -7,8 +7,6 @@ from typing import Any
 
 from rclpy.node import Node
 
-__all__ = ["offer_service"]
-
 
 def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
     """Offer a service as a node of rosbag2 does; False where its type is not known here.

@@ -15,8 +15,6 @@ from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["ScannerConsole"]
-
 _TISSUES = "acoustics.tissues."
 
 Console = Callable[[Probe, Imaging, Acoustics], None]

@@ -17,8 +17,6 @@ from us_sim.nodes.settings import SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
-__all__ = ["SceneNode"]
-
 
 class SceneNode(GuardedNode):
     """A node that works on a scene.

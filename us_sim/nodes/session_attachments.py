@@ -19,8 +19,6 @@ from us_sim.scene.reading import parse_scene, scene_document, with_path, with_vo
 from us_sim.settings.setting import rules_of
 from us_sim.share import full_path
 
-__all__ = ["session_attachments"]
-
 LARGEST = 4 * 1024 * 1024
 """Bytes of a file that is attached itself; of larger ones, such as volumes, the checksum is."""
 

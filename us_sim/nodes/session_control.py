@@ -19,9 +19,6 @@ from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
 from us_sim.nodes.session_settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
-__all__ = ["Controlled", "SessionControl"]
-
-
 _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_room_bytes")
 """What changes all the time, and is told once a second."""
 

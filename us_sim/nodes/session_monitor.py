@@ -15,8 +15,6 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.qos import EVERY
 from us_sim.viewer.parameters import Kind
 
-__all__ = ["SessionMonitor"]
-
 TOLD = 50
 """Losses that a report tells one by one, the newest."""
 

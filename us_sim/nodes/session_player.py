@@ -24,8 +24,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
 from us_sim.share import find_bag
 
-__all__ = ["SessionPlayer", "main"]
-
 _MOST_SAID = 10
 """Topics that are left out, of which a person is told each."""
 

@@ -33,8 +33,6 @@ from us_sim.recording.write_behind import Message, WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
-__all__ = ["SessionRecorder", "main"]
-
 _M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
 MARKERS = "session/marker"
 """What is said there marks a moment."""

@@ -9,15 +9,6 @@ from us_sim.nodes.topics import TOPICS
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = [
-    "BEGUN",
-    "AwaitedSettings",
-    "PathPlayerSettings",
-    "SessionControlSettings",
-    "SessionPlayerSettings",
-    "SessionRecorderSettings",
-]
-
 BEGUN = Quantity("time", 0.0, 1e10)
 """When something began, since 1970."""
 _SPEED = Quantity("number", 0.01, 100.0)

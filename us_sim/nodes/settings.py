@@ -36,22 +36,6 @@ from us_sim.slicing.formation.imaging import Imaging
 from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
-__all__ = [
-    "NODES",
-    "CameraDriverSettings",
-    "ImageWriterSettings",
-    "OpenIGTLinkBridgeSettings",
-    "ProbeTrackerSettings",
-    "SceneNodeSettings",
-    "SkinDeformerSettings",
-    "SpaceMouseDriverSettings",
-    "StructureMarkersSettings",
-    "TissueDeformerSettings",
-    "checked_parameters",
-    "is_live",
-    "parameters_of",
-]
-
 _MARKERS = Quantity("frequency", 0.1, 1000.0)
 
 

@@ -26,8 +26,6 @@ from us_sim.scene.building import membrane_of
 from us_sim.settings.setting import rules_of
 from us_sim.skin.settings import MembraneSettings, SkinSettings
 
-__all__ = ["SkinDeformer", "main"]
-
 
 class SkinDeformer(SceneNode):
     """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.

@@ -13,8 +13,6 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.building import skin_surface_of
 from us_sim.slicing.b_mode import BMode
 
-__all__ = ["SkinShapes"]
-
 _REMEMBERED = 64
 
 

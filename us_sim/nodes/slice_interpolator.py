@@ -30,8 +30,6 @@ from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["SliceInterpolator", "main"]
-
 _BEYOND = 1e-3  # m, by which an image may be too deep before that is said
 
 _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor

@@ -18,8 +18,6 @@ from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse.space_mouse import SpaceMouse
 
-__all__ = ["SpaceMouseDriver", "main"]
-
 RETRY_S = 1.0
 """How long a device that is not there is left alone."""
 

@@ -14,8 +14,6 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-__all__ = ["STANDBY", "STANDING_BY", "stand_by"]
-
 STANDBY = "US_SIM_STANDBY"
 """Set in the environment of a process that is to wait."""
 STANDING_BY = "standing by"

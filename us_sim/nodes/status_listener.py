@@ -13,8 +13,6 @@ from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import STREAM
 from us_sim.viewer.status import Level, NodeStatus, StatusBoard
 
-__all__ = ["StatusListener"]
-
 LEVELS = {
     DiagnosticStatus.OK: Level.WELL,
     DiagnosticStatus.WARN: Level.WARNING,

@@ -20,8 +20,6 @@ from us_sim.scene.structures import Structure, structures_of
 from us_sim.settings.spelling import counted
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["StructureMarkers"]
-
 
 class StructureMarkers:
     """``tissue/structures``: a TRIANGLE_LIST of each structure, where the tissue has carried it.

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from us_sim.nodes.contact_model_publisher import ContactModelPublisher
     from us_sim.nodes.structure_markers import StructureMarkers
 
-__all__ = ["TissueDeformer", "main"]
-
 ALWAYS = Time()
 """The stamp of what does not change: zero, which tf takes as the latest."""
 GO_ON_S = 0.05

@@ -14,8 +14,6 @@ from us_sim.nodes.conversions import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import EVERY, overridable
 
-__all__ = ["TruthFiles"]
-
 REMEMBERED = 1000
 """Images whose numbers are kept for what is known of them, and messages that wait for theirs."""
 

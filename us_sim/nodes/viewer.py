@@ -30,9 +30,6 @@ from us_sim.viewer.server import WebServer
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
-__all__ = ["Viewer", "main"]
-
-
 IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` that pages are told with each image."""
 

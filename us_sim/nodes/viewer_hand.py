@@ -32,8 +32,6 @@ from us_sim.viewer.hand_state import hand_state
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["ViewerHand"]
-
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
 images than that."""

@@ -16,8 +16,6 @@ from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 from us_sim.viewer.session import NOT_THERE, LoadableScene, SessionBoard, SessionState
 
-__all__ = ["CONTROL", "ViewerSession"]
-
 CONTROL = "session_control"
 LOOK_S = 0.5
 SILENT_S = 3.0

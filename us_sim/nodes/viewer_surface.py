@@ -12,8 +12,6 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 
-__all__ = ["ViewerSurface"]
-
 _PLANE = 0.1
 """m around the origin, of the plane where nothing has a surface."""
 

@@ -25,8 +25,6 @@ from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.live import LiveReconstruction
 from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
-__all__ = ["VolumeReconstructor", "main"]
-
 SECONDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Images that wait while the volume is saved."""
 REMEMBERED = 256

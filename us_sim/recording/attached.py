@@ -12,8 +12,6 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import Fault
 
-__all__ = ["extract", "versions"]
-
 
 def extract(bag: Path, folder: Path) -> list[Path]:
     """Write the files that are attached to a bag; their paths.

@@ -16,8 +16,6 @@ from pathlib import Path
 from us_sim.errors import BagError
 from us_sim.share import full_path
 
-__all__ = ["BagNames"]
-
 
 class BagNames:
     """Names of files that are not there yet.

@@ -13,8 +13,6 @@ from us_sim.recording.metadata import BagMetadata, FileEntry, TopicEntry
 from us_sim.recording.qos import QosProfile, qos_to_yaml
 from us_sim.recording.schemas import definitions, schema_text
 
-__all__ = ["Contents"]
-
 
 @dataclass
 class _Topic:

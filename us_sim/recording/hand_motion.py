@@ -30,8 +30,6 @@ from us_sim.recording.path import ProbePath
 from us_sim.recording.shipped_path import write_where_asked
 from us_sim.settings.spelling import unknown
 
-__all__ = ["HASTES", "KINDS", "HandMotion", "Haste", "Room", "hand_motion", "shipped_hand_path"]
-
 RATE = 60.0
 """Poses per second."""
 _EPOCH = 1_700_000_000 * 10**9  # ns

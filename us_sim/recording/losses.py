@@ -7,8 +7,6 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
-__all__ = ["Loss", "Losses", "news"]
-
 
 class Loss(NamedTuple):
     """Messages of one topic that were lost."""

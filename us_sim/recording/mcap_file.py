@@ -43,8 +43,6 @@ from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 
-__all__ = ["MAGIC", "McapFile"]
-
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC

@@ -40,8 +40,6 @@ from mcap.records import (
     SummaryOffset,
 )
 
-__all__ = ["MAGIC", "McapOutput", "Place"]
-
 MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
 _CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression

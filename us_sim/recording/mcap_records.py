@@ -25,20 +25,6 @@ from mcap.opcode import Opcode
 from us_sim.errors import BagError
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
-__all__ = [
-    "AFTER_THE_DATA",
-    "DAMAGE",
-    "HEADER",
-    "Chunk",
-    "Record",
-    "attachment",
-    "cut_chunk_at",
-    "next_sound",
-    "parsed",
-    "record_at",
-    "records_in",
-]
-
 HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 _CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
 _LENGTH = struct.Struct("<Q")

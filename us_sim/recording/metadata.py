@@ -24,8 +24,6 @@ from us_sim.recording.qos import QosProfile, qos_from_yaml
 from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 
-__all__ = ["BagMetadata", "FileEntry", "TopicEntry", "read_metadata"]
-
 _NEWEST_VERSION = 9
 _NO_TIME = 2**63 - 1  # ns, the starting time that rosbag2 gives a bag without messages
 

@@ -16,8 +16,6 @@
 
 from __future__ import annotations
 
-__all__ = ["Playhead"]
-
 
 class Playhead:
     """Goes on with a clock that is told to it.

@@ -46,8 +46,6 @@ from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, read_slicer
 from us_sim.volume.sequences.transform_chain import TransformChain, shortest_chain
 from us_sim.volume.sequences.transform_name import is_image_frame, split_transform_name
 
-__all__ = ["TrackerRecording", "read_tracker_recording"]
-
 _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
 
 

@@ -16,8 +16,6 @@ from collections import deque
 
 from us_sim.recording.write_behind import Message
 
-__all__ = ["PreRoll"]
-
 
 class PreRoll:
     """A ring of messages, as rosbag2's snapshot mode keeps it.

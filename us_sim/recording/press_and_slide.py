@@ -19,8 +19,6 @@ from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath
 from us_sim.recording.shipped_path import write_where_asked
 
-__all__ = ["press_and_slide"]
-
 _EPOCH = 1_700_000_000 * 10**9  # ns
 
 _KEYED_DURATION = 10.0

@@ -21,8 +21,6 @@ from us_sim.errors import BagError
 from us_sim.recording.path import write_path
 from us_sim.recording.press_and_slide import press_and_slide
 
-__all__ = ["pressing_path"]
-
 _MADE = 1
 """Changes with what `press_and_slide` makes, so that no older file is taken for it."""
 

@@ -21,8 +21,6 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.settings.yaml_text import YamlError, load_yaml
 
-__all__ = ["INFINITE", "QosProfile", "qos_from_yaml", "qos_to_yaml"]
-
 INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
 
 _POLICIES = {

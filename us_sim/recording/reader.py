@@ -30,8 +30,6 @@ from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
 from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
-__all__ = ["Bag", "read_bag"]
-
 
 class Bag:
     """A bag opened for reading; made by :func:`read_bag`."""

@@ -30,8 +30,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
 
-__all__ = ["POSE_STAMPED", "Row", "bodies_in", "pose_rows"]
-
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _TF = "tf2_msgs/msg/TFMessage"

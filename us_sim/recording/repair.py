@@ -27,8 +27,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagTopic, Fault
 from us_sim.recording.writer import BagWriter
 
-__all__ = ["Repaired", "repair"]
-
 
 @dataclass(frozen=True)
 class Repaired:

@@ -7,8 +7,6 @@ from datetime import UTC, datetime
 from us_sim.errors import printable
 from us_sim.recording.reader import Bag
 
-__all__ = ["describe"]
-
 
 def describe(bag: Bag) -> str:
     """Path, times, topics with type, count, rate and offered quality; then losses, marks, files.

@@ -29,8 +29,6 @@ from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError
 
-__all__ = ["definitions", "jazzy_definitions", "normalized_type", "schema_text", "type_hash"]
-
 _RULE = "=" * 80
 _LARGEST_TEXT = 1 << 18
 _MOST_PARTS = 20_000

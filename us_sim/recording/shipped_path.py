@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath, write_path
 
-__all__ = ["write_where_asked"]
-
 
 def write_where_asked(arguments: Sequence[str], module: str, make: Callable[[], ProbePath]) -> int:
     """Write a path to the file that the one argument names.

@@ -13,8 +13,6 @@ from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 
-__all__ = ["MAGIC", "SqliteFile"]
-
 MAGIC = b"SQLite format 3\0"
 
 

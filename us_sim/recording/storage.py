@@ -19,8 +19,6 @@ from us_sim.recording.sqlite_file import SqliteFile
 from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import unpack_file
 
-__all__ = ["NoBagError", "Scratch", "Storage", "bag_files", "open_storage"]
-
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _PART = re.compile(r"(.*?)(?:_(\d+))?(\.(?:mcap|db3)(?:\.zstd)?)")

@@ -8,8 +8,6 @@ from typing import NamedTuple
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile
 
-__all__ = ["LOST", "MARKER", "BagAttachment", "BagMessage", "BagNote", "BagTopic", "Fault"]
-
 LOST = "messages_lost"
 """The note that says how many messages of each topic are missing since the note before."""
 MARKER = "marker"

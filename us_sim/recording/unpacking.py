@@ -20,8 +20,6 @@ import zstandard
 
 from us_sim.errors import BagError
 
-__all__ = ["LARGEST_CHUNK", "LARGEST_FILE", "unpack", "unpack_file"]
-
 LARGEST_CHUNK = 1 << 28
 """Bytes of a chunk or message after unpacking; rosbag2 makes chunks of less than a megabyte."""
 

@@ -25,8 +25,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.writer import BagWriter
 
-__all__ = ["WRENCH_STAMPED", "WrenchRecord", "read_wrenches", "write_wrenches"]
-
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 
 

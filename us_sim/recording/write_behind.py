@@ -28,8 +28,6 @@ from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
-__all__ = ["Message", "WriteBehind"]
-
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
 _RETRY = 1.0  # s, between looks at a disk that was full
 _BATCH = 512 * 1024  # bytes of messages for which it is worth to wake the thread

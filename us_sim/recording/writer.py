@@ -27,8 +27,6 @@ from us_sim.recording.contents import Contents
 from us_sim.recording.mcap_output import McapOutput, Place
 from us_sim.settings.spelling import counted
 
-__all__ = ["BagWriter"]
-
 _CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
 _ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
 _COMPRESSIONS = {"none": "", "zstd": "zstd"}

@@ -14,8 +14,6 @@ from typing import Any
 
 from us_sim.run.end_with_parent import end_with_parent
 
-__all__ = ["Background", "tell"]
-
 _NICE = 10
 
 

@@ -12,8 +12,6 @@ from us_sim.errors import BagError
 from us_sim.recording.metadata import read_metadata
 from us_sim.share import full_path, shared_roots
 
-__all__ = ["bags_in_reach"]
-
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd")
 _MOST = 500
 """Bags of a folder that are listed, the newest."""

@@ -15,8 +15,6 @@ from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
 from us_sim.scene.reading import load_scene
 from us_sim.scene.thumbnail import thumbnail_file
 
-__all__ = ["main"]
-
 
 def main(names: Sequence[str]) -> int:
     """Tell all scenes, then the file of each one's thumbnail as soon as there is one."""

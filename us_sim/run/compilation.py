@@ -19,8 +19,6 @@ from us_sim.settings.registry import SLICERS, SOLVERS
 if TYPE_CHECKING:
     from us_sim.tissue.model import TissueModel
 
-__all__ = ["compile_kernels", "parts"]
-
 Part = tuple[str, Callable[[], object]]
 """What a person reads, and what compiles it."""
 

@@ -22,8 +22,6 @@ import signal
 import threading
 from collections.abc import Iterator
 
-__all__ = ["deferred_signals"]
-
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -18,8 +18,6 @@ from filelock import FileLock, Timeout
 
 from us_sim.errors import UsSimError
 
-__all__ = ["alone_on_domain", "domain"]
-
 
 def domain() -> str:
     """The ROS domain's number, as the environment says it."""

@@ -20,8 +20,6 @@ from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import IMAGER, IMAGES, Supervisor, say
 from us_sim.run.supervision_settings import SupervisionSettings
 
-__all__ = ["follow"]
-
 SETTLE_S = 1.2
 """After the path's end: the last images, and each node's last report, which comes every second."""
 RIVALRY_S = 5.0

@@ -25,8 +25,6 @@ from pathlib import Path
 
 from us_sim.run.end_with_parent import end_with_parent
 
-__all__ = ["main"]
-
 EVERY_NODE = ("us_sim.nodes", "us_sim.nodes.process", "us_sim.nodes.scene_node")
 """What every node imports; the first provides rclpy."""
 COMPUTING = ("us_sim.kernels", "scipy.sparse", "scipy.sparse.linalg", "scipy.sparse.csgraph")

@@ -26,8 +26,6 @@ from typing import IO
 from us_sim.run.end_with_parent import end_with_parent
 from us_sim.run.process_state import process_state
 
-__all__ = ["ForkServer", "ForkedProcess", "package_on_path"]
-
 _MODULE = "us_sim.run.fork_server"
 _PR_SET_CHILD_SUBREAPER = 36
 _ROOM = 1000

@@ -9,8 +9,6 @@ from typing import Any
 from us_sim.errors import UsSimError
 from us_sim.run.parameter_texts import require_texts
 
-__all__ = ["node_in_process"]
-
 
 def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -> Any:
     """The node called ``name`` in an initialised context, with parameters by name.

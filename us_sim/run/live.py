@@ -38,8 +38,6 @@ from us_sim.viewer.viewer_settings import ViewerSettings
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
 
-__all__ = ["demo", "dry_run", "play", "prepare_volume", "run", "view_running"]
-
 
 def dry_run(
     scene: Scene,

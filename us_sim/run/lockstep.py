@@ -30,8 +30,6 @@ from us_sim.scene.scene import Scene
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
-__all__ = ["render", "render_scene", "truth_folders"]
-
 QUIET_S = 0.25
 """Silence after which everything that was sent has been taken."""
 

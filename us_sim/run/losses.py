@@ -12,8 +12,6 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 
-__all__ = ["Loss", "Outcome", "files_of", "images_in"]
-
 IMAGES = "/ultrasound/image"
 TOLD = 4
 """Losses that are told one by one in a sentence."""

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from us_sim.nodes.session_control import SessionControl
     from us_sim.nodes.session_monitor import SessionMonitor
 
-__all__ = ["Monitored", "refuse_unknown"]
-
 LOOK_AROUND_S = 0.4
 """To discover whether another simulation is on this ROS domain."""
 ANSWER_S = 5.0

@@ -10,8 +10,6 @@ from collections.abc import Mapping
 
 from us_sim.errors import UsSimError
 
-__all__ = ["require_texts"]
-
 
 def require_texts(parameters: Mapping[str, object]) -> None:
     """Raise UsSimError for a text that is no UTF-8, as a file's name may be."""

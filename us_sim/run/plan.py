@@ -22,8 +22,6 @@ from us_sim.scene.building import path_of
 from us_sim.share import full_path
 from us_sim.viewer.listening import require_free
 
-__all__ = ["PLAYERS", "Plan", "goes_on", "plan_of"]
-
 PLAYERS = ("path_player", "session_player")
 _WHAT_COUNTS = {
     RECORDER: ("file",),

@@ -6,8 +6,6 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ProcessState", "process_state"]
-
 _UTIME, _STIME = 11, 12  # in /proc/PID/stat, counted from the state; see proc_pid_stat(5)
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from us_sim.run.graph import NodeProcess
 from us_sim.run.losses import files_of
 
-__all__ = ["Recordings"]
-
 
 class Recordings:
     """Finds the files of each recorder that was started, without those that were there before."""

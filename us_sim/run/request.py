@@ -14,8 +14,6 @@ from us_sim.viewer.viewer_settings import ViewerSettings
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
 
-__all__ = ["Request"]
-
 _OF_ANY_SCENE = (VIEWER, RECORDER, "path_player")
 """Nodes whose parameters hold whatever the scene is."""
 

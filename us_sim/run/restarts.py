@@ -10,8 +10,6 @@ from dataclasses import replace
 from us_sim.run.graph import RECORDER, VIEWER, NodeProcess
 from us_sim.run.supervision_settings import SupervisionSettings
 
-__all__ = ["Restarts", "going_on"]
-
 MINUTE_S = 60.0
 
 

@@ -17,8 +17,6 @@ from us_sim.run.end_with_parent import end_with_parent
 from us_sim.run.forking import ForkedProcess, ForkServer, package_on_path
 from us_sim.run.parameter_texts import require_texts
 
-__all__ = ["COMPLAINT", "STANDING_BY", "STOP_S", "NodeProcess", "RunningNode"]
-
 COMPLAINT = "us_sim: "
 """With which a node begins to say why it cannot work."""
 STOP_S = 0.8

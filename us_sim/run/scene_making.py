@@ -15,8 +15,6 @@ from us_sim.scene.building import volume_of
 from us_sim.scene.case_tissue import keep_tissue
 from us_sim.scene.reading import load_scene
 
-__all__ = ["main"]
-
 _STEP_S = 0.1
 
 

@@ -26,8 +26,6 @@ from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.share import find_bag, full_path
 
-__all__ = ["Simulation"]
-
 CATALOGUE_AFTER_S = 3.0
 """From all nodes ready until scenes are listed: the first picture goes before."""
 _BAGS_EVERY_S = 2.0

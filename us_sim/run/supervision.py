@@ -27,8 +27,6 @@ from us_sim.run.restarts import Restarts, going_on
 from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.run.watch import START_LIMIT_S, Watch
 
-__all__ = ["IMAGER", "IMAGES", "Kept", "Supervisor", "say"]
-
 SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
 """Nodes that take long to start, and hold no device that a second process could not have."""
 LIVES_S = 10.0

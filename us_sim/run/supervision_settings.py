@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["SupervisionSettings"]
-
 
 @dataclass(frozen=True)
 class SupervisionSettings(Settings):

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 
 from us_sim.run.process_state import ProcessState, process_state
 
-__all__ = ["Watch"]
-
 STEP_S = 0.5
 """A longer time between two looks counts as this much: the machine slept, or had no time for us,
 and so perhaps none for the nodes."""

@@ -9,8 +9,6 @@ from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.vessel import Vessel
 from us_sim.volume.volume import Volume
 
-__all__ = ["blood_of"]
-
 
 def blood_of(scene: Scene, volume: Volume) -> Blood:
     """All vessels of a scene that have a flow.

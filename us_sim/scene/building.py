@@ -38,17 +38,6 @@ if TYPE_CHECKING:
     from us_sim.tissue.model import TissueModel
     from us_sim.volume.volume import Volume
 
-__all__ = [
-    "collider_of",
-    "materials_of",
-    "membrane_of",
-    "path_of",
-    "probe_of",
-    "scanner_of",
-    "tissue_model_of",
-    "volume_of",
-]
-
 _TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material (`fat: null`)"
 
 

@@ -30,8 +30,6 @@ from us_sim.volume.cases.case import Case, read_case
 from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
 from us_sim.volume.volume import grid_extent
 
-__all__ = ["case_document", "patient_from_volume"]
-
 _BESIDE = 0.013  # m, of tissue beside the probe
 _LEAST_ASIDE = 0.03  # m, along the probe's y: for its slide, and for tissue to give way
 _ASIDE_OVER_DEPTH = 0.25

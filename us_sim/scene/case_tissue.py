@@ -24,8 +24,6 @@ from us_sim.volume.cases.case import LABELS, TISSUE
 from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
 from us_sim.volume.volume import Volume
 
-__all__ = ["box_tissue", "keep_tissue", "kept_tissue"]
-
 _logger = logging.getLogger(__name__)
 
 

@@ -28,8 +28,6 @@ from us_sim.volume.surfaces.decimation import coarsened
 from us_sim.volume.surfaces.structure_surface import structure_surface
 from us_sim.volume.volume import Volume
 
-__all__ = ["conforming_tissue"]
-
 _logger = logging.getLogger(__name__)
 
 _GROWTH = 0.35

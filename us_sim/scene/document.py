@@ -21,8 +21,6 @@ from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import LARGEST_YAML, YamlError, load_yaml
 
-__all__ = ["merged", "read_document"]
-
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
 

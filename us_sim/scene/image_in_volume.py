@@ -30,8 +30,6 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.tracking.measurement import PATIENT
 from us_sim.volume.volume import Volume
 
-__all__ = ["check_path_in_volume", "part_inside"]
-
 _POSES = 60  # of a path that are looked at
 _POINTS = 32  # along each side of an image
 

@@ -13,8 +13,6 @@ from us_sim.scene.reading import find_scene, load_scene
 from us_sim.scene.scene import CASE_PREFIX
 from us_sim.share import shared_roots
 
-__all__ = ["ListedScene", "listed_scene", "listed_scenes"]
-
 
 @dataclass(frozen=True)
 class ListedScene:

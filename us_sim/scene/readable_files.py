@@ -16,8 +16,6 @@ from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.scene.tracker_building import camera_body_of, source_settings, tracking_of
 
-__all__ = ["check_files"]
-
 
 def check_files(scene: Scene) -> list[str]:
     """Read what files the scene names, of its volume only the header; the keys that name them.

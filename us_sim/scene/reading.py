@@ -22,8 +22,6 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.spelling import nearest, shown
 from us_sim.share import full_path, shared_roots
 
-__all__ = ["find_scene", "load_scene", "parse_scene", "scene_document", "with_path", "with_volume"]
-
 
 def find_scene(name: str | Path) -> Path:
     """The scene file of that path, or of that name in ``config/scenes``.

@@ -22,8 +22,6 @@ from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["RestPlacement", "probe_pose", "rest_placement"]
-
 _MOST_FRAMES = 60
 """Frames of a solver until the tissue under one pose is at rest; inertia and creep take some."""
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from us_sim.tissue.mesh.embedding import EmbeddedSurface
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["Structure", "colour_of", "require_labels", "structures_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Structure:

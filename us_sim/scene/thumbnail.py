@@ -16,8 +16,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
 
-__all__ = ["HEIGHT", "WIDTH", "thumbnail_file"]
-
 WIDTH, HEIGHT = 240, 180
 """Pixels."""
 _QUALITY = 85

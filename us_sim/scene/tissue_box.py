@@ -19,8 +19,6 @@ from us_sim.tissue.mesh.fitted_planes import fitted_planes, wanted_under_probe
 from us_sim.tissue.mesh.label_thickness import wanted_by_labels
 from us_sim.volume.volume import Volume
 
-__all__ = ["box_planes", "footprint"]
-
 _STEPS = 160
 """Places along the longest side of the box at which structures are looked for."""
 

@@ -21,14 +21,6 @@ if TYPE_CHECKING:
     from us_sim.tracking.haptic.rendering import HapticRendering
     from us_sim.tracking.probe_tracking import ProbeTracking
 
-__all__ = [
-    "camera_body_of",
-    "haptic_rendering_of",
-    "source_settings",
-    "tracker_poses_of",
-    "tracking_of",
-]
-
 
 def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
     """What turns the measurements of the scene's tracker into the probe's poses.

@@ -16,8 +16,6 @@ import math
 
 from us_sim.settings.quantity import Quantity
 
-__all__ = ["amount", "dial_unit", "span"]
-
 _HANDY = {
     "length": ("mm", "m", "um"),
     "pressure": ("kPa", "Pa", "MPa", "GPa"),

@@ -29,8 +29,6 @@ from us_sim.settings.spelling import unknown
 if TYPE_CHECKING:
     from us_sim.settings.setting import Settings
 
-__all__ = ["Choice", "Chosen", "Option"]
-
 _logger = logging.getLogger(__name__)
 
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from us_sim.errors import SettingsError
 from us_sim.settings.spelling import shown, unknown
 
-__all__ = ["Quantity", "units_of"]
-
 _UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},

@@ -21,8 +21,6 @@ from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.setting import Refusal, Rule, Settings, convert, kinds_of, rules_of
 from us_sim.settings.spelling import nearest, shown, unknown
 
-__all__ = ["Reader"]
-
 S = TypeVar("S", bound=Settings)
 
 

@@ -7,19 +7,6 @@ before. Packages of others add solvers and trackers under the entry point groups
 from us_sim.errors import CalibrationError, ProbeError, SolverError, TrackingError, VolumeError
 from us_sim.settings.choice import Choice, Option
 
-__all__ = [
-    "CALIBRATIONS",
-    "COLLIDERS",
-    "EVALUATIONS",
-    "FILTERS",
-    "PHANTOMS",
-    "PROBES",
-    "SEGMENTATIONS",
-    "SLICERS",
-    "SOLVERS",
-    "TRACKERS",
-]
-
 SOLVERS = Choice(
     "tissue solver",
     key="solver",

@@ -31,8 +31,6 @@ from us_sim.settings.spelling import shown, unknown
 if TYPE_CHECKING:
     from us_sim.settings.choice import Choice
 
-__all__ = ["Rule", "Settings", "convert", "kinds_of", "rules_of", "setting"]
-
 NUMBER = Quantity("number")
 
 

@@ -14,8 +14,6 @@ import difflib
 import reprlib
 from collections.abc import Iterable
 
-__all__ = ["counted", "nearest", "shown", "unknown"]
-
 _MANY = 25
 """Names that are too many to list beside the one that was probably meant."""
 _repr = reprlib.Repr()

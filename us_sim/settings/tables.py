@@ -27,8 +27,6 @@ from us_sim.settings.amount import amount, span
 from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
 
-__all__ = ["Section", "anchor", "default_text", "first_sentence", "sections_of", "table", "values"]
-
 NEEDED = "needed"
 """Where a setting has no default."""
 OUTERMOST = "Outermost keys"

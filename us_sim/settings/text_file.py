@@ -12,8 +12,6 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-__all__ = ["read_bytes", "read_text"]
-
 _LARGEST = 64 << 20
 
 

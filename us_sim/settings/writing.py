@@ -17,8 +17,6 @@ from typing import Any
 from us_sim.settings.choice import Chosen
 from us_sim.settings.setting import Rule, Settings, rules_of
 
-__all__ = ["document_of"]
-
 
 def document_of(settings: Settings) -> dict[str, Any]:
     """The settings that are not what they would be without being said, in SI units."""

@@ -19,8 +19,6 @@ import yaml
 
 from us_sim.errors import UsSimError
 
-__all__ = ["LARGEST_YAML", "MOST_NODES", "YamlError", "load_yaml"]
-
 LARGEST_YAML = 1 << 20
 """Characters of a text that is read."""
 

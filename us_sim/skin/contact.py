@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from us_sim.geometry.collider_distance import offset_box_distance
 from us_sim.kernels import njit
 
-__all__ = ["PartArrays", "push_out"]
-
 
 class PartArrays(NamedTuple):
     """Parts of a surface's triangles, as the kernel takes them."""

@@ -41,8 +41,6 @@ from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.springs import spring_energy, spring_forces
 from us_sim.skin.surface import TriangleSurface
 
-__all__ = ["CONTACT_TOLERANCE", "SkinDeformation", "SkinMembrane"]
-
 CONTACT_TOLERANCE = 1e-9
 """No vertex is deeper inside the collider than this, m."""
 

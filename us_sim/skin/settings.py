@@ -8,8 +8,6 @@ from us_sim.errors import SolverError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["MembraneSettings", "SkinSettings"]
-
 _STIFFNESS = Quantity("stiffness", 1e-6, 1e9)
 
 

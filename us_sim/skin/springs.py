@@ -20,8 +20,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["SHORTEST", "spring_energy", "spring_forces"]
-
 SHORTEST = 0.5
 """Fraction of its natural length below which a spring's force falls to zero with its length. The
 force of a spring that turns over would otherwise jump, and no step would be stable."""

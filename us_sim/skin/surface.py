@@ -27,8 +27,6 @@ from us_sim.skin.wavefront import parse_wavefront
 
 _CORNERS = {"triangle": 3, "quad": 4}
 
-__all__ = ["TriangleSurface", "bent_surface", "plane_surface", "read_surface"]
-
 
 @dataclass(frozen=True, eq=False)
 class TriangleSurface:

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.settings.spelling import shown
 
-__all__ = ["parse_wavefront"]
-
 
 def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points (N, 3), in the file's unit, and triangles (T, 3); polygons are split into fans.

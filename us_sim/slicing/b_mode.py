@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.volume.volume import Volume
 
-__all__ = ["BMode"]
-
 _BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
 """Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward."""
 

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from us_sim.slicing.cutting.located import evaluate
 from us_sim.slicing.frame import Frame
 
-__all__ = ["displacement"]
-
 
 def displacement(frame: Frame) -> NDArray[np.float32]:
     """(rows, columns, 2) m: the tissue's way from rest to each pixel, lateral and axial.

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from us_sim.slicing.cutting.slicer import Slicer
     from us_sim.volume.volume import Volume
 
-__all__ = ["Contact", "Frame", "Mesh"]
-
 Contact = tuple[NDArray[np.float32], NDArray[np.float64]]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int32]]
 

@@ -23,8 +23,6 @@ from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.probe.beam_places import pixels_of
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["MMode"]
-
 _ROWS, _COLUMNS = 384, 512
 
 

@@ -8,8 +8,6 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["MModeSettings"]
-
 
 @dataclass(frozen=True)
 class MModeSettings(Settings):

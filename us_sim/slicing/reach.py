@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["beyond"]
-
 
 def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64]) -> float:
     """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.

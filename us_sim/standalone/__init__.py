@@ -3,8 +3,6 @@
 import importlib.util
 import sys
 
-__all__ = ["install"]
-
 
 def install() -> bool:
     """Make `rclpy` and message packages importable, unless the real rclpy is there.

@@ -14,8 +14,6 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-__all__ = ["AliasFinder"]
-
 
 class AliasFinder(MetaPathFinder, Loader):
     """Imports `alias.x` as `target.x`."""

@@ -17,8 +17,6 @@ from typing import TypeVar
 from .cdr_source import compiled_reader, compiled_writer
 from .message_class import Message
 
-__all__ = ["CdrError", "deserialize", "serialize"]
-
 M = TypeVar("M", bound=Message)
 
 

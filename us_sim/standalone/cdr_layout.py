@@ -18,8 +18,6 @@ import numpy as np
 from .field_setters import ARRAY_TYPES
 from .interfaces import Field, interface
 
-__all__ = ["FORMATS", "CdrLayout"]
-
 # Primitive: its character in a `struct` format.
 FORMATS = {"bool": "?", "byte": "c", **{kind: code for kind, (code, _) in ARRAY_TYPES.items()}}
 _PADS = tuple(bytes(n) for n in range(8))

@@ -25,8 +25,6 @@ from .field_setters import ARRAY_TYPES
 from .interfaces import Field, interface
 from .message_class import Message, message_class
 
-__all__ = ["compiled_reader", "compiled_writer"]
-
 
 @cache
 def compiled_writer(type_name: str) -> Callable[[Message], bytes]:

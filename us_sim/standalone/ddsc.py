@@ -17,20 +17,6 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "ANY_STATE",
-    "INFINITY",
-    "BuiltinEndpoint",
-    "BuiltinParticipant",
-    "DdsError",
-    "IoVector",
-    "RawSampleInfo",
-    "check",
-    "guid_of",
-    "lib",
-    "topic_descriptor",
-]
-
 INFINITY = 2**63 - 1
 ANY_STATE = 0x7F
 ALIVE = 16

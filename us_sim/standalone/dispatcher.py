@@ -16,8 +16,6 @@ from itertools import count
 
 from .ddsc import INFINITY, check, lib
 
-__all__ = ["Dispatcher"]
-
 _WAKE_UP = 0
 _AT_ONCE = 64
 

@@ -19,8 +19,6 @@ from html import escape
 
 from .ddsc import DdsError, check, lib
 
-__all__ = ["DiscoveryRange", "acquire_domain", "release_domain"]
-
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 
 # The largest participant index tried on a host: the number of processes that find each other

@@ -18,8 +18,6 @@ from typing import Any, ClassVar
 
 from .ddsc import INFINITY, DdsError, lib
 
-__all__ = ["EndpointQos", "dds_qos", "participant_qos", "qos_of_profile", "read_qos", "user_data"]
-
 _UNSPECIFIED = (0, INFINITY)
 _LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds would block for ever
 

@@ -13,8 +13,6 @@ from .ddsc import DdsError, IoVector, RawSampleInfo, check, guid_of, lib
 from .dispatcher import Dispatcher
 from .endpoint_qos import EndpointQos, user_data
 
-__all__ = ["Endpoint", "Reader", "SampleInfo", "Writer"]
-
 _DATA_AVAILABLE = 1 << 8
 
 # The policies by DDS's numbers (dds_qos_policy_id), with the names that rclpy has for them.

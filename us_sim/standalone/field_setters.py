@@ -11,8 +11,6 @@ import numpy as np
 
 from .interfaces import Field
 
-__all__ = ["ARRAY_TYPES", "Setter", "field_setter"]
-
 # Primitive: (array.array type code, NumPy dtype) of the sequences and arrays that rosidl packs.
 ARRAY_TYPES: dict[str, tuple[str, Any]] = {
     "float32": ("f", np.float32),

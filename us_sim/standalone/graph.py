@@ -22,8 +22,6 @@ from .interfaces import type_hash
 from .message_class import message_class
 from .transport import Participant
 
-__all__ = ["Graph", "GraphEndpoint", "GraphNode"]
-
 _BUILTIN_TOPICS = {
     ddsc.BUILTIN_PARTICIPANT: BuiltinParticipant,
     ddsc.BUILTIN_PUBLICATION: BuiltinEndpoint,

@@ -20,17 +20,6 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-__all__ = [
-    "Field",
-    "Interface",
-    "InterfaceError",
-    "interface",
-    "message_names",
-    "packages",
-    "service_names",
-    "type_hash",
-]
-
 PLACEHOLDER = "structure_needs_at_least_one_member"
 
 _SERVICES = {

@@ -24,8 +24,6 @@ import numpy as np
 from .field_setters import ARRAY_TYPES, Setter, field_setter
 from .interfaces import Field, interface
 
-__all__ = ["Message", "message_class"]
-
 _ZEROS: dict[str, Any] = {"bool": False, "byte": b"\x00", "string": ""}
 
 

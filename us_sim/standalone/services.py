@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 from .interfaces import type_hash
 from .transport import Participant, SampleInfo
 
-__all__ = ["RequestHeader", "ServiceClient", "ServiceServer"]
-
 _HEADER = struct.Struct("<Qq")
 _LONGEST_WAIT = 0.1  # s, for a client's reader to be discovered, as rmw_cyclonedds waits
 

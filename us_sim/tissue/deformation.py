@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Deformation", "TissueState"]
-
 
 @dataclass(frozen=True, eq=False)
 class Deformation:

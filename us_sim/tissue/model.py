@@ -24,8 +24,6 @@ from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
-__all__ = ["TissueModel"]
-
 _SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 
 

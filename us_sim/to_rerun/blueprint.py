@@ -12,8 +12,6 @@ from us_sim.to_rerun.diagnostics import CURVES
 from us_sim.to_rerun.images import IMAGE
 from us_sim.to_rerun.rerun_file import STAMP
 
-__all__ = ["blueprint_of"]
-
 _BACKGROUND = (14, 17, 19)
 _FROM, _AT, _UP = (0.11, -0.16, -0.11), (0.0, 0.0, 0.012), (0.0, 0.0, -1.0)
 """Where the eye is, what it looks at, and what is up, in `patient`, m: +z is into the tissue."""

@@ -9,8 +9,6 @@ import rerun
 from us_sim.nodes.conversions import vectors_from
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["Clouds"]
-
 _RADIUS = rerun.Radius.ui_points(1.5)
 _COLOUR = (79, 179, 191)
 

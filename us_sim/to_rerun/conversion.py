@@ -24,8 +24,6 @@ from us_sim.to_rerun.rerun_file import RerunFile, require_rerun
 if TYPE_CHECKING:
     from us_sim.to_rerun.shown import Shown
 
-__all__ = ["to_rerun"]
-
 _OF_POSES = ("/tf", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 """Topics whose messages are stamped as poses are."""
 

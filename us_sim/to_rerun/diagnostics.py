@@ -9,8 +9,6 @@ import rerun
 
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["CURVES", "Diagnostics"]
-
 CURVES = {"rate_hz": "rate", "latency_p50_ms": "latency", "residual": "residual"}
 """Keys of diagnostics, and what their curves are called."""
 _LEVELS = (

@@ -13,8 +13,6 @@ from us_sim.errors import VolumeError
 from us_sim.nodes.conversions import affine_from, colour_pixels_from, field_from, pixels_from
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["IMAGE", "PLANE", "Images"]
-
 IMAGE = "ultrasound/image"
 PLANE = "ultrasound/plane"
 """Entity of the image in three dimensions."""

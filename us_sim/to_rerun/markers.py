@@ -14,8 +14,6 @@ from us_sim.errors import MessageError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["Markers"]
-
 _DELETE, _DELETE_ALL = 2, 3
 _ARROW, _CUBE, _SPHERE, _CYLINDER, _LINE_STRIP, _LINE_LIST = 0, 1, 2, 3, 4, 5
 _CUBE_LIST, _SPHERE_LIST, _POINTS, _TEXT, _TRIANGLE_LIST = 6, 7, 8, 9, 11

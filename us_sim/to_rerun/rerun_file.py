@@ -20,8 +20,6 @@ import numpy as np
 
 from us_sim.errors import BagError
 
-__all__ = ["RECORDED", "STAMP", "RerunFile", "require_rerun"]
-
 OLDEST = "0.41"
 """Of the versions of rerun, the oldest with which this works."""
 STAMP = "stamp"

@@ -6,8 +6,6 @@ from typing import Any, Protocol
 
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["Shown"]
-
 
 class Shown(Protocol):
     """Logs messages of one type, each at the time that the file has been told."""

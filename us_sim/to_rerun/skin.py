@@ -13,8 +13,6 @@ from us_sim.geometry.normals import vertex_normals
 from us_sim.nodes.conversions import mesh_from, vectors_from
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["SKIN", "Skin"]
-
 SKIN = "skin"
 """Its entity."""
 _COLOUR = (217, 166, 140, 90)

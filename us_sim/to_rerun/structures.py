@@ -21,8 +21,6 @@ from us_sim.scene.structures import structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["REST", "STRUCTURES", "TETRAHEDRA", "Structures"]
-
 REST, TETRAHEDRA = "/tissue/rest", "/tissue/tetrahedra"
 STRUCTURES = "tissue/structures"
 """The entity that holds one for each."""

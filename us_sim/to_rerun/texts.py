@@ -8,8 +8,6 @@ import rerun
 
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["Texts"]
-
 
 class Texts:
     """``std_msgs/String``."""

@@ -9,8 +9,6 @@ import rerun
 from us_sim.nodes.conversions import transform_from
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["Transforms"]
-
 
 class Transforms:
     """``tf2_msgs/TFMessage``."""

@@ -9,8 +9,6 @@ import rerun
 from us_sim.nodes.conversions import wrench_from
 from us_sim.to_rerun.rerun_file import RerunFile
 
-__all__ = ["FORCE", "METRES_A_NEWTON", "Wrenches"]
-
 FORCE = "force"
 """What a topic's name is followed by in the entity of the curves."""
 METRES_A_NEWTON = 0.002

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 
-__all__ = ["PATIENT", "Measurement"]
-
 PATIENT = "patient"
 """The frame of the tissue, and of the probe's poses."""
 

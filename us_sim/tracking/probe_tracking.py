@@ -40,8 +40,6 @@ from us_sim.tracking.filter.pose_filter import PoseFilter
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.state import TrackingClock, TrackingState
 
-__all__ = ["ProbeTracking"]
-
 RESTART_NS = 1_000_000_000
 """A stamp that jumps back by more is a restarted source, not a late measurement."""
 

@@ -15,8 +15,6 @@ from enum import Enum
 
 from us_sim.errors import TrackingError
 
-__all__ = ["TrackingClock", "TrackingState"]
-
 
 class TrackingState(Enum):
     """How far the probe's place is known."""

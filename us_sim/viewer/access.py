@@ -21,8 +21,6 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-__all__ = ["Access", "is_loopback"]
-
 COOKIE = "us_sim_viewer_{port}"
 """Cookies of two servers of one computer would be one, since they do not tell ports apart."""
 _FORBIDDEN, _CLOSED = 403, 1008

@@ -18,8 +18,6 @@ from us_sim.viewer.page import build_page
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.stream import serve_page
 
-__all__ = ["ASSETS", "application"]
-
 ASSETS = Path(__file__).parent / "assets"
 
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import time
 
-__all__ = ["AskedPoses"]
-
 _KEPT = 512  # poses
 _MOVES_S = 2.0  # after its last wish a page holds the probe, and moves it no more
 

@@ -24,8 +24,6 @@ from us_sim import __version__
 from us_sim.errors import UsSimError
 from us_sim.viewer.packet import Packet
 
-__all__ = ["KINDS", "LARGEST", "Sent", "exported", "frames_of"]
-
 Sent = tuple[Mapping[str, Any], bytes]
 """Header and payload of a frame, as the page was sent them; pictures are JPEG, with ``time``, s."""
 

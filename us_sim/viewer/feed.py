@@ -19,8 +19,6 @@ from collections.abc import Callable
 
 from us_sim.viewer.packet import Packet
 
-__all__ = ["Feed", "Pack"]
-
 Pack = Callable[[int], Packet | None]
 """Makes the packet of a number; None where what came cannot be used."""
 Notify = Callable[[], None]

@@ -23,8 +23,6 @@ from us_sim.errors import MessageError
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import Stance
 
-__all__ = ["HOME_PRESS", "LIFTED", "HandCommand", "is_source"]
-
 HOME_PRESS = 1e-3
 """m: where the probe begins it touches, so that there is an image."""
 LIFTED = -0.01

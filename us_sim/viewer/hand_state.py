@@ -7,8 +7,6 @@ from typing import Any
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 from us_sim.tracking.virtual_hand.stance import DEEPEST, HIGHEST, STEEPEST, Stance
 
-__all__ = ["hand_state"]
-
 
 def hand_state(
     surface: RestSurface | None, stance: Stance | None, goal: Stance | None

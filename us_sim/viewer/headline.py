@@ -10,8 +10,6 @@ from nicegui import ui
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build_headline", "words_of"]
-
 _LOOK_S = 0.5
 
 

@@ -8,8 +8,6 @@ import socket
 
 from us_sim.errors import UsSimError
 
-__all__ = ["listening", "require_free"]
-
 _QUEUE = 64
 
 

@@ -13,8 +13,6 @@ from nicegui import ui
 from us_sim.viewer.parameters import Kind
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build_modes"]
-
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {
     "b-mode": ("B-mode", "The image as it is"),

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-__all__ = ["Packet"]
-
 _LENGTH = struct.Struct("<I")
 _ALIGNMENT = 8
 """Bytes: where the payload begins is a multiple, so that the page can look at it as numbers."""

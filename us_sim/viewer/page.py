@@ -12,8 +12,6 @@ from us_sim.viewer.modes import build_modes
 from us_sim.viewer.panels import cases, image, plots, session, status, tissue
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["PANELS", "Panel", "build_page"]
-
 _HEAD = """<link rel="stylesheet" href="/us_sim/assets/viewer.css">
 <link rel="stylesheet" href="/us_sim/assets/panels.css">
 <link rel="stylesheet" href="/us_sim/assets/session.css">"""

@@ -19,8 +19,6 @@ from typing import Any
 from us_sim.errors import UsSimError
 from us_sim.viewer.parameters import NodeParameters, Parameter
 
-__all__ = ["ParameterBoard", "Send"]
-
 Send = Callable[[Parameter, Any], "Future[str]"]
 """Sets a parameter to a value in SI units; the future holds why not, or nothing."""
 

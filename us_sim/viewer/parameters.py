@@ -20,8 +20,6 @@ from typing import Any
 from us_sim.errors import SettingsError
 from us_sim.settings.spelling import shown
 
-__all__ = ["Kind", "NodeParameters", "Parameter", "State", "in_words"]
-
 _DIGITS = 12
 """Of a number that is shown: fewer than a float has, so that rounding is not seen."""
 _AT_THE_END = 1e-11

@@ -15,8 +15,6 @@ from us_sim.viewer.access import Access, is_loopback
 from us_sim.viewer.listening import listening
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["WebServer"]
-
 _STARTED_S = 30.0
 _STOPPED_S = 3.0
 

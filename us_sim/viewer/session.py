@@ -14,8 +14,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import PurePath
 
-__all__ = ["NOT_THERE", "Ask", "LoadableScene", "SessionBoard", "SessionState"]
-
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
 
 Ask = Callable[[Mapping[str, object]], "Future[str]"]

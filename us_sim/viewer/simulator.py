@@ -11,8 +11,6 @@ from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
 
-__all__ = ["Command", "Simulator"]
-
 Command = Callable[[Any, int], str | None]
 """Takes what a page sent, and the page's number; returns what is wrong with it, or None."""
 

@@ -13,8 +13,6 @@ import math
 import sys
 from dataclasses import dataclass
 
-__all__ = ["SliderSpan", "slider_span"]
-
 _BY_FACTORS = 50.0
 """From the smallest number to the largest: beyond, a slider goes by factors."""
 _WIDE = 1000.0

@@ -18,8 +18,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-__all__ = ["Level", "NodeStatus", "Point", "StatusBoard"]
-
 GONE_S = 3.0
 """Without a word, after which a node counts as gone: each says something every second."""
 FORGOTTEN_S = 60.0

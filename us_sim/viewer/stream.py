@@ -14,8 +14,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["PageStream", "serve_page"]
-
 _LONGEST = 65536
 """Characters of a page's message."""
 _numbers = itertools.count(1)

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["MOST", "on_sliders", "slider_count"]
-
 USUAL, MOST = 8, 12
 
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["TOKEN", "ViewerSettings"]
-
 TOKEN = "US_SIM_VIEWER_TOKEN"
 """In the environment: what an address must hold that is not this computer's own. Other users of the
 computer cannot read it there, as they could on a command line or among ROS parameters."""

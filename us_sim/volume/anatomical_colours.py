@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["Colour", "anatomical_colour"]
-
 Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 

@@ -23,8 +23,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
-__all__ = ["LabelMap"]
-
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:

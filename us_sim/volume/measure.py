@@ -16,8 +16,6 @@ from scipy import ndimage
 
 from us_sim.errors import VolumeError
 
-__all__ = ["label_area"]
-
 
 def label_area(
     label_image: NDArray[np.uint8], label: int, pixel_area: float, *, largest_part: bool = False

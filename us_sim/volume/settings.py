@@ -12,8 +12,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import PHANTOMS
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["SEED", "VOXEL_SIZE", "VolumeSettings"]
-
 SEED = Quantity("number", 0, 2**31)
 VOXEL_SIZE = Quantity("length", 2e-4, 5e-3)
 """Voxel size of a phantom; the finest takes 1.1 GB while it is made."""

@@ -16,8 +16,6 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 
-__all__ = ["coded_name", "is_anatomical", "problem_with", "readable"]
-
 _TEXT = """
     abdominal abdominis abscess achilles acromioclavicular acromion adductor adenohypophysis adipose
     adrenal air amniotic amygdaloid and aneurysm annulus anterior anus aorta aortic aponeurosis

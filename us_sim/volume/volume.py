@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["Volume", "grid_extent"]
-
 
 @dataclass(frozen=True, eq=False)
 class Volume:

@@ -23,8 +23,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-__all__ = ["CONVERGED", "METHOD", "TRUSTED", "Converged", "converged", "patient_solver", "settled"]
-
 METHOD = "fem_nonlinear"
 CONVERGED = 1e-5
 """Residual at which a pose is left for the next."""

@@ -24,8 +24,6 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.progress import Progress
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-__all__ = ["evaluate_hand"]
-
 
 def evaluate_hand(out: Path, quick: bool, settings: HandSettings | None = None) -> int:
     """Write hand.csv, the plots and hand.md, as `us_sim.evaluation` says.

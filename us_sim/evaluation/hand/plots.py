@@ -18,8 +18,6 @@ from us_sim.evaluation.hand.points import ENOUGH, HOLD, Point, those
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.recording.hand_motion import HASTES
 
-__all__ = ["plot_errors", "plot_faults", "plot_hold", "plot_time"]
-
 _FRAME = 1e3 / RATE  # ms
 _SHOWN = 4.0  # s, of a motion
 _LOWEST = 1e-3  # mm; what is less is drawn there

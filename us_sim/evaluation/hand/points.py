@@ -26,19 +26,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.solvers.frame_time import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver
 
-__all__ = [
-    "ENOUGH",
-    "HOLD",
-    "OWN_EVERY",
-    "SENDING_S",
-    "Frames",
-    "Held",
-    "Live",
-    "Point",
-    "measure",
-    "those",
-]
-
 ENOUGH = 0.9
 """Fraction of the frames that must be compared before their errors are told of."""
 HOLD = 60

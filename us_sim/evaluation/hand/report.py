@@ -17,8 +17,6 @@ from us_sim.evaluation.row import failures
 from us_sim.evaluation.target import target_table
 from us_sim.recording.hand_motion import HASTES, KINDS
 
-__all__ = ["table", "write_report"]
-
 _COLUMNS = 3  # motions that are drawn over time
 
 _HEAD = (

@@ -11,8 +11,6 @@ from us_sim.evaluation.hand.cases import MAIN_TISSUE
 from us_sim.evaluation.hand.points import ENOUGH, Point, those
 from us_sim.evaluation.target import Target
 
-__all__ = ["JUDGED", "targets"]
-
 JUDGED = "fem_nonlinear"
 """The method that the targets are for."""
 

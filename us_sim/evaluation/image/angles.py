@@ -22,8 +22,6 @@ from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-__all__ = ["Fibres", "Surfaces"]
-
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
 _TILTS = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 _BORDER = 0.0152  # m, along z

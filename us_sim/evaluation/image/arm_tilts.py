@@ -23,8 +23,6 @@ from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.formation.imaging import Imaging
 
-__all__ = ["ArmTilts"]
-
 _TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)
 _BONE = np.array([12e-3, 0.0, 38e-3])  # m, about which the probe turns, so that it stays in view
 _FROM_BONE = np.array([-6e-3, 0.0, -36e-3])  # m, to the probe's face

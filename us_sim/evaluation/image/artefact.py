@@ -10,8 +10,6 @@ from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.target import Target
 
-__all__ = ["Artefact"]
-
 
 class Artefact(ABC):
     """One file each; `us_sim.evaluation.image.measure` has the list of them."""

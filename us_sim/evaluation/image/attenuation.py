@@ -19,8 +19,6 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["Attenuation"]
-
 _FREQUENCY = {"linear": 7e6, "convex": 3.5e6, "sector": 3e6}  # Hz
 _TILTS = (0.0, 10.0, 20.0, 30.0, 40.0)  # degrees
 _PARTS = 12  # of the depth; of each the depth with the greatest error is a row

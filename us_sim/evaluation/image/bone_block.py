@@ -18,8 +18,6 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-__all__ = ["GREY", "HEIGHT", "STATES", "State", "bone_volume", "corners", "line_through", "mesh"]
-
 GREY = 170
 _LOW, _HIGH = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of the block
 HEIGHT = _HIGH[1] - _LOW[1]

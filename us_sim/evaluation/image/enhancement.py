@@ -21,8 +21,6 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import LinearProbe
 
-__all__ = ["Enhancement"]
-
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
 _FREQUENCY = 8e6  # Hz
 _MUSCLE, _FLUID = (0.57, 1.645e6), (0.14, 1.679e6)

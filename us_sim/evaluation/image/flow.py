@@ -18,8 +18,6 @@ from us_sim.evaluation.target import Target
 from us_sim.slicing.flow.colour_doppler import ColourDoppler
 from us_sim.slicing.flow.colour_settings import ColourSettings
 
-__all__ = ["Flow"]
-
 _TILTS = (5.0, 10.0, 20.0, 30.0, 40.0)  # degrees
 _SQUEEZED = (1.0, 0.6)  # heights of the lumen over that at rest
 _TIMES = {"diastole": 0.0, "systole": 0.13 / 1.1}  # s after the beat begins

@@ -24,8 +24,6 @@ from us_sim.slicing.flow.spectrum import Spectrum
 from us_sim.slicing.frame import Frame
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["draw_arm"]
-
 _TILT = math.radians(20)
 _AIM = 15e-3  # m, depth at which the middle beam crosses the plane under the probe's middle
 _TOUCH, _PRESS = 3e-3, 12e-3  # m

@@ -26,16 +26,6 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
-__all__ = [
-    "Ball",
-    "Reference",
-    "ball_mesh",
-    "ball_nodes",
-    "labelled",
-    "plate_model",
-    "pressed_by_plate",
-]
-
 PLATE = RoundedBox(length=0.4, width=0.3, height=0.05, rounding=0.001)
 """Larger than the block's top."""
 

@@ -20,8 +20,6 @@ from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["GREY", "LAYERS", "PROBES", "layered_volume", "lost", "tilted"]
-
 
 @dataclass(frozen=True)
 class Layer:

@@ -19,8 +19,6 @@ from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures, words_of
 from us_sim.evaluation.steps import steps
 
-__all__ = ["ARTEFACTS", "evaluate_image"]
-
 ARTEFACTS: tuple[Artefact, ...] = (
     Attenuation(),
     Enhancement(),

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 from us_sim.evaluation.row import Row
 
-__all__ = ["Point"]
-
 
 @dataclass(frozen=True)
 class Point(Row):

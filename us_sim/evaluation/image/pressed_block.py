@@ -17,8 +17,6 @@ from us_sim.slicing.frame import Frame
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["PRESS", "beam_displacement", "beam_strain", "pressed_block"]
-
 PRESS = 0.05
 """Of the height."""
 

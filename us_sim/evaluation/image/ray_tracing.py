@@ -18,8 +18,6 @@ from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["traced_gain"]
-
 _STEP = 0.1e-3  # m
 _RAYS = 33  # from the aperture to a pixel
 _SOFT = (0.8e6, 3.0e6)  # Rayl

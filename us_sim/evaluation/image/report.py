@@ -10,8 +10,6 @@ from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
 from us_sim.evaluation.target import target_table
 
-__all__ = ["table", "write_report"]
-
 Measured = Mapping[Artefact, Sequence[Point]]
 
 

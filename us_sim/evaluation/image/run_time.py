@@ -22,8 +22,6 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
-__all__ = ["RunTime"]
-
 _NODES = (32, 16, 16)  # 34,875 tetrahedra
 _PRESS = 8e-3  # m
 _IMAGES, _QUICK_IMAGES = 300, 60

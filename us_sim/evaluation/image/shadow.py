@@ -28,8 +28,6 @@ from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["Shadow"]
-
 _PROBES: dict[str, tuple[Probe, float]] = {
     "linear": (LinearProbe(aperture=0.04, depth=0.04), 8e6),
     "convex": (ConvexProbe(radius=0.05, opening_angle=np.radians(50), depth=0.06), 4e6),

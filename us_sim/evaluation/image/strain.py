@@ -39,8 +39,6 @@ from us_sim.slicing.strain.axial_strain import AxialStrain
 from us_sim.slicing.strain.colours import strain_scale
 from us_sim.volume.volume import Volume
 
-__all__ = ["StrainImages"]
-
 PROBES: dict[str, Probe] = {
     "linear": LinearProbe(aperture=0.06, depth=0.08),
     "convex": ConvexProbe(radius=0.04, opening_angle=np.radians(60), depth=0.08),

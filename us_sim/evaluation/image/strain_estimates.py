@@ -20,8 +20,6 @@ from us_sim.slicing.strain.estimate import Estimate, estimate_strain
 from us_sim.slicing.strain.settings import Strain
 from us_sim.volume.volume import Volume
 
-__all__ = ["compared_ball", "comparison"]
-
 _PROBE = LinearProbe(aperture=0.06, depth=0.08)
 _FIRST, _SECOND = 0.001, 0.002  # m, the plate's depth in the two images
 _SETTINGS = Strain(search=1.5e-3)

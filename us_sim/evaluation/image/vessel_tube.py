@@ -19,8 +19,6 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-__all__ = ["DEPTH", "FLOW", "RADIUS", "TubeScan", "mesh_of_block", "squeezed"]
-
 RADIUS, DEPTH = 3e-3, 20e-3
 """m, of the vessel, and of its axis, which runs along y."""
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-__all__ = ["COARSE", "DEMO", "FINE", "LIVE", "PLACED", "RATE", "Case", "cases"]
-
 RATE = 60.0
 """Poses a second."""
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from us_sim.nodes.arrivals import Arrivals
 
-__all__ = ["listening"]
-
 
 @contextlib.contextmanager
 def listening(*, viewer: bool) -> Iterator[Arrivals]:

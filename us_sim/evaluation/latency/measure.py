@@ -20,8 +20,6 @@ from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
 from us_sim.scene.reading import load_scene
 
-__all__ = ["evaluate_latency"]
-
 
 def evaluate_latency(out: Path, quick: bool) -> int:
     """Write latency.csv, the plots and latency.md, as `us_sim.evaluation` says."""

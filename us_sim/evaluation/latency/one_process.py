@@ -14,8 +14,6 @@ from typing import Any
 
 from us_sim.run.in_process import node_in_process
 
-__all__ = ["main"]
-
 
 def main(arguments: list[str]) -> int:
     """Run the nodes until SIGTERM."""

@@ -14,8 +14,6 @@ from us_sim.evaluation.figure import key_beside, new_figure, plain, save
 from us_sim.evaluation.latency.cases import RATE
 from us_sim.evaluation.latency.points import HAND, Point
 
-__all__ = ["plot_hops", "plot_over_time", "plot_usage"]
-
 _WAY = {"probe/pose": "#c6dbef", "tissue/nodes": "#6baed6", "ultrasound/image": "#08519c"}
 """The hops that an image waits for, one after another."""
 _NODES = {

@@ -12,8 +12,6 @@ from us_sim.evaluation.latency.cases import Case
 from us_sim.evaluation.latency.usage import UsageOverTime
 from us_sim.evaluation.row import Row
 
-__all__ = ["HAND", "Heard", "Point"]
-
 HAND = 0.1
 """m/s of a hand, with which a time becomes a way."""
 

@@ -15,8 +15,6 @@ from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
 from us_sim.evaluation.target import target_table
 
-__all__ = ["table", "write_report"]
-
 _HEAD = (
     *("", "scheduling", "images/s", "dropped", "pose ms p50", "nodes ms p50", "p99"),
     *("image ms p50", "p99", "worst", "mm p50", "p99", "cores", "MB", "not recorded"),

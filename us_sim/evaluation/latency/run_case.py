@@ -37,8 +37,6 @@ from us_sim.scene.scene import Scene
 if TYPE_CHECKING:
     from us_sim.nodes.arrivals import Arrivals
 
-__all__ = ["run_case"]
-
 _START_S = 300.0  # the first run compiles
 _WARMING_S = 2.0  # of images that do not count
 _SETTLE_S = 1.5  # for what is under way to arrive, and to be recorded

@@ -10,8 +10,6 @@ import yaml
 from us_sim.evaluation.latency.cases import COARSE, Case
 from us_sim.scene.reading import load_scene
 
-__all__ = ["write_scene"]
-
 _ARM = "upper_arm"
 
 

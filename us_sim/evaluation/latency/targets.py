@@ -10,8 +10,6 @@ from us_sim.evaluation.latency.cases import DEMO, LIVE, Case
 from us_sim.evaluation.latency.points import Point
 from us_sim.evaluation.target import Target
 
-__all__ = ["targets"]
-
 _IMAGE = "ultrasound/image"
 
 

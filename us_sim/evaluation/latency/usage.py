@@ -16,8 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["Usage", "UsageOverTime", "usage_of"]
-
 _SHARE = re.compile(r"^Pss:\s+(\d+) kB", re.MULTILINE)  # proc(5): proportional set size
 _WARMING = 60.0  # s, of a run, in which memory may still grow
 _LONG = 120.0  # s, of a run that tells whether it does

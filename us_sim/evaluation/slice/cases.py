@@ -28,19 +28,6 @@ from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-__all__ = [
-    "DEPTHS",
-    "MAIN",
-    "PLANES",
-    "SIZES",
-    "Case",
-    "Frame",
-    "black_and_white",
-    "cases",
-    "dented",
-    "speckle",
-]
-
 SIZES = (256, 512, 1024)  # columns, and rows, of an image
 DEPTHS = Named("deformation", {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03})
 """m, by which the block is pressed."""

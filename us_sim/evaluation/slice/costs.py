@@ -19,8 +19,6 @@ from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["Cost", "costs"]
-
 _IMAGES, _QUICK_IMAGES = 60, 15
 _LINEAR = LinearProbe(aperture=0.06, depth=0.08, columns=MAIN.size, rows=MAIN.size)
 _PROBES: Mapping[str, Probe] = {

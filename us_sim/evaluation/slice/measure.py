@@ -31,8 +31,6 @@ from us_sim.evaluation.slice.vtk_images import HOW_TO_GET, is_installed
 from us_sim.evaluation.steps import steps
 from us_sim.progress import Progress
 
-__all__ = ["evaluate_slice"]
-
 _FRAMES = 4  # images that a case's are taken from, in turns
 _SECONDS, _QUICK_SECONDS = (12.0, 2.0), (5.0, 1.0)  # s, of timing the main case, and another
 

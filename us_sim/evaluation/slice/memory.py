@@ -13,8 +13,6 @@ import numpy as np
 
 from us_sim.evaluation.own_process import start_module
 
-__all__ = ["peak_memory"]
-
 
 def peak_memory(side: int) -> int | None:
     """Bytes that a process held at most that cut a volume of ``side``³ uint8 voxels.

@@ -19,8 +19,6 @@ from us_sim.evaluation.slice.vtk_images import VtkSlicer, is_installed
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.volume.volume import Volume
 
-__all__ = ["OURS", "SLICING_METHODS", "Contender", "SlicingMethod", "contender", "methods"]
-
 OURS = "scan_conversion"
 """The method that the others are compared with, and that the targets are about."""
 

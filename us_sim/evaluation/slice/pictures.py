@@ -17,8 +17,6 @@ from us_sim.evaluation.slice.points import wrong_pixels
 from us_sim.evaluation.slice.reference import ExactSlice, exact_slice, voxel_distance
 from us_sim.volume.volume import Volume
 
-__all__ = ["SHOWN", "draw_differences"]
-
 SHOWN = (
     MAIN,
     replace(MAIN, deformation="pressed_30mm", plane="oblique"),

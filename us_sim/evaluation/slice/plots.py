@@ -14,8 +14,6 @@ from us_sim.evaluation.figure import key_beside, new_figure, plain, save
 from us_sim.evaluation.slice.methods import OURS, SLICING_METHODS
 from us_sim.evaluation.slice.points import Point
 
-__all__ = ["plot_errors", "plot_meshes", "plot_pixels"]
-
 _FRAME = 1000.0 / 60.0  # ms, at 60 images a second
 _TENTH = 0.1  # voxels
 _SMALLEST = 1e-14  # voxels, drawn where a method is exact to the last bit

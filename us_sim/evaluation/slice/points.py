@@ -22,8 +22,6 @@ from us_sim.evaluation.slice.methods import Contender
 from us_sim.evaluation.slice.reference import ExactSlice, voxel_distance
 from us_sim.volume.volume import Volume
 
-__all__ = ["Errors", "Point", "Timing", "compare", "timed_together", "wrong_pixels"]
-
 _AGAIN = 5  # images in a turn of a method that takes less than _SHORT
 _SHORT = 8.0  # ms
 _FEWEST = 3  # turns of each method that takes less than _SLOW

@@ -14,8 +14,6 @@ import time
 
 from us_sim.evaluation.own_process import start_module
 
-__all__ = ["publishing_ms"]
-
 _IMAGES = 180
 _RATE = 60.0  # Hz
 _LONGEST = 60.0  # s, after which nothing is waited for

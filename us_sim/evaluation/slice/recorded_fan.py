@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.fan_probe import ConvexProbe
 
-__all__ = ["LIVER_SWEEP", "RecordedFan"]
-
 
 @dataclass(frozen=True)
 class RecordedFan:

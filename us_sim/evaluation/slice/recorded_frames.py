@@ -31,8 +31,6 @@ from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import read_sweep
 
-__all__ = ["RecordedComparison", "compare_with_recorded"]
-
 _ATTRIBUTION = "Data: ImFusion GmbH, CC BY 4.0"
 _ASKED = 0.8  # normalised cross-correlation
 _HEAD = ("normalised cross-correlation with", "lowest", "median", "highest", "at least 0.8")

@@ -29,17 +29,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
-__all__ = [
-    "LARGEST_SHIFT",
-    "MARGIN",
-    "RESOLUTION",
-    "SHIFT_STEP",
-    "RecordedFrame",
-    "RecordedPair",
-    "RecordedPairs",
-    "normalised_cross_correlation",
-]
-
 RESOLUTION = 1e-3
 """m, standard deviation of the Gaussian that smooths a frame to its volume's resolution."""
 

@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from us_sim.evaluation.slice.recorded_pairs import RecordedFrame, RecordedPair
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["draw_recorded"]
-
 _BRIGHTEST = 99.2  # percentile that is shown white, since few pixels of a recording are bright
 _DIFFERENCE = 40.0  # grey levels, at the ends of the colour scale
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from us_sim.errors import SettingsError
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["RecordedSweep"]
-
 
 @dataclass(frozen=True)
 class RecordedSweep(Settings):

@@ -30,8 +30,6 @@ from scipy import ndimage
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.volume.volume import Volume
 
-__all__ = ["ExactSlice", "exact_slice", "sampled", "voxel_distance"]
-
 _CLOSED = -1e-9  # least barycentric coordinate of a point inside
 _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron has no interior
 _PAIRS = 1_000_000  # pairs of a pixel and a tetrahedron that are tried at once

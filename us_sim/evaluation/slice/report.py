@@ -20,8 +20,6 @@ from us_sim.evaluation.slice.targets import main_points, mesh_points, size_point
 from us_sim.evaluation.slice.vtk_images import HOW_TO_GET
 from us_sim.evaluation.target import target_table
 
-__all__ = ["Surroundings", "table", "write_report"]
-
 
 @dataclass(frozen=True)
 class Surroundings:

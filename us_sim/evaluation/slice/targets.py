@@ -12,8 +12,6 @@ from us_sim.evaluation.slice.methods import OURS
 from us_sim.evaluation.slice.points import Point
 from us_sim.evaluation.target import Target
 
-__all__ = ["LARGE_VOLUME", "main_points", "mesh_points", "size_points", "targets"]
-
 LARGE_VOLUME = 512  # voxels a side, of the volume whose memory is asked for
 
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.volume.volume import Volume
 
-__all__ = ["HOW_TO_GET", "VtkSlicer", "is_installed"]
-
 HOW_TO_GET = "VTK was left out, since it is not installed: pip install 'us_sim[evaluate]' adds it"
 
 

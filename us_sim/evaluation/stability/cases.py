@@ -24,17 +24,6 @@ from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
-__all__ = [
-    "COLLIDERS",
-    "LAYOUTS",
-    "MOTIONS",
-    "SPRINGS",
-    "StabilityCase",
-    "extreme_cases",
-    "model_of",
-    "sampled_cases",
-]
-
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),
     "needle": Sphere(0.001),

@@ -12,8 +12,6 @@ import numpy as np
 
 from us_sim.evaluation.stability.cases import LAYOUTS, StabilityCase
 
-__all__ = ["HOLD", "SMALL", "held_cases"]
-
 HOLD = 30
 """Frames in which the probe stays where its motion ended."""
 SMALL = 1e-3

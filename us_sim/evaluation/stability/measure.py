@@ -36,8 +36,6 @@ from us_sim.kernels import kernel_folder
 from us_sim.progress import Progress
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["evaluate_stability"]
-
 _SAMPLES, _QUICK_SAMPLES = 2048, 64
 _STEP_LIMITS, _QUICK_STEP_LIMITS = 200, 24  # sampled cases whose step limit is looked for
 _STEP_LIMIT_ERROR = 0.02  # relative, of predicted step limits

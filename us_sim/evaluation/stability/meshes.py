@@ -20,8 +20,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
-__all__ = ["MESHES", "SUPPORTS", "fixed_nodes", "mesh_named", "parts"]
-
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
 """What of a tissue is held."""
 

@@ -13,8 +13,6 @@ import numpy as np
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["LIFTED", "poses_of"]
-
 _TREMOR = 1000.0  # Hz
 _FRAME_RATE = 2718.0  # Hz; no small multiple of the tremor's, so that no phase repeats
 

@@ -23,8 +23,6 @@ from us_sim.settings.setting import rules_of
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["observed_step_limit"]
-
 _AMPLITUDE = 1e-8
 """First displacements over the shortest edge: so small that springs do not turn."""
 _SWELLING = 1e3

@@ -19,8 +19,6 @@ from us_sim.evaluation.stability.meshes import MESHES
 from us_sim.evaluation.stability.points import Trial, Tried
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
-__all__ = ["draw_map", "draw_step_limits"]
-
 _FAILED, _REFUSED = "#d62728", "#d9d9d9"
 
 _MANY = 500  # cases, with fewer of which cells are larger

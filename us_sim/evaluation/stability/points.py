@@ -35,17 +35,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-__all__ = [
-    "Trial",
-    "Tried",
-    "agrees",
-    "damping_factor",
-    "equations_of",
-    "run_trial",
-    "spring_settings",
-    "try_case",
-]
-
 _FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"
 """What a solver says of a frame that failed, and where it kept the last good state after that."""
 

@@ -25,8 +25,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["REFUSALS", "refusal_of"]
-
 
 def refusal_of(method: str, name: str) -> Trial:
     """What a method does with one of the inputs of `REFUSALS`."""

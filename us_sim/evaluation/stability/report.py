@@ -17,8 +17,6 @@ from us_sim.evaluation.stability.plots import draw_map, draw_step_limits
 from us_sim.evaluation.stability.points import Trial, Tried
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
-__all__ = ["table", "write_report"]
-
 _HEAD = (
     *("method", "cases", "refused", "failed", "not finite", "not bounded", "not truthful"),
     *("back to rest", "frames", "kept", "slowest ms"),

@@ -27,8 +27,6 @@ from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["LOCKING", "MAIN_SCENE", "SCENES", "Scene"]
-
 MAIN_SCENE = "press_25mm"
 """The scene that is pressed on every mesh."""
 

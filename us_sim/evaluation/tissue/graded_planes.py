@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["graded_planes"]
-
 
 def graded_planes(
     low: float, high: float, fine_low: float, fine_high: float, size: float, growth: float

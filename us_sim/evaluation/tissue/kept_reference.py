@@ -18,8 +18,6 @@ from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import Solution, solve_contact
 from us_sim.geometry.pose import Pose
 
-__all__ = ["Reference", "kept_reference"]
-
 _STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
 
 _ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")

@@ -23,8 +23,6 @@ from us_sim.evaluation.solved import solved
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["LinearEquations"]
-
 _MAXIMUM_ITERATIONS = 10_000
 
 

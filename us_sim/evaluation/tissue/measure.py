@@ -28,8 +28,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["Trial", "evaluate_tissue", "plan"]
-
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
 _QUICK_SETTINGS = 3  # of each method, the defaults among them
 _SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the reference's elements

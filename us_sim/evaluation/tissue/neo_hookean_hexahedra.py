@@ -43,8 +43,6 @@ except ImportError as error:
         "pip install 'us_sim[evaluate]'"
     ) from error
 
-__all__ = ["NeoHookeanHexahedra"]
-
 _BATCH = 128  # elements whose stiffness is computed at once, which bounds the memory
 
 _OWN, _LINEAR = 5.0, 45.0

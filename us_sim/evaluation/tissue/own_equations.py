@@ -16,8 +16,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 
-__all__ = ["converged", "solved_independently"]
-
 _FRAMES = 400  # at the last pose, at the most
 _LONGEST = 10.0  # s, of these frames together
 

@@ -15,8 +15,6 @@ from us_sim.evaluation.power_law import exponent
 from us_sim.evaluation.tissue.points import Point
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 
-__all__ = ["plot_errors", "plot_sizes"]
-
 _LINES = ("-", "--", "-.", ":")  # of a method's settings that solve the same equations
 _FRAME = 1000.0 / 30.0  # ms, at the paper's 30 frames a second
 

@@ -27,8 +27,6 @@ from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver
 
-__all__ = ["Errors", "Outcome", "Point", "Timing", "compare", "held_memory", "timed"]
-
 _PASSES = 3  # along the path; the first is not timed
 _LONGEST = 20.0  # s, after which no further pass begins
 

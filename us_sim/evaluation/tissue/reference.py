@@ -36,8 +36,6 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 
-__all__ = ["Solution", "solve_contact"]
-
 _SOFT = 200.0
 """Penalty, Pa/m over Young's modulus, of the first poses: a soft contact is found in few steps."""
 _HARDER = (200.0, 200.0, 1000.0, 5000.0, 20000.0)

@@ -16,8 +16,6 @@ from us_sim.evaluation.tissue.kept_reference import Reference
 from us_sim.evaluation.tissue.plots import plot_errors, plot_sizes
 from us_sim.evaluation.tissue.points import Point
 
-__all__ = ["pareto_front", "table", "write_report"]
-
 _PAPERS_FINEST = int(np.prod(MESHES[-1]))
 _DEFAULTS = ("scene", "method", "nodes", "ms", "p99 ms", "L2 %", "max mm", "force %", "volume %")
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import splu
 
-__all__ = ["TwoLevel"]
-
 _DEGREE = 3  # of the smoothing polynomial
 _SMOOTHED = 20.0  # the smoother acts on eigenvalues down to the largest over this
 _MAXIMUM_ITERATIONS = 400

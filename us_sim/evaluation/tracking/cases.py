@@ -26,19 +26,6 @@ from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.rigid_body_file import read_rigid_body
 
-__all__ = [
-    "CONDITIONS",
-    "FRAMES",
-    "LARGE",
-    "MARKERS",
-    "RIGID_BODY",
-    "SINGLE",
-    "SMALL",
-    "Case",
-    "Marker",
-    "cases",
-]
-
 SMALL, LARGE = WEBCAMS  # images, by their sizes
 RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"
 FRAMES = 5

@@ -28,8 +28,6 @@ from us_sim.tracking.filter.pose_filter import create_filter
 from us_sim.tracking.filter.settings import KalmanSettings, OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["FILTER_METHODS", "FilterPoint", "delay", "filter_point", "filter_trials"]
-
 FILTER_METHODS = Named(
     "evaluated filter",
     {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")},

@@ -19,8 +19,6 @@ from us_sim.evaluation.tracking.points import Bench, Point
 from us_sim.evaluation.tracking.report import table, write_report
 from us_sim.evaluation.tracking.small_markers import small_marker_point, small_marker_trials
 
-__all__ = ["evaluate_tracking"]
-
 _SEQUENCES, _QUICK_SEQUENCES = {SMALL: 12, LARGE: 8}, {SMALL: 5, LARGE: 3}
 """Sequences of views a case, by the size of the images."""
 _MORE = 3  # times as many sequences of the cases that the targets are about

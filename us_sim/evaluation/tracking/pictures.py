@@ -10,8 +10,6 @@ import numpy as np
 from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
-__all__ = ["draw_views"]
-
 _CUT = 240  # pixels, of the image around the body
 _TITLE = 22  # pixels
 

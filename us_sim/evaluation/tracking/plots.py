@@ -14,8 +14,6 @@ from us_sim.evaluation.tracking.cases import CONDITIONS, LARGE, MARKERS, SMALL
 from us_sim.evaluation.tracking.filters import FILTER_METHODS, FilterPoint
 from us_sim.evaluation.tracking.points import Point, those
 
-__all__ = ["plot_conditions", "plot_filters", "plot_run_time", "plot_views"]
-
 _DISTANCE = 0.4  # m
 
 

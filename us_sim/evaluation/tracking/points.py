@@ -30,8 +30,6 @@ from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["Bench", "Point", "View", "mirrored", "those", "views_of", "visible"]
-
 _FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
 

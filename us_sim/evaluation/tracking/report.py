@@ -22,8 +22,6 @@ from us_sim.evaluation.tracking.points import Point, View, those, views_of
 from us_sim.evaluation.tracking.small_markers import SmallMarkerPoint
 from us_sim.evaluation.tracking.targets import small_marker_targets, targets
 
-__all__ = ["table", "write_report"]
-
 _OF_VIEWS = ("views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
 
 

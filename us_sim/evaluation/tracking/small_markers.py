@@ -25,8 +25,6 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
 
-__all__ = ["SmallMarkerPoint", "small_marker_point", "small_marker_trials"]
-
 _CAMERA = CameraModel(
     200,
     160,

@@ -11,8 +11,6 @@ from us_sim.evaluation.tracking.cases import LARGE, RIGID_BODY, SINGLE, SMALL
 from us_sim.evaluation.tracking.points import Point, View, views_of
 from us_sim.evaluation.tracking.small_markers import SmallMarkerPoint
 
-__all__ = ["small_marker_targets", "targets"]
-
 _BODY = {"marker": RIGID_BODY, "condition": "plain", "distance": 0.4}
 
 _VISIBLE = 4  # markers

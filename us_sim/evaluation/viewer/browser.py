@@ -10,8 +10,6 @@ from typing import Any
 
 from us_sim.errors import UsSimError
 
-__all__ = ["Browser"]
-
 ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",

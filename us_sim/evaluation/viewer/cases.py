@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-__all__ = ["Case", "cases"]
-
 
 @dataclass(frozen=True)
 class Case:

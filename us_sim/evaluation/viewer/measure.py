@@ -19,8 +19,6 @@ from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
 from us_sim.scene.reading import load_scene
 
-__all__ = ["evaluate_viewer"]
-
 
 def evaluate_viewer(out: Path, quick: bool) -> int:
     """Write viewer.csv, the plots and viewer.md, as `us_sim.evaluation` says."""

@@ -10,8 +10,6 @@ import numpy as np
 from us_sim.evaluation.figure import key_beside, new_figure, plain, save
 from us_sim.evaluation.viewer.points import Point
 
-__all__ = ["plot_memory", "plot_rates"]
-
 
 def plot_rates(points: Sequence[Point], file: Path) -> None:
     """Two bars a case: images made and shown; and beside them how long a page waits for them."""

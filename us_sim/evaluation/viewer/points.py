@@ -11,8 +11,6 @@ from us_sim.evaluation.latency.usage import UsageOverTime
 from us_sim.evaluation.row import Row
 from us_sim.evaluation.viewer.cases import Case
 
-__all__ = ["Point"]
-
 
 @dataclass(frozen=True)
 class Point(Row):

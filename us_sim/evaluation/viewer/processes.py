@@ -7,8 +7,6 @@ from pathlib import Path
 
 from us_sim.evaluation.latency.usage import Usage, UsageOverTime, usage_of
 
-__all__ = ["UsageByName", "started_by"]
-
 _MODULE = "us_sim.nodes."
 
 

@@ -14,8 +14,6 @@ from us_sim.evaluation.viewer.plots import plot_memory, plot_rates
 from us_sim.evaluation.viewer.points import Point
 from us_sim.evaluation.viewer.targets import targets
 
-__all__ = ["table", "write_report"]
-
 _HEAD = (
     *("", "s", "images/s made", "poses skipped %", "age ms p50", "p99", "images/s shown"),
     *("delay ms median", "p99", "start s", "opened s", "viewer cores", "browser cores"),

@@ -28,8 +28,6 @@ from us_sim.evaluation.viewer.processes import UsageByName, started_by
 from us_sim.evaluation.viewer.taker import Taker
 from us_sim.share import find_bag
 
-__all__ = ["run_case"]
-
 _START_S = 300.0  # the first run compiles
 _WARMING_S = 2.0  # of images that do not count
 _STOP_S = 20.0

@@ -12,8 +12,6 @@ from typing import Any
 from us_sim.errors import UsSimError
 from us_sim.viewer.packet import Packet
 
-__all__ = ["STREAMED", "Taker"]
-
 STREAMED = (
     "image",
     "skin_mesh",

@@ -9,8 +9,6 @@ import numpy as np
 from us_sim.evaluation.target import Target
 from us_sim.evaluation.viewer.points import Point
 
-__all__ = ["targets"]
-
 
 def targets(points: Sequence[Point]) -> list[Target]:
     """Every measure that is asked for."""

@@ -11,8 +11,6 @@ from us_sim.errors import MeshError
 from us_sim.nodes.conversions.packing import packed
 from us_sim.nodes.conversions.stamps import require_frame
 
-__all__ = ["cloud_message", "vectors_from"]
-
 _KINDS = {PointField.FLOAT32: "f4", PointField.FLOAT64: "f8"}
 _FARTHEST = 1e6
 """m: coordinates beyond are no place, and their squares do not fit single precision for long."""

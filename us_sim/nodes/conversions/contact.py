@@ -11,8 +11,6 @@ from us_sim.nodes.conversions.packing import packed
 from us_sim.nodes.conversions.stamps import nanoseconds_since
 from us_sim.tracking.haptic.contact_model import ContactModel
 
-__all__ = ["contact_model_from", "contact_model_message"]
-
 _CONTACT_PARTS = (("stamp", 2), ("pose", 7), ("wrench", 6), ("stiffness", 36))
 """What a model of the contact holds: seconds and nanoseconds; position and quaternion of the probe;
 force and torque; six rows of six."""

@@ -14,18 +14,6 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 from us_sim.errors import ProbeError, VolumeError
 from us_sim.nodes.conversions.packing import packed
 
-__all__ = [
-    "affine_from",
-    "affine_message",
-    "bgr_image_message",
-    "colour_image_message",
-    "colour_pixels_from",
-    "field_from",
-    "field_message",
-    "image_message",
-    "pixels_from",
-]
-
 _FIELD = re.compile(r"32FC([1-4])")
 _LARGEST = 1e6
 """m, of a pixel, or to the first one."""

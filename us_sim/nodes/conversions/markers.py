@@ -15,16 +15,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions.packing import CDR_LITTLE_ENDIAN
 from us_sim.nodes.conversions.stamps import nanoseconds_since, require_frame
 
-__all__ = [
-    "MarkedTriangles",
-    "line_from",
-    "markers_stamp",
-    "structure_markers",
-    "surface_marker",
-    "transducer_markers",
-    "triangles_from",
-]
-
 Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], NDArray[np.integer]]
 """A marker's namespace, its red, green, blue and alpha, (V, 3) m vertices and (T, 3) triangles."""
 

@@ -11,8 +11,6 @@ from std_msgs.msg import Int32MultiArray, MultiArrayDimension
 from us_sim.errors import MeshError
 from us_sim.nodes.conversions.packing import packed
 
-__all__ = ["mesh_from", "mesh_message", "tetrahedra_from", "tetrahedra_message"]
-
 
 def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
     """(M, 4) node indices."""

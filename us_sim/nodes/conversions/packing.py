@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CDR_LITTLE_ENDIAN", "packed"]
-
 CDR_LITTLE_ENDIAN = b"\0\1\0\0"
 """What serialized messages begin with."""
 

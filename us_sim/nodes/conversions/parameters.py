@@ -19,8 +19,6 @@ from us_sim.settings.amount import dial_unit
 from us_sim.settings.quantity import Quantity, units_of
 from us_sim.viewer.parameters import Kind, Parameter
 
-__all__ = ["parameter_from", "parameter_message", "raw_from"]
-
 _TYPES: dict[Kind, tuple[int, str]] = {
     Kind.TRUTH: (ParameterType.PARAMETER_BOOL, "bool_value"),
     Kind.WHOLE: (ParameterType.PARAMETER_INTEGER, "integer_value"),

@@ -15,18 +15,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions.packing import CDR_LITTLE_ENDIAN
 from us_sim.nodes.conversions.stamps import require_frame
 
-__all__ = [
-    "pose_from",
-    "pose_from_text",
-    "pose_message",
-    "pose_text",
-    "transform_from",
-    "transform_message",
-    "wrench_from",
-    "wrench_message",
-    "wrench_serialized",
-]
-
 _FARTHEST = 1e7
 """m: from the middle of the Earth everything is nearer, but for what is no place."""
 

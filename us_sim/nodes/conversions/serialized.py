@@ -14,8 +14,6 @@ from rosbags.interfaces import Nodetype
 
 from us_sim.recording.schemas import jazzy_definitions
 
-__all__ = ["require_sequences"]
-
 
 def require_sequences(data: bytes, message_type: Any) -> None:
     """Look at the sequences of a serialized message, where its type is one of Jazzy's with any.

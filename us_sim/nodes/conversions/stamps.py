@@ -9,8 +9,6 @@ from std_msgs.msg import Header
 
 from us_sim.errors import MessageError, StampError
 
-__all__ = ["nanoseconds_of", "nanoseconds_since", "require_frame", "require_stamp", "stamp_message"]
-
 _SECOND = 1_000_000_000  # ns
 _LAST = 2**31 - 1 - 86_400
 """s since 1970, a day before a stamp can count no further: what is added must be counted, too."""

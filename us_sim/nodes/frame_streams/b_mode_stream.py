@@ -9,8 +9,6 @@ from us_sim.nodes.conversions import image_message
 from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.slicing.frame import Frame
 
-__all__ = ["BModeStream"]
-
 
 class BModeStream(FrameStream):
     """``ultrasound/image``, whose age counts as the node's latency."""

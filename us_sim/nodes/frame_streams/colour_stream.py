@@ -18,8 +18,6 @@ from us_sim.slicing.flow.colour_settings import ColourSettings
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["ColourStream"]
-
 _OPACITY = 0.9
 
 

@@ -10,8 +10,6 @@ from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.slicing.displacement import displacement
 from us_sim.slicing.frame import Frame
 
-__all__ = ["DisplacementStream"]
-
 
 class DisplacementStream(FrameStream):
     """``ultrasound/displacement``: lateral and axial, m, of each pixel's tissue since rest."""

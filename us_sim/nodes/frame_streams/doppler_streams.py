@@ -14,8 +14,6 @@ from us_sim.scene.blood import blood_of
 from us_sim.slicing.flow.warm_up import warm_up
 from us_sim.volume.volume import Volume
 
-__all__ = ["doppler_streams"]
-
 
 def doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
     """The velocity of blood, its colour Doppler and its spectrum; flows are parameters of the node.

@@ -10,8 +10,6 @@ from us_sim.slicing.flow.doppler_settings import DopplerSettings
 from us_sim.slicing.flow.following import nearest_vessel
 from us_sim.slicing.frame import Frame
 
-__all__ = ["Following"]
-
 EVERY_S = 0.2
 """Between two looks at where the vessel is; of the frames' time."""
 

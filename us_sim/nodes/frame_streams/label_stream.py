@@ -9,8 +9,6 @@ from us_sim.nodes.conversions import image_message
 from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.slicing.frame import Frame
 
-__all__ = ["LabelStream"]
-
 
 class LabelStream(FrameStream):
     """``ultrasound/labels``: the number of the volume's label at each pixel, 0 for nothing."""

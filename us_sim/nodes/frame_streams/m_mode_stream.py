@@ -17,8 +17,6 @@ from us_sim.slicing.m_mode import MMode
 from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["MModeStream"]
-
 
 class MModeStream(SettableStream[MMode]):
     """``ultrasound/m_mode``: the image along a line over time; parameters ``m_mode.…``."""

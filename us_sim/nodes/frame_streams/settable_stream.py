@@ -12,8 +12,6 @@ from us_sim.settings.setting import Settings
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["SettableStream"]
-
 M = TypeVar("M")
 
 

@@ -19,8 +19,6 @@ from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["SpectrumStream"]
-
 
 class SpectrumStream(SettableStream[Spectrum]):
     """``ultrasound/spectrum``: velocities at the gate over time; parameters ``spectrum.…``."""

@@ -25,8 +25,6 @@ from us_sim.slicing.strain.estimate import Estimate, estimate_strain, require_sh
 from us_sim.slicing.strain.settings import Strain
 from us_sim.slicing.strain.warm_up import warm_up
 
-__all__ = ["StrainEstimateStream", "StrainStream", "strain_streams"]
-
 
 def strain_streams(node: SceneNode) -> list[FrameStream]:
     """Both, with the scene's settings as parameters ``strain.…`` that may change while running."""

@@ -16,8 +16,6 @@ from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["FrameStream"]
-
 
 class FrameStream(ABC):
     """One topic of images, made from each frame while somebody subscribes.

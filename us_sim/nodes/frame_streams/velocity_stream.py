@@ -11,8 +11,6 @@ from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.frame import Frame
 
-__all__ = ["VelocityStream"]
-
 
 class VelocityStream(FrameStream):
     """``ultrasound/velocity``: exact, along the beams of colour Doppler, in the whole image."""

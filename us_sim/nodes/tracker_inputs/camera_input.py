@@ -16,8 +16,6 @@ from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.camera.warm_up import practice
 
-__all__ = ["CameraInput"]
-
 
 class CameraInput(TrackerInput):
     """``camera/image_raw``, or ``camera/image_raw/compressed``, with ``camera/camera_info``."""

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from us_sim.scene.scene import Scene
     from us_sim.tracking.measurement import Measurement
 
-__all__ = ["Device", "TrackerInput"]
-
 
 class TrackerInput:
     """Hands the measurements of one kind of source to the tracker, with `Device.take`.

@@ -9,8 +9,6 @@ from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.haptic.device import HapticDevice
 from us_sim.tracking.haptic.settings import HapticSettings
 
-__all__ = ["HapticInput"]
-
 
 class HapticInput(TrackerInput):
     """``haptic/pose`` in the frame that the scene names; ``haptic/clutch`` holds the probe."""

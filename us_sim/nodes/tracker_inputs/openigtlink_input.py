@@ -11,8 +11,6 @@ from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
 from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 
-__all__ = ["OpenIGTLinkInput"]
-
 
 class OpenIGTLinkInput(TrackerInput):
     """The device ``tracker.body`` of the server ``tracker.openigtlink``; the newest pose wins."""

@@ -13,8 +13,6 @@ from us_sim.scene.building import path_of
 from us_sim.settings.spelling import counted
 from us_sim.tracking.measurement import PATIENT, Measurement
 
-__all__ = ["PathInput"]
-
 SHORTEST_S, LONGEST_S = 1e-3, 0.02
 """How often it is looked whether a pose is due, at most and at least."""
 CHECK_S, CHECKS = 0.05, 6

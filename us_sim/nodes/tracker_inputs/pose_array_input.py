@@ -10,8 +10,6 @@ from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.settings.spelling import counted
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["PoseArrayInput"]
-
 
 class PoseArrayInput(TrackerInput):
     """The pose ``tracker.entry`` of ``tracker/poses``, in the frame that the scene names."""

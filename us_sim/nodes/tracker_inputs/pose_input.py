@@ -9,8 +9,6 @@ from geometry_msgs.msg import PoseStamped
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import PATIENT, Measurement
 
-__all__ = ["PoseInput"]
-
 
 class PoseInput(TrackerInput):
     """``tracker/pose`` in the frame that the scene names.

@@ -9,8 +9,6 @@ from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.mouse.settings import SixDofMouseSettings
 from us_sim.tracking.mouse.six_dof_mouse import SixDofMouse
 
-__all__ = ["SixDofMouseInput"]
-
 
 class SixDofMouseInput(TrackerInput):
     """``spacenav/joy``, or ``spacenav/twist`` where there is no joystick message."""

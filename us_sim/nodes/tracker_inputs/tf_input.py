@@ -13,8 +13,6 @@ from us_sim.nodes.conversions import transform_from
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["TfInput"]
-
 MOVING = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=100,

@@ -21,8 +21,6 @@ from us_sim.nodes.viewer_feeds.watched_topic import Make, WatchedTopic
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
 
-__all__ = ["image_feeds"]
-
 _QUALITY = 90
 """Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
 _STRIPS = {"m_mode": "ultrasound/m_mode", "spectrum": "ultrasound/spectrum"}

@@ -8,8 +8,6 @@ from us_sim.nodes.conversions import triangles_from
 from us_sim.viewer.meshes.coloured_surface import ColouredSurface
 from us_sim.viewer.meshes.welded import welded
 
-__all__ = ["surfaces_of"]
-
 
 def surfaces_of(message: MarkerArray, frame: str) -> list[ColouredSurface]:
     """Of each namespace one, with shared vertices.

@@ -25,8 +25,6 @@ from us_sim.viewer.feed import Feed
 from us_sim.viewer.meshes.transducer import transducer_packet
 from us_sim.viewer.packet import Packet
 
-__all__ = ["ProbeFeeds"]
-
 _POSE, _WRENCH = "probe/pose", "probe/wrench"
 _KEPT = 16
 """Poses and wrenches, until the image of their stamp is made."""

@@ -15,8 +15,6 @@ from us_sim.nodes.qos import LATCHED
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.meshes.rest_surface import RestSurface
 
-__all__ = ["RestMesh"]
-
 
 class RestMesh:
     """``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while somebody watches them.

@@ -14,8 +14,6 @@ from us_sim.viewer.feed import Feed
 from us_sim.viewer.meshes.rest_surface import RestSurface
 from us_sim.viewer.packet import Packet
 
-__all__ = ["SkinFeeds"]
-
 
 class SkinFeeds:
     """The streams ``skin_mesh``, of ``skin/mesh``, and ``skin``, of ``skin/nodes``."""

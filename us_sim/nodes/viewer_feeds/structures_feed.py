@@ -22,8 +22,6 @@ from us_sim.viewer.feed import Feed
 if TYPE_CHECKING:
     from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
 
-__all__ = ["StructuresFeed"]
-
 _REMEMBERED = 32
 _NODES, _STRUCTURES = "tissue/nodes", "tissue/structures"
 

@@ -16,8 +16,6 @@ from us_sim.viewer.feed import Feed
 from us_sim.viewer.meshes.equivalent_strain import EquivalentStrain
 from us_sim.viewer.packet import Packet
 
-__all__ = ["TissueFeeds"]
-
 _STRAIN_RATE = 12.0
 """Hz: strain takes longer than positions, and its colours are read and not followed."""
 

@@ -13,8 +13,6 @@ from us_sim.nodes.qos import STREAM
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
 
-__all__ = ["WatchedTopic", "made_of"]
-
 Make = Callable[[Any, int], Packet]
 MakeOrWait = Callable[[Any, int], Packet | None]
 

@@ -44,8 +44,6 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["SPEED_OF_SOUND", "BeamAcoustics"]
-
 SPEED_OF_SOUND = 1540.0
 """m/s, that scanners take for all soft tissue."""
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["LOCATED", "BeamGrid", "aperture"]
-
 LOCATED = (2, 2)
 """Rows and columns from one pixel to the next of those that beams know the place of."""
 

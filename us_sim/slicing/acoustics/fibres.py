@@ -14,8 +14,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.located import Located
 from us_sim.slicing.probe.plane import SlicePlane
 
-__all__ = ["Fibres"]
-
 
 class Fibres:
     """The directions of fibres at rest, carried by a mesh.

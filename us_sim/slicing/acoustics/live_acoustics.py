@@ -17,8 +17,6 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
 
-__all__ = ["LiveAcoustics"]
-
 _F_NUMBER = 2.0  # of the aperture, over which a point is a wavelength times that wide
 _PULSE_LENGTH = 1.5  # wavelengths of a point along the beam, 6 dB below its peak
 

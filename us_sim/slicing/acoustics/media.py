@@ -22,15 +22,6 @@ from us_sim.slicing.acoustics.surface_echo import MIRROR
 from us_sim.slicing.acoustics.tissue_table import AROUND
 from us_sim.volume.volume import Volume
 
-__all__ = [
-    "constants_by_label",
-    "crossing_loss",
-    "decibels_per_metre",
-    "media_of",
-    "reflection",
-    "surface_levels",
-]
-
 _SOFT = (0.8e6, 3.0e6)
 """Rayl, of soft tissue and fluid: what has more or less is bone or gas, which casts a shadow."""
 _FAINTEST = -200.0  # dB, in place of nothing

@@ -15,8 +15,6 @@ from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
 from us_sim.slicing.formation.imaging import ECHO_RANGE
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["Noise"]
-
 _FRAMES = 4
 _GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
 

@@ -20,17 +20,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.trilinear import SLACK
 
-__all__ = [
-    "END",
-    "NOTHING",
-    "Crossings",
-    "Media",
-    "follow_beams",
-    "medium_at",
-    "room_for_crossings",
-    "sharpen_borders",
-]
-
 NOTHING = 0
 """The medium where there is no tissue."""
 

@@ -14,8 +14,6 @@ import numpy as np
 from us_sim.kernels import njit
 from us_sim.slicing.acoustics.path_loss import END, NOTHING, medium_at
 
-__all__ = ["AMPLITUDES", "cast_shadows", "sharpen_edges"]
-
 _MOST = 40.0  # dB of loss after which more says nothing further of where it is
 _DARKEST = 3e-4  # amplitude below which nothing is seen
 _DARK = np.float32(100.0)  # dB, in place of more than that

@@ -22,8 +22,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.acoustics.tissue_table import table_constants
 
-__all__ = ["Acoustics", "SoundSettings", "TissueAcoustics"]
-
 _FREQUENCY = Quantity("frequency", 0.5e6, 50e6)
 
 

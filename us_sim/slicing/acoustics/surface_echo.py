@@ -20,8 +20,6 @@ import numpy as np
 from us_sim.kernels import njit
 from us_sim.slicing.acoustics.surface_normals import BLOCK, DISTANCE
 
-__all__ = ["GRAIN", "MIRROR", "angle_loss", "draw_surfaces"]
-
 MIRROR = 11.0
 """dB: echo of a plane that reflects everything at a right angle, where the strongest shown is 0."""
 

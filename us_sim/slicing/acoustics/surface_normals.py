@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.volume.volume import Volume
 
-__all__ = ["BLOCK", "DISTANCE", "SurfaceNormals", "surface_normals_of"]
-
 BLOCK = 8
 DISTANCE = 40.0
 """Parts of a voxel in which the distance of a surface is kept."""

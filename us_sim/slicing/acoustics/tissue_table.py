@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["AROUND", "table_constants"]
-
 AROUND = "tissue"
 """The name of what is in no structure."""
 

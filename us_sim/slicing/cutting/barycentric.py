@@ -16,8 +16,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["adjugate", "is_solid"]
-
 _FLAT = 1e-6
 """Fraction of its rest volume below which a tetrahedron is flat: it has no interior to show."""
 

@@ -25,8 +25,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.section import finite_nodes
 from us_sim.slicing.probe.plane import SlicePlane
 
-__all__ = ["ON_PLANE", "Clusters"]
-
 ON_PLANE = 1e-9
 """Pixels off the plane within which a node counts as on it: rounding."""
 

@@ -20,16 +20,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 from us_sim.slicing.cutting.clusters import ON_PLANE
 
-__all__ = [
-    "FACES",
-    "Cuts",
-    "cross_edge",
-    "cut_tetrahedra",
-    "face_cut",
-    "place_node",
-    "room_for_cuts",
-]
-
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.row_bands import parallel_rows
 
-__all__ = ["BLACK", "Located", "evaluate"]
-
 BLACK = -1
 """The element of a pixel that shows nothing, as where tissue moved away."""
 

@@ -27,8 +27,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.located import BLACK
 from us_sim.slicing.cutting.section import INSIDE, row_span
 
-__all__ = ["cells", "leave_black", "subdivide_rows"]
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cells(bounds, columns, rows, regions):

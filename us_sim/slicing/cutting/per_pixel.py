@@ -41,8 +41,6 @@ from us_sim.slicing.probe.plane import SlicePlane
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["PerPixel"]
-
 _ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section
 _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
 

@@ -38,17 +38,6 @@ from us_sim.slicing.probe.plane import SlicePlane
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = [
-    "full_runs",
-    "grey_voxels",
-    "label_voxels",
-    "pixel_to_index",
-    "sample_labels",
-    "sample_nearest",
-    "sample_plane",
-    "voxels_of",
-]
-
 
 def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
     """The image (rows, columns) on a plane through the volume as it is, without tissue.

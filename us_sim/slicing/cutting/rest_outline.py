@@ -16,8 +16,6 @@ from us_sim.slicing.cutting.cut_polygons import FACES, cross_edge, face_cut, pla
 from us_sim.slicing.cutting.spans import closed_columns, up_to
 from us_sim.slicing.probe.plane import SlicePlane
 
-__all__ = ["NO_OUTLINE", "Outline", "RestSurface", "mark_covered"]
-
 
 class Outline(NamedTuple):
     """The cuts of the mesh's outer faces at rest; of each array the first ``number`` are in use."""

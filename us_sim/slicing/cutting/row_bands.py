@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["parallel_rows"]
-
 
 def parallel_rows(
     threads: int, rows: int, work: Callable[[int, int], object], *, band: int = 1

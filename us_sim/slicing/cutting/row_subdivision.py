@@ -51,8 +51,6 @@ if TYPE_CHECKING:
 
     from us_sim.volume.volume import Volume
 
-__all__ = ["RowSubdivision", "RowSubdivisionSettings"]
-
 
 @dataclass(frozen=True)
 class RowSubdivisionSettings(Settings):

@@ -50,8 +50,6 @@ from us_sim.slicing.probe.plane import SlicePlane
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["ScanConversion"]
-
 
 class ScanConversion(Slicer):
     """Cuts exact images, and fast."""

@@ -29,8 +29,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 from us_sim.slicing.probe.plane import SlicePlane
 
-__all__ = ["INSIDE", "RestMesh", "Section", "finite_nodes", "row_span"]
-
 INSIDE = -1e-9
 """Least barycentric coordinate of a point inside, so that rounding leaves no holes at faces."""
 

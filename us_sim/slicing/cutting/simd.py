@@ -20,8 +20,6 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["LANES", "load_pairs", "write_ramp"]
-
 LANES = 16
 """Numbers that are read or written at once: arrays need room for as many beyond their last one."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from us_sim.slicing.cutting.located import Located
     from us_sim.volume.volume import Volume
 
-__all__ = ["Slicer", "create_slicer", "warm_up"]
-
 
 class Slicer(ABC):
     """Cuts images from a volume that is carried by a deformed tetrahedral mesh.

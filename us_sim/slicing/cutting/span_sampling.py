@@ -19,15 +19,6 @@ from us_sim.slicing.cutting.simd import LANES, load_pairs, write_ramp
 from us_sim.slicing.cutting.spans import CUT_SHIFT, END_SHIFT
 from us_sim.slicing.cutting.trilinear import SLACK
 
-__all__ = [
-    "INNER_MARGIN",
-    "MOST_VOXELS",
-    "MOST_VOXELS_A_SIDE",
-    "fill_elements",
-    "fill_some_elements",
-    "sample_spans",
-]
-
 _FRACTION = 17  # bits behind the point of a coordinate
 _DROPPED = 2  # number of these bits that a blend leaves out
 _ONE = float(1 << _FRACTION)

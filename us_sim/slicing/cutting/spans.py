@@ -11,8 +11,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["CUT_SHIFT", "END_SHIFT", "closed_columns", "convert_cuts", "up_to"]
-
 CUT_SHIFT, END_SHIFT = 26, 13
 """A span is one number: bits by which its cut and its end are shifted there. The lowest bits are
 its first column. A column is at most 4096."""

@@ -20,8 +20,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["SLACK", "inside_volume", "sample_linear"]
-
 SLACK = 1e-6
 """Voxels by which a point may miss the volume's outer faces: rounding of the map, no more."""
 

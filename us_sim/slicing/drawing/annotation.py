@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from us_sim.slicing.drawing.overlay import Overlay
     from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["Annotation", "Badge"]
-
 _SCALE: Colour = (205, 215, 215)
 _FOCUS: Colour = (255, 210, 60)
 _SHADOW: Colour = (0, 0, 0)

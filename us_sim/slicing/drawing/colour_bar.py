@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.slicing.drawing.lettering import Colour, lettering
 from us_sim.slicing.drawing.overlay import ColourScale
 
-__all__ = ["ColourBar"]
-
 _TEXT: Colour = (205, 215, 215)
 _HEIGHT = 9
 """Of the bar, in heights of a letter."""

@@ -34,8 +34,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.frame import Frame
 from us_sim.volume.volume import Volume
 
-__all__ = ["onto_border"]
-
 _SIGMA = 2.0  # voxels: less leaves steps where a border runs along them
 _MARGIN = 6  # voxels around a label in which it has a share
 _STEPS = 4  # of Newton's method

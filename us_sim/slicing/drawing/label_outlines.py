@@ -18,8 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Settle", "label_outlines"]
-
 Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Moves points (P, 2) of a label's outline, see `us_sim.slicing.drawing.label_border`."""
 

@@ -19,8 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Colour", "Label", "lettering"]
-
 Colour = tuple[int, int, int]
 """Red, green and blue, 0 to 255."""
 

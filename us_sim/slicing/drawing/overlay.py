@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.drawing.lettering import Colour
 
-__all__ = ["ColourScale", "Overlay", "mirrored"]
-
 
 @dataclass(frozen=True)
 class ColourScale:

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.drawing.lettering import Colour, lettering
 
-__all__ = ["SweepPicture"]
-
 _SCALE: Colour = (205, 215, 215)
 _LINE: Colour = (90, 100, 100)
 _TEXT = 11  # px, height of letters

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from us_sim.slicing.flow.blood import Blood, Window
 from us_sim.slicing.frame import Frame
 
-__all__ = ["Absence", "absence"]
-
 _HEARD = 0.3  # coupling below which blood, 20 dB fainter than tissue, is lost
 _STANDING = 1e-3  # m/s on a vessel's axis
 _ACROSS = 0.12  # cosine between beam and flow: 83 degrees

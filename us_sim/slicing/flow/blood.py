@@ -35,8 +35,6 @@ from us_sim.slicing.frame import Frame, Mesh
 from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["Blood", "Window"]
-
 
 class Window:
     """Places in an image, and the directions of the beams there.

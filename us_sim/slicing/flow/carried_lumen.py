@@ -33,8 +33,6 @@ from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
 from us_sim.tissue.mesh.point_location import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["CarriedLumen", "LumenNow"]
-
 _RINGS = 4
 """Rings around a station that share its area at rest evenly."""
 

@@ -27,8 +27,6 @@ from scipy.sparse.csgraph import dijkstra
 
 from us_sim.errors import VolumeError
 
-__all__ = ["Centreline", "centreline", "resampled"]
-
 _MOST = 60_000
 """Voxels of a lumen that are walked; of more, every second along each axis is."""
 

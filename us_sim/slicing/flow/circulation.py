@@ -41,8 +41,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.flow.settings import FlowSettings
 
-__all__ = ["VISCOSITY", "Circulation", "open_fraction"]
-
 VISCOSITY = 3.5e-3
 """Pa s, of blood where it is sheared fast (W. W. Nichols, M. F. O'Rourke, McDonald's Blood Flow in
 Arteries, 5th ed., 2005, chapter 2: 3 to 4)."""

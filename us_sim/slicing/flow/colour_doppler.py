@@ -42,8 +42,6 @@ from us_sim.slicing.probe.beam_places import (
 )
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["ColourDoppler"]
-
 _SHOWN = 0.3
 """Size of R, over that of fast blood, from which colour is shown with a gain of 0 dB."""
 

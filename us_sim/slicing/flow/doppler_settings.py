@@ -9,8 +9,6 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["DopplerSettings"]
-
 
 @dataclass(frozen=True)
 class DopplerSettings(Settings):

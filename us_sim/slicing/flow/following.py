@@ -12,8 +12,6 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.beam_places import fractions_and_depths, pixels_of
 from us_sim.slicing.probe.probe import LinearProbe
 
-__all__ = ["nearest_vessel"]
-
 _STEP = 6  # pixels from one place that is looked at to the next
 _REACH = 8e-3  # m around the nearest place of a vessel, which may cross the image twice
 

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["DIRECTIONS", "Lumen", "lumen_of"]
-
 DIRECTIONS = 24
 """Directions from a section's centre in which its wall is known."""
 

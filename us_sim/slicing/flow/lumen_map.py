@@ -28,8 +28,6 @@ from us_sim.cache import Form, kept
 from us_sim.slicing.flow.lumen import Lumen, lumen_of
 from us_sim.volume.volume import Volume
 
-__all__ = ["LumenMap", "mapped_lumen"]
-
 _WAY = 1
 """Raised when another lumen or map is made of the same voxels."""
 _OUTSIDE = 3.0  # radial coordinate that is well outside the wall

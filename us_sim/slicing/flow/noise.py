@@ -16,8 +16,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["normal_pair", "uniform"]
-
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 

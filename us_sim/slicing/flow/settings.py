@@ -19,8 +19,6 @@ from us_sim.errors import SceneError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["FlowSettings"]
-
 _PRESSURE = Quantity("pressure", 10.0, 40e3)
 _RATE = Quantity("rate", 0.02, 5.0)
 _VENOUS = ("kind", ("venous",))

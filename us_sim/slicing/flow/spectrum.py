@@ -32,8 +32,6 @@ from us_sim.slicing.probe.beam_places import (
 )
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["Spectrum"]
-
 _ROWS, _COLUMNS = 256, 512
 _ALONG, _ACROSS = 15, 7
 """Places in the gate along the beam and across it."""

@@ -9,8 +9,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.slicing.flow.doppler_settings import DopplerSettings
 
-__all__ = ["SpectrumSettings"]
-
 
 @dataclass(frozen=True)
 class SpectrumSettings(DopplerSettings):

@@ -28,8 +28,6 @@ from us_sim.slicing.flow.waveform import Waveform
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-__all__ = ["Vessel"]
-
 _ALONG = 0.25
 """Least cosine between the direction that is set and the vessel's own."""
 

@@ -17,8 +17,6 @@ from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
-__all__ = ["warm_up"]
-
 
 def warm_up() -> None:
     """Use every kernel of this room once, on a tube of a few voxels."""

@@ -24,8 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.slicing.flow.settings import FlowSettings
 
-__all__ = ["Waveform"]
-
 _BELLS = ((0.13, 0.045, 1.0), (0.33, 0.06, -0.32), (0.52, 0.09, 0.10))
 """Middle and standard deviation, in beats, and height of the arterial pulse's three waves."""
 

@@ -22,8 +22,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["FULL_PRESS", "GEL_BEAD", "GEL_FILM", "LIGHT_CONTACT", "ContactSurface"]
-
 GEL_FILM = (0.15e-3, 0.3e-3)
 """m: gel fills gaps between face and skin up to the first; from the second on there is air."""
 

@@ -21,8 +21,6 @@ from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.beams import beam_width, depth_steps, focus_of, step_depths
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["WIDTH_PER_SIGMA", "Elevation"]
-
 WIDTH_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 """Full width at half maximum of a Gaussian, in standard deviations."""
 

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["GelLayer"]
-
 _THICKEST = 5e-3
 """m, of a layer that is filled: what is more is not the mesh's coarseness."""
 

@@ -23,8 +23,6 @@ from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.beams import depth_steps, step_depths
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["GREYS_PER_DECIBEL", "GreyLevels"]
-
 GREYS_PER_DECIBEL = 255.0 / ECHO_RANGE
 
 _SOFT = 0.7  # exponent of the soft map

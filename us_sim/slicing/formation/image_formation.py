@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from us_sim.slicing.formation.resolution import Resolution
     from us_sim.slicing.formation.reverberation import Reverberation
 
-__all__ = ["ImageFormation"]
-
 
 class ImageFormation:
     """The stages between slices and the picture, in the order in which echoes meet them.

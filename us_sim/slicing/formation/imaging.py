@@ -17,8 +17,6 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["ECHO_RANGE", "GREY_MAPS", "Imaging"]
-
 ECHO_RANGE = 60.0
 """dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
 

@@ -33,8 +33,6 @@ from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.beams import beam_width, focus_of
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["Resolution"]
-
 _SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
 """Standard deviation of an amplitude over the width at half its power. Power is the square of the
 amplitude, and its standard deviation is √2 times less."""

@@ -30,8 +30,6 @@ from us_sim.kernels import njit
 from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["BAND_SPACING", "Reverberation"]
-
 BAND_SPACING = 1.2e-3
 """m: how thick a lens of 0.8 mm seems, which sound crosses at 1000 m/s instead of 1540."""
 

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-__all__ = ["beam_angles", "fractions_and_depths", "pixels_of", "require_depth", "require_steering"]
-
 
 def require_depth(probe: Probe, key: str, depth: float | None, what: str) -> float:
     """The depth, m, or half of the image's where none is given.

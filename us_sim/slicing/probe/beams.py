@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["DEPTH_STEPS", "beam_width", "depth_steps", "focus_of", "step_depths"]
-
 DEPTH_STEPS = 512
 """Steps of depth in which tables of what changes with depth are made."""
 

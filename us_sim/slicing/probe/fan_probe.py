@@ -31,8 +31,6 @@ from us_sim.slicing.probe.probe import (
     image_depth,
 )
 
-__all__ = ["ConvexProbe", "SectorProbe"]
-
 
 @dataclass(frozen=True)
 class ConvexProbe(Probe):

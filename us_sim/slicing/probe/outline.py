@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.probe.probe import Probe
 
-__all__ = ["OUTLINE_POINTS", "image_outline"]
-
 OUTLINE_POINTS = 33
 """Of each of the two arcs that an outline has."""
 

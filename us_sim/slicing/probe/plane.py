@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import ProbeError
 
-__all__ = ["SlicePlane", "require_pixel_counts"]
-
 _MOST_PIXELS = 4096
 
 

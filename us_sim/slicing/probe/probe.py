@@ -30,16 +30,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
 
-__all__ = [
-    "LinearProbe",
-    "Probe",
-    "beam_focus",
-    "beam_frequencies",
-    "beam_lines",
-    "beam_samples",
-    "image_depth",
-]
-
 
 def image_depth() -> Any:
     """The setting of how deep an image is."""

@@ -36,8 +36,6 @@ from us_sim.slicing.probe.probe import LinearProbe, Probe
 from us_sim.slicing.strain.main_label import main_labels
 from us_sim.slicing.strain.nodal_strain import corners_by_tissue, nodal_deformation, to_pixels
 
-__all__ = ["AxialStrain"]
-
 
 class AxialStrain:
     """Strain images of a mesh's deformations.

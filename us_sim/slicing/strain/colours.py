@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.slicing.drawing.overlay import ColourScale
 
-__all__ = ["FollowingEnd", "strain_scale"]
-
 _COLOURS = ((215, 48, 39), (253, 174, 97), (48, 48, 48), (116, 173, 209), (69, 117, 180))
 
 _ENDS = tuple(step / power for power in (100, 10, 1) for step in (1, 2, 3, 5))

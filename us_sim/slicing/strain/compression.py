@@ -15,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Compression", "compression"]
-
 
 class Compression(NamedTuple):
     """Of all tissue in a strain image."""

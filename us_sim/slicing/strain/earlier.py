@@ -16,8 +16,6 @@ from typing import Any
 
 from us_sim.slicing.frame import Frame
 
-__all__ = ["Earlier"]
-
 
 class Earlier:
     """The last frames of one probe and one mesh, as far as they follow one another.

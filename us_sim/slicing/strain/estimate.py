@@ -25,8 +25,6 @@ from us_sim.slicing.strain.least_squares import slope
 from us_sim.slicing.strain.settings import Strain
 from us_sim.slicing.strain.tracking import track
 
-__all__ = ["Estimate", "estimate_strain", "require_short_windows"]
-
 _STEEPEST = 0.5
 """Of displacement along a beam: what is found steeper than that is not tissue."""
 

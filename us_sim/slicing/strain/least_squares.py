@@ -19,8 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["slope"]
-
 
 def slope(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float32]:
     """The slope (per sample) at each sample of (samples, lines) values, down the columns.

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from us_sim.volume.volume import Volume
 
-__all__ = ["main_labels"]
-
 _PARTS = 5
 """Of an edge: the points that are looked up lie evenly, 56 in each tetrahedron."""
 

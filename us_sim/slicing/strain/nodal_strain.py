@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.barycentric import adjugate, is_solid
 
-__all__ = ["Corners", "corners_by_tissue", "nodal_deformation", "to_pixels"]
-
 
 class Corners(NamedTuple):
     """The P corners that tetrahedra of one tissue share: a node between two tissues is two."""

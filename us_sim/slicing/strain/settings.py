@@ -17,8 +17,6 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["Strain"]
-
 _LENGTH = Quantity("length", 0.2e-3, 0.05)
 
 

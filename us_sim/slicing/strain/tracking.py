@@ -29,8 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import ProbeError
 from us_sim.kernels import njit
 
-__all__ = ["track"]
-
 _PASSES = 2
 """How often the image is warped and what remains is looked for."""
 _FLAT = 6.0**2

@@ -14,8 +14,6 @@ from us_sim.slicing.strain.axial_strain import AxialStrain
 from us_sim.slicing.strain.tracking import track
 from us_sim.volume.volume import Volume
 
-__all__ = ["warm_up"]
-
 
 @cache
 def warm_up() -> None:

@@ -16,8 +16,6 @@ from ._rclpy_pybind11 import RCLInvalidROSArgsError, UnknownROSArgsError
 from ._remapping import RemapRule, RemapSyntaxError, parse_remap_rule
 from .impl.logging_severity import LoggingSeverity
 
-__all__ = ["Arguments", "parse_arguments"]
-
 _PARAMETER = re.compile(
     r"(?:(?P<node>[A-Za-z_][A-Za-z0-9_]*):(?!=))?(?P<name>[A-Za-z0-9_./~]+?):=(?P<value>.*)", re.S
 )

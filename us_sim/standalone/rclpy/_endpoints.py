@@ -17,8 +17,6 @@ from .logging import get_logger
 from .qos import QoSProfile
 from .serialization import require_message_class
 
-__all__ = ["Connected", "NodeLink", "Receiver", "message_of", "open_endpoint"]
-
 _KINDS: dict[
     str, tuple[Callable[..., Any], str]
 ] = {  # how the participant makes one, and what is said of one that does not fit

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from ._arguments import Arguments
 from .impl.logging_severity import LoggingSeverity
 
-__all__ = ["Record", "add_rosout", "configure", "effective_level", "emit"]
-
 _COLORS = {
     LoggingSeverity.DEBUG: "\033[32m",
     LoggingSeverity.INFO: "\033[0m",

@@ -17,17 +17,6 @@ from .exceptions import (
     InvalidTopicNameException,
 )
 
-__all__ = [
-    "error_in_full_topic_name",
-    "error_in_namespace",
-    "error_in_node_name",
-    "error_in_topic_name",
-    "expand",
-    "require_namespace",
-    "require_node_name",
-    "require_topic_name",
-]
-
 Fault = tuple[str, int] | None
 
 _LONGEST_TOPIC = 247

@@ -26,8 +26,6 @@ from .service import Service
 from .subscription import Subscription
 from .timer import Timer
 
-__all__ = ["NodeEntities"]
-
 
 class NodeEntities(NodeParameters):
     """Publishers, subscriptions, clients, services, timers and guard conditions."""

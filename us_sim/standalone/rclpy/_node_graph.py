@@ -11,8 +11,6 @@ from .duration import Duration, Infinite
 from .qos import QoSProfile
 from .topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 
-__all__ = ["NodeGraph"]
-
 
 class NodeGraph:
     """Names and questions; `Node` says what its own name and context are."""

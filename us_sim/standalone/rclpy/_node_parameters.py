@@ -20,8 +20,6 @@ from .exceptions import (
 from .parameter import PARAMETER_SEPARATOR_STRING, Parameter
 from .publisher import Publisher
 
-__all__ = ["NodeParameters"]
-
 ParameterDescriptor: Any = message_class("rcl_interfaces/msg/ParameterDescriptor")
 ParameterValue: Any = message_class("rcl_interfaces/msg/ParameterValue")
 ParameterMsg: Any = message_class("rcl_interfaces/msg/Parameter")

@@ -12,8 +12,6 @@ import yaml
 from ._names import error_in_namespace, error_in_node_name
 from ._parameter_values import ParameterSyntaxError, value_of_node
 
-__all__ = ["NodeParameter", "parse_parameter_file", "read_parameter_file"]
-
 NodeParameter = tuple[str, str, Any]  # node name or wildcard, parameter name, value
 
 _KEY = "ros__parameters"

@@ -5,8 +5,6 @@ from typing import Any
 
 from .parameter import Parameter
 
-__all__ = ["reason_against"]
-
 
 def reason_against(parameter: Parameter, descriptor: Any, tolerance: float) -> str:
     """Why a value is outside its descriptor's range or between its steps.

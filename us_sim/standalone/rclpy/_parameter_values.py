@@ -12,8 +12,6 @@ from typing import Any
 
 import yaml
 
-__all__ = ["ParameterSyntaxError", "parse_value", "value_of_node"]
-
 _TRUE = {"Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"}
 _FALSE = {"N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"}
 _NOT_FINITE = re.compile(r"[-+]?\.(nan|NaN|NAN|inf|Inf|INF)")

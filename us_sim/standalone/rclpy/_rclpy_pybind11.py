@@ -1,13 +1,5 @@
 """What rclpy's compiled part defines: errors, and things that can be destroyed."""
 
-__all__ = [
-    "Destroyable",
-    "InvalidHandle",
-    "RCLError",
-    "RCLInvalidROSArgsError",
-    "UnknownROSArgsError",
-]
-
 
 class RCLError(RuntimeError):
     """An operation on a node, an endpoint or a context failed."""

@@ -13,18 +13,6 @@ from dataclasses import dataclass
 
 from ._names import expand
 
-__all__ = [
-    "NAMESPACE",
-    "NODE_NAME",
-    "SERVICE",
-    "TOPIC",
-    "RemapRule",
-    "RemapSyntaxError",
-    "parse_remap_rule",
-    "remap",
-    "remap_node",
-]
-
 TOPIC, SERVICE, NODE_NAME, NAMESPACE = 1, 2, 4, 8
 
 _TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"

@@ -12,8 +12,6 @@ from .publisher import Publisher
 from .qos import DurabilityPolicy, QoSProfile
 from .time import Time
 
-__all__ = ["Rosout"]
-
 Log: Any = message_class("rcl_interfaces/msg/Log")
 _QOS = QoSProfile(
     depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10)

@@ -2,8 +2,6 @@
 
 import threading
 
-__all__ = ["RunningCallbacks"]
-
 
 class RunningCallbacks:
     """Counts the callbacks that run, by thread."""

@@ -7,8 +7,6 @@ the wrong moment would wait for itself. Releasing a bare lock never blocks.
 import _thread
 from threading import TIMEOUT_MAX
 
-__all__ = ["WakeUp"]
-
 
 class WakeUp:
     """One thread waits; any thread or signal handler wakes it, now or for its next wait."""

@@ -4,8 +4,6 @@ import weakref
 from threading import Lock
 from typing import Any
 
-__all__ = ["CallbackGroup", "MutuallyExclusiveCallbackGroup", "ReentrantCallbackGroup"]
-
 
 class CallbackGroup:
     """Subscriptions, timers, services, … whose callbacks are scheduled together."""

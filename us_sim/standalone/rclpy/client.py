@@ -15,8 +15,6 @@ from .context import Context
 from .qos import QoSProfile
 from .task import Future
 
-__all__ = ["Client", "wait_until"]
-
 _PAUSE = 0.01  # s, between two looks at whether a service is there
 
 

@@ -2,8 +2,6 @@
 
 from enum import IntEnum
 
-__all__ = ["ClockType"]
-
 
 class ClockType(IntEnum):
     """ROS_TIME follows the topic /clock when the parameter use_sim_time is true."""

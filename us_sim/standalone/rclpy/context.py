@@ -24,8 +24,6 @@ from ._rclpy_pybind11 import RCLError
 from ._wake_up import WakeUp
 from .exceptions import NotInitializedException
 
-__all__ = ["Context", "LocalNode"]
-
 Callback = Callable[[], None]
 
 

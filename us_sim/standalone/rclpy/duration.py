@@ -13,8 +13,6 @@ from typing import Any
 from ..messages import message_class
 from .constants import S_TO_NS
 
-__all__ = ["Duration", "Infinite"]
-
 
 @total_ordering
 class Duration:

@@ -26,13 +26,6 @@ from .node import Node
 from .task import Future
 from .utilities import get_default_context
 
-__all__ = [
-    "Executor",
-    "ExternalShutdownException",
-    "MultiThreadedExecutor",
-    "SingleThreadedExecutor",
-]
-
 
 class ExternalShutdownException(Exception):
     """The context was shut down."""

@@ -8,8 +8,6 @@ from .callback_groups import CallbackGroup
 from .context import Context
 from .utilities import get_default_context
 
-__all__ = ["GuardCondition"]
-
 
 class GuardCondition(Destroyable):
     """Triggered any number of times before the executor looks, it calls back once."""

@@ -29,8 +29,6 @@ from .qos import qos_profile_parameter_events
 from .time_source import TimeSource
 from .utilities import get_default_context
 
-__all__ = ["Node"]
-
 
 class Node(NodeEntities):
     """A participant in the ROS graph."""

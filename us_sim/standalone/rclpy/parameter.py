@@ -15,8 +15,6 @@ from typing import Any
 
 from ..messages import message_class
 
-__all__ = ["PARAMETER_SEPARATOR_STRING", "Parameter"]
-
 PARAMETER_SEPARATOR_STRING = "."
 
 # bool before int, since a bool is an int; scalar and sequence as in ParameterType

@@ -11,8 +11,6 @@ from .parameter import Parameter
 from .qos import QoSProfile, qos_profile_services_default
 from .task import Future
 
-__all__ = ["AsyncParameterClient"]
-
 Callback = Callable[[Future], Any]
 
 

@@ -8,8 +8,6 @@ from .exceptions import ParameterNotDeclaredException, ParameterUninitializedExc
 from .parameter import Parameter
 from .qos import qos_profile_parameters
 
-__all__ = ["ParameterService"]
-
 
 class ParameterService:
     """Offers `<node>/get_parameters` and the five others."""

@@ -9,8 +9,6 @@ from ._rclpy_pybind11 import RCLError
 from .logging import get_logger
 from .qos import QoSProfile
 
-__all__ = ["Publisher"]
-
 
 class Publisher(Connected):
     """Sends messages of one type to one topic."""

@@ -15,8 +15,6 @@ from .exceptions import ParameterAlreadyDeclaredException
 from .parameter import Parameter
 from .qos import QoSPolicyEnum, QoSPolicyKind, QoSProfile
 
-__all__ = ["InvalidQosOverridesError", "QoSOverridingOptions", "overridden"]
-
 
 class InvalidQosOverridesError(Exception):
     """The callback of the options rejects the profile that the overrides lead to."""

@@ -5,8 +5,6 @@ from typing import Any
 from ..messages import deserialize, serialize
 from .exceptions import NoTypeSupportImportedException
 
-__all__ = ["deserialize_message", "require_message_class", "serialize_message"]
-
 
 def serialize_message(message: Any) -> bytes:
     """The CDR bytes of a message, with their four-byte header."""

@@ -12,8 +12,6 @@ from .callback_groups import CallbackGroup
 from .logging import get_logger
 from .qos import QoSProfile
 
-__all__ = ["Service"]
-
 
 class Service(Receiver):
     """Calls back with each request, and answers with what the callback returns."""

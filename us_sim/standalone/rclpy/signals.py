@@ -11,13 +11,6 @@ from enum import Enum
 from types import FrameType
 from typing import Any
 
-__all__ = [
-    "SignalHandlerOptions",
-    "get_current_signal_handlers_options",
-    "install_signal_handlers",
-    "uninstall_signal_handlers",
-]
-
 
 class SignalHandlerOptions(Enum):
     """Which signals shut contexts down."""

@@ -10,8 +10,6 @@ from ._endpoints import NodeLink, Receiver, message_of, open_endpoint
 from .callback_groups import CallbackGroup
 from .qos import QoSProfile
 
-__all__ = ["Subscription"]
-
 
 class Subscription(Receiver):
     """Calls back with each message that is received on one topic."""

@@ -12,8 +12,6 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Future"]
-
 
 class Future:
     """A result, an exception, or nothing yet."""

@@ -16,8 +16,6 @@ from .clock_type import ClockType
 from .constants import S_TO_NS
 from .duration import Duration
 
-__all__ = ["Time"]
-
 
 @total_ordering
 class Time:

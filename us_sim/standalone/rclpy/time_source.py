@@ -9,8 +9,6 @@ from .parameter import Parameter
 from .qos import QoSProfile, ReliabilityPolicy
 from .time import Time
 
-__all__ = ["TimeSource"]
-
 _PARAMETER = "use_sim_time"
 
 

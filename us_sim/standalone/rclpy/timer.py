@@ -10,8 +10,6 @@ from .clock import Clock
 from .context import Context
 from .utilities import get_default_context
 
-__all__ = ["Timer"]
-
 
 class Timer(Destroyable):
     """Calls back each period. Periods that were missed are skipped, not caught up with."""

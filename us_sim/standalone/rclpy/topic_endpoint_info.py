@@ -5,8 +5,6 @@ from enum import IntEnum
 
 from .qos import QoSProfile
 
-__all__ = ["TopicEndpointInfo", "TopicEndpointTypeEnum"]
-
 
 class TopicEndpointTypeEnum(IntEnum):
     """Whether an endpoint writes or reads."""

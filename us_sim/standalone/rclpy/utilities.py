@@ -7,15 +7,6 @@ from collections.abc import Sequence
 from ._arguments import parse_arguments
 from .context import Context
 
-__all__ = [
-    "get_default_context",
-    "get_rmw_implementation_identifier",
-    "ok",
-    "remove_ros_args",
-    "shutdown",
-    "try_shutdown",
-]
-
 _default_context: Context | None = None
 _lock = threading.RLock()
 

@@ -21,8 +21,6 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out
 
-__all__ = ["ActiveSet"]
-
 _CLEARANCE = 1e-3
 """A touched node is let go at once when the probe is this far from it and from its rest position,
 m. Until the force changed sign, a probe that jumped away would pull the node along."""

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from us_sim.kernels import njit
 
-__all__ = ["pivot", "solve_active", "unilateral"]
-
 _PATIENCE = 5
 """Block pivots that may fail to improve before pivots are made one at a time."""
 

@@ -31,8 +31,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import pivot, solve_active
 from us_sim.tissue.contact.penetration import only_forward, pushing_gap
 
-__all__ = ["CLOSED", "SKIRT", "CompliantContact", "gaps", "gather", "yielded"]
-
 CLOSED = 1e-9
 """A gap up to this is closed, and so is one of a node this deep in the probe, m."""
 

@@ -34,8 +34,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
-__all__ = ["FlaredProbe"]
-
 _LEAN = math.radians(60)
 """Angle of the leaning flanks to the face."""
 

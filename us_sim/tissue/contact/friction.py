@@ -35,8 +35,6 @@ from us_sim.tissue.contact.compliant_contact import (
     yielded,
 )
 
-__all__ = ["FrictionalContact"]
-
 _ROUNDS = 30
 _SWEEPS = 100
 

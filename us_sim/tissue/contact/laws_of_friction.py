@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from us_sim.settings.quantity import Quantity
 
-__all__ = ["COEFFICIENT", "CONTACTS"]
-
 CONTACTS = ("frictionless", "coulomb", "sticking")
 
 COEFFICIENT = Quantity("number", 1e-9, 10.0)

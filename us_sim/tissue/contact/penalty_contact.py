@@ -37,8 +37,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.tissue.contact.flared_probe import FlaredProbe
 
-__all__ = ["PenaltyContact"]
-
 _LEAP = 0.02
 """Way in one move, m, beyond which a probe has not swept through tissue: it was lifted and came
 down anew."""

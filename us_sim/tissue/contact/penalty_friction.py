@@ -42,8 +42,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 
-__all__ = ["PenaltyFriction"]
-
 
 class PenaltyFriction(PenaltyContact):
     """Penalty contact with Coulomb's friction, or with a probe to which touched points stick.

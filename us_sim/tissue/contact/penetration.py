@@ -23,14 +23,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
-__all__ = [
-    "GAP_TOLERANCE",
-    "only_forward",
-    "push_out",
-    "pushing_gap",
-    "wrench_on_probe",
-]
-
 GAP_TOLERANCE = 1e-5
 """A node this close to the probe's surface lies on it, m."""
 

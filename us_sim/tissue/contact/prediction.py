@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import unilateral
 
-__all__ = ["predict_forces"]
-
 
 def predict_forces(
     compliance: NDArray[np.float64],

@@ -27,8 +27,6 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.penetration import push_out
 
-__all__ = ["compliance_between", "contact_stiffness"]
-
 _STEP = 1e-7  # m, of the differences by which gaps and normals are differentiated
 
 

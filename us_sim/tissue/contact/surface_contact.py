@@ -21,8 +21,6 @@ from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
 from us_sim.tissue.elasticity.wall import withstood_force
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["surface_contact"]
-
 _FIRMNESS = 30.0
 """Stiffness of the springs of a node, over the shear stiffness of the tissue there. The softer, the
 deeper the probe sinks in; the firmer, the worse conditioned the equations, and the more a surface

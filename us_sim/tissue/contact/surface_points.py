@@ -28,8 +28,6 @@ from us_sim.geometry.triangle_parts import TriangleParts
 from us_sim.kernels import njit
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["SurfacePoints", "add_springs", "add_turns"]
-
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
 
 _SHARE = 0.5

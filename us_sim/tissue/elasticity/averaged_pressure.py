@@ -33,8 +33,6 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["AveragedPressure", "averaged_pressure"]
-
 
 @dataclass(frozen=True, eq=False)
 class AveragedPressure:

@@ -31,25 +31,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.lanes import LANES, put_six, three
 from us_sim.tissue.elasticity.neo_hookean_point import HALF, INLINED, LOOP
 
-__all__ = [
-    "FIELD",
-    "OUT",
-    "PER_WIDTH",
-    "PRESSURES",
-    "ROWS",
-    "SCALAR",
-    "SUMS",
-    "SYMMETRIC",
-    "add_field",
-    "add_out",
-    "copy_field",
-    "copy_in",
-    "gradients",
-    "put_forces",
-    "put_sum",
-    "put_volumes",
-]
-
 PER_WIDTH = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
 """Row of the constants: one over the width along x (negative where mirrored), then y and z."""
 

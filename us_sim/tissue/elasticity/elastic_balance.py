@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.elasticity.volume_term import VolumeTerm
 
-__all__ = ["ElasticBalance"]
-
 
 class ElasticBalance:
     """Residual of each frame of a run.

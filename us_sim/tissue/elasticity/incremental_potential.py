@@ -36,8 +36,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors, push_corners
 
-__all__ = ["IncrementalPotential"]
-
 
 class IncrementalPotential:
     """Value, forces and curvature of the function above.

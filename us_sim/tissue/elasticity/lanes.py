@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.neo_hookean_point import INLINED
 
-__all__ = ["LANES", "five", "in_lanes", "nine", "put_nine", "put_six", "three"]
-
 LANES = 64
 """Numbers in a row: a few vectors of the widest kind, so that all rows stay in the L1 cache."""
 

@@ -24,15 +24,6 @@ from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = [
-    "free_stiffness",
-    "lame_stiffness",
-    "nodal_shear_stiffness",
-    "require_held",
-    "shape_gradients",
-    "stiffness",
-]
-
 
 def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
     """(M, 4, 3) 1/m, gradients of the four linear shape functions of each tetrahedron."""

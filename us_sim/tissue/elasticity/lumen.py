@@ -46,15 +46,6 @@ from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.elasticity.wall import wall_modulus
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = [
-    "CONSTANTS",
-    "NeoHookeanConstants",
-    "emptying",
-    "lumen_table",
-    "neo_hookean_constants",
-    "require_solid",
-]
-
 CONSTANTS = 6
 """Numbers that the law of a lumen needs, see `lumen_table`."""
 

@@ -24,8 +24,6 @@ from us_sim.tissue.elasticity.lanes import LANES, in_lanes
 from us_sim.tissue.elasticity.lumen import emptying
 from us_sim.tissue.elasticity.neo_hookean_point import INLINED, volume_change
 
-__all__ = ["add_lumens", "emptied", "in_groups"]
-
 
 def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
     """(C,) which row of the other array each group of `LANES` lines has, or -1 if it has no lumen;

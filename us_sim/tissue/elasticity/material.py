@@ -13,8 +13,6 @@ from us_sim.errors import MaterialError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["DENSITY", "LUMEN_PRESSURE", "POISSON_RATIO", "YOUNG_MODULUS", "Material"]
-
 YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
 """Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""

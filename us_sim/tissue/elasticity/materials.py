@@ -27,14 +27,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = [
-    "LabelFractions",
-    "TissueMaterials",
-    "average_over_labels",
-    "label_fractions",
-    "uniform_material",
-]
-
 _SAMPLES = 1024
 """Samples of each tetrahedron: enough to measure a volume fraction to about one percent."""
 

@@ -39,8 +39,6 @@ from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["NeoHookean"]
-
 
 class NeoHookean:
     """Energy, forces and tangent of a mesh whose fields are (3, N) arrays of one dtype.

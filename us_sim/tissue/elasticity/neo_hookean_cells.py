@@ -63,8 +63,6 @@ from us_sim.tissue.elasticity.neo_hookean_point import (
 from us_sim.tissue.elasticity.nodal_sums import Kernels, NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["CellSums"]
-
 _SHEAR, _ELEMENT, _NODAL = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13
 _WALL, _CONSTANTS = PER_WIDTH + 18, PER_WIDTH + 23
 """First rows of the constants behind the widths: V mu, V element, V nodal / 4 and V wall of each of

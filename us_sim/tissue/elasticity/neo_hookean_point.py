@@ -37,25 +37,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = [
-    "HALF",
-    "INLINED",
-    "LOOP",
-    "ONE",
-    "block",
-    "bulk_slope",
-    "cofactor_change",
-    "cofactor_slope",
-    "crowding",
-    "crowding_below",
-    "energy_density",
-    "inner",
-    "stress",
-    "stress_rise",
-    "volume_change",
-    "volume_slope",
-]
-
 LOOP: dict[str, Any] = {
     "cache": True,
     "nogil": True,

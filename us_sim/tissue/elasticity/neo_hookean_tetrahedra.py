@@ -56,8 +56,6 @@ from us_sim.tissue.elasticity.tetrahedron_lanes import (
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["TetrahedraSums"]
-
 _ROW = np.int64(LANES)  # no literal, for which numba would compile `emptied` again
 
 _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (

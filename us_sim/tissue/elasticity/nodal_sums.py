@@ -17,8 +17,6 @@ from typing import Any, ClassVar, NamedTuple
 
 from numpy.typing import NDArray
 
-__all__ = ["Kernels", "NodalSums"]
-
 _Kernel = Callable[..., Any]
 
 

@@ -39,8 +39,6 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 
-__all__ = ["Overstress", "PronyBranch"]
-
 
 @dataclass(frozen=True)
 class PronyBranch:

@@ -25,8 +25,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["SpringArrays", "SpringNetwork", "fitted_springs", "spring_forces", "springs_of"]
-
 _CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 """The six edges of a tetrahedron."""
 

@@ -29,8 +29,6 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from us_sim.errors import SolverError
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["highest_frequency", "node_stiffness", "stabilised", "step_limit"]
-
 _MARGIN = 1.05
 """Safety factor of masses and sub-steps on Gershgorin's bound of stability."""
 

@@ -22,8 +22,6 @@ from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.volume_term import area_vectors
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["Tangling", "count_inverted", "watched_tetrahedra"]
-
 _WATCHED, _LAYERS = 50_000, 2
 """Tetrahedra up to which all are watched, which takes less than a millisecond; and how many layers
 under the surface are watched otherwise."""

@@ -20,20 +20,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.lanes import LANES, nine, three
 from us_sim.tissue.elasticity.neo_hookean_point import INLINED
 
-__all__ = [
-    "FIELD",
-    "OUT",
-    "ROWS",
-    "SHAPE",
-    "SUMS",
-    "gather",
-    "gather_scalar",
-    "gradient",
-    "put_forces",
-    "scatter",
-    "scatter_scalar",
-]
-
 SHAPE = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
 """First row of the constants' gradients of the shape functions of nodes 1, 2 and 3."""
 

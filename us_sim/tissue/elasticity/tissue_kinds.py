@@ -28,8 +28,6 @@ from collections.abc import Mapping
 
 from us_sim.tissue.elasticity.material import Material
 
-__all__ = ["KINDS", "LAYERS", "kind_of"]
-
 _BLOOD = 1060.0  # kg/m3
 _VENOUS = 1e3  # Pa, 8 mmHg
 

@@ -45,15 +45,6 @@ _YIELD = 1.5
 _ROUNDING = 1e-9
 """Fraction of the shear modulus below which a nodal part is rounding."""
 
-__all__ = [
-    "VolumeArrays",
-    "VolumeTerm",
-    "add_volume_forces",
-    "area_vectors",
-    "push_corners",
-    "volume_term",
-]
-
 
 class VolumeArrays(NamedTuple):
     """The arrays of a `VolumeTerm` that kernels take, of M tetrahedra and N nodes."""

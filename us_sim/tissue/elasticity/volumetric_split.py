@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.elasticity.materials import TissueMaterials
 
-__all__ = ["VolumetricSplit", "volumetric_split"]
-
 _ELEMENT_LIMIT = 5.0
 """lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock."""
 

@@ -21,8 +21,6 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["wall_modulus", "withstood_force"]
-
 _FIRMNESS = 5.0
 
 

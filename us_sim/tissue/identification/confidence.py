@@ -23,8 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-__all__ = ["BLOCKS", "blocks", "covariance", "jackknife", "quantile"]
-
 BLOCKS = 8
 """Parts of a press, one of which is left out at a time. With fewer the intervals are wider, with
 more they miss correlations that last: with 8 they hold up to about 0.8 from pose to pose."""

@@ -31,8 +31,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SolverError, StiffnessError
 
-__all__ = ["FARTHEST", "Fitted", "basis", "fit", "without_nuisance"]
-
 FARTHEST = 100.0
 """Factor by which a modulus may differ from the one that the fit begins with."""
 

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from us_sim.tissue.identification.confidence import covariance, quantile
 from us_sim.tissue.identification.fit import basis, without_nuisance
 
-__all__ = ["Verdict", "judge"]
-
 _SINGULAR = 1e-9
 """Eigenvalue of the slopes' products over the largest, below which moduli are one."""
 

@@ -33,8 +33,6 @@ from us_sim.tissue.identification.press_record import PressRecord
 from us_sim.tissue.mesh.point_location import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["Landmarks", "read_landmarks"]
-
 _COLUMNS = ("name", "time", "x", "y", "z")
 _TIME, _LENGTH = Quantity("time", -1e6, 1e6), Quantity("length", -10.0, 10.0)
 _OUTSIDE = 1e-3

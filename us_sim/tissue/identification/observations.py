@@ -16,8 +16,6 @@ from us_sim.tissue.identification.pose_choice import ChosenPoses
 from us_sim.tissue.identification.press_model import Felt
 from us_sim.tissue.identification.press_record import CHANNELS, PressRecord
 
-__all__ = ["GROUPS", "Observations", "Seen", "observations_of"]
-
 GROUPS = ("force", "torque", "landmark")
 """Kinds of measurements, each with a noise of its own: N, N m, m."""
 

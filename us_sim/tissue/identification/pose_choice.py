@@ -22,8 +22,6 @@ from us_sim.errors import StiffnessError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.identification.press_record import CHANNELS, PressRecord
 
-__all__ = ["ChosenPoses", "choose_poses", "spread"]
-
 _PRESSED, _FREE = -2e-4, 5e-4
 """m, clearance below which a probe presses, and above which it touches nothing; a pose between says
 little and costs as much."""

@@ -38,8 +38,6 @@ from us_sim.tissue.identification.pressed_tissue import PressedTissue, slopes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 
-__all__ = ["Felt", "MaterialsFor", "PressModel", "SeenPoints"]
-
 MaterialsFor = Callable[[Mapping[str, float]], TissueMaterials]
 """The constants of all tetrahedra, from Young's moduli (Pa) by structure."""
 

@@ -23,18 +23,6 @@ from numpy.typing import NDArray
 from us_sim.errors import StiffnessError
 from us_sim.geometry.pose import Pose
 
-__all__ = [
-    "CHANNELS",
-    "Poses",
-    "PressRecord",
-    "Wrenches",
-    "in_order",
-    "nearest_stamp",
-    "paired",
-    "stamped_alike",
-    "without_wrench",
-]
-
 CHANNELS = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
 _FEWEST = 12

@@ -50,8 +50,6 @@ from us_sim.tissue.linear_algebra.two_level import (
 )
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["PressedTissue", "Slopes", "slopes"]
-
 _LOCAL_WEIGHT = 12.0
 """As in `us_sim.tissue.solvers.newton`."""
 

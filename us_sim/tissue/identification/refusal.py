@@ -11,8 +11,6 @@ from us_sim.tissue.identification.identifiability import Verdict
 from us_sim.tissue.identification.observations import Observations
 from us_sim.tissue.identification.settings import StiffnessSettings
 
-__all__ = ["refusal"]
-
 _UNITS = (("force", 1.0, "N"), ("torque", 1.0, "N m"), ("landmarks", 1e3, "mm"))
 
 

@@ -13,8 +13,6 @@ from us_sim.errors import StiffnessError
 from us_sim.settings.spelling import counted
 from us_sim.tissue.identification.stiffness import StiffnessFit
 
-__all__ = ["table", "write_moduli"]
-
 
 def table(found: StiffnessFit) -> str:
     """Structures with their moduli, intervals and part in the force; then what is left over."""

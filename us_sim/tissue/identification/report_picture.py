@@ -15,8 +15,6 @@ from us_sim.tissue.identification.observations import GROUPS
 from us_sim.tissue.identification.press_record import CHANNELS
 from us_sim.tissue.identification.stiffness import StiffnessFit
 
-__all__ = ["draw_fit"]
-
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _SCALES = {"force": (1.0, "N"), "torque": (1e3, "mN m"), "landmark": (1e3, "mm")}
 

@@ -14,8 +14,6 @@ from us_sim.errors import StiffnessError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["StiffnessSettings"]
-
 
 @dataclass(frozen=True)
 class StiffnessSettings(Settings):

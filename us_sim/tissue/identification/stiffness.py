@@ -48,8 +48,6 @@ from us_sim.tissue.identification.refusal import refusal
 from us_sim.tissue.identification.settings import StiffnessSettings
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["Interval", "StiffnessFit", "Tissue", "fit_stiffness"]
-
 Progress = Callable[[float, str], None]
 
 

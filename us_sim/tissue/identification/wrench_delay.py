@@ -25,8 +25,6 @@ from us_sim.errors import StiffnessError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.identification.press_record import Poses, Wrenches, in_order, nearest_stamp
 
-__all__ = ["find_delay", "narrowest_loop"]
-
 _STEP = 0.01
 """s, between delays that are tried; a parabola finds the least between them."""
 

@@ -32,8 +32,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["CoarseGrid"]
-
 _MOST_NODES = 400
 """Most nodes of a grid around the bounding box: a dense product of 1,200 unknowns takes 0.2 ms."""
 

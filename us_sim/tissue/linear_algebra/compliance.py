@@ -35,8 +35,6 @@ from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["SurfaceCompliance", "surface_compliance"]
-
 _VERSION = 4
 """Part of the cache's key: raise it when the bytes change."""
 

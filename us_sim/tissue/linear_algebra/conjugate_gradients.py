@@ -24,8 +24,6 @@ import numpy as np
 
 from us_sim.kernels import njit
 
-__all__ = ["conjugate_gradients", "product_rows"]
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def product_rows(start, columns, blocks, vector, rows):

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from us_sim.kernels import njit
 
-__all__ = ["DenseFields"]
-
 _CHUNK = 64  # nodes for whose forces the fields are made at once
 
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]

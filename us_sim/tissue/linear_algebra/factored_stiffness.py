@@ -33,8 +33,6 @@ from us_sim.tissue.elasticity.lumen import emptying, neo_hookean_constants
 from us_sim.tissue.elasticity.neo_hookean_point import crowding
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["FactoredStiffness"]
-
 
 class FactoredStiffness:
     """Solves with a stiffness near the tangent at a displacement, springs included.

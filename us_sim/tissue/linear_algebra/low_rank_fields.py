@@ -34,8 +34,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
 
-__all__ = ["LowRankFields"]
-
 _BLOCK = 512  # nodes at most of a block
 
 _CHUNK = 64  # nodes at most for whose forces the fields are made at once

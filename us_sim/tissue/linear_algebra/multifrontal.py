@@ -45,8 +45,6 @@ from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure
 from us_sim.tissue.linear_algebra.nested_dissection import Part, nested_dissection
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["Eliminated", "eliminate"]
-
 _LARGE = 100_000
 """Numbers in a matrix from which on it may be kept in a file."""
 

@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-__all__ = ["Part", "nested_dissection"]
-
 
 @dataclass(eq=False)
 class Part:

@@ -29,8 +29,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, dia_array
 from scipy.sparse.linalg import splu
 
-__all__ = ["ScalarPreconditioner"]
-
 _BLOCK = 64  # right-hand sides at a time
 
 

@@ -32,16 +32,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 
-__all__ = [
-    "Preconditioner",
-    "Solved",
-    "TwoLevel",
-    "add_blocks",
-    "clear_nodes",
-    "conjugate_gradients",
-    "largest_local_eigenvalue",
-]
-
 Product = Callable[[NDArray[np.floating], NDArray[np.floating]], Any]
 
 _POWER = 20

@@ -22,8 +22,6 @@ from us_sim.geometry.connected_parts import connected_parts
 from us_sim.geometry.mesh_faces import FACES, MOST_NODES, face_order
 from us_sim.settings.spelling import counted
 
-__all__ = ["EDGES", "check_arrays", "check_mesh", "signed_volumes"]
-
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # the six edges of a tetrahedron
 
 _FARTHEST = 1e6

@@ -24,8 +24,6 @@ from us_sim.tissue.mesh import wild_mesher
 from us_sim.tissue.mesh.repair import repair
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["EdgeLengths", "conforming_mesh", "require_mesher"]
-
 _SECONDS = 300.0
 """After which fTetWild is given up; meshes of some thousand nodes take it seconds."""
 

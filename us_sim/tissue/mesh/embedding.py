@@ -24,8 +24,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.mesh.point_location import Location, locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["EmbeddedSurface"]
-
 _REACH = 0.5
 """Distance that a vertex may lie outside the mesh, over the longest edge of the nearest
 tetrahedron, whose deformation carries it."""

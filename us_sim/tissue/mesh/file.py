@@ -28,8 +28,6 @@ from us_sim.tissue.mesh.gmsh_one import parse_gmsh_one
 from us_sim.tissue.mesh.repair import repair
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["read_mesh"]
-
 _NO_MESH = (
     "this is not a tetrahedral mesh that can be read: give a Gmsh, VTK or VTU file, whole and of "
     "an unstructured grid"

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 
-__all__ = ["Wanted", "fitted_planes", "wanted_under_probe"]
-
 _GROWTH = 0.35
 """The most that the wanted spacing changes over a distance, per distance."""
 

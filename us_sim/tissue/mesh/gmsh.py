@@ -32,8 +32,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 
-__all__ = ["VERSIONS", "parse_gmsh", "row_numbers"]
-
 VERSIONS = ("2", "2.1", "2.2", "4.1")
 
 _NODES_OF = {1: 2, 2: 3, 8: 3, 9: 6, 15: 1, 4: 4, 11: 10}

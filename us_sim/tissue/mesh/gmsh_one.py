@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.tissue.mesh.gmsh import row_numbers
 
-__all__ = ["parse_gmsh_one"]
-
 _TETRAHEDRON = 4
 _ON_ITS_SURFACE = (1, 2, 15)
 

@@ -13,8 +13,6 @@ from us_sim.geometry.normals import vertex_normals
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["with_inside_volume"]
-
 _STEPS = 3
 _HALVINGS = 4
 _LEFT = 0.2

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.mesh.fitted_planes import Wanted
 
-__all__ = ["wanted_by_labels"]
-
 _ACROSS = 3.0
 """Cells across a structure: the least with which its wall and its middle move differently."""
 

@@ -16,8 +16,6 @@ from us_sim.errors import MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["FACES", "face_nodes", "facing_nodes", "held_remark", "nodes_in_label"]
-
 FACES = {
     "top": ((2, False),),
     "bottom": ((2, True),),

@@ -24,8 +24,6 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["Location", "locate"]
-
 _ROUNDING = 1e-9
 """A barycentric coordinate this far below zero is rounding."""
 

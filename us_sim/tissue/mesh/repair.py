@@ -21,8 +21,6 @@ from us_sim.errors import MeshError
 from us_sim.tissue.mesh.check import check_arrays, signed_volumes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["repair"]
-
 
 def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tuple[str, ...]]:
     """A mesh from nodes and tetrahedra that may be in disorder.

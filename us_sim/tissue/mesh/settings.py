@@ -12,8 +12,6 @@ from us_sim.geometry.placement import PLACE, Placement
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["KINDS", "MeshSettings"]
-
 KINDS = ("grid", "conforming")
 """Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures."""
 

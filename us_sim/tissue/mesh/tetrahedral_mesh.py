@@ -23,8 +23,6 @@ from us_sim.geometry.connected_parts import connected_parts
 from us_sim.geometry.mesh_faces import boundary_faces, boundary_triangles
 from us_sim.tissue.mesh.check import EDGES, check_mesh, signed_volumes
 
-__all__ = ["TetrahedralMesh", "box_mesh", "uniform_planes"]
-
 _FIVE = np.array(
     [
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],

@@ -12,8 +12,6 @@ import types
 
 import numpy as np
 
-__all__ = ["main"]
-
 _ROUNDS = 10
 """Of optimization; further ones hardly better a mesh."""
 

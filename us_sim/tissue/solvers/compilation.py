@@ -30,8 +30,6 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.rehearsal import rehearsal_model
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["compiled_solver"]
-
 Progress = Callable[[float, str], None]
 
 _NICENESS = 5

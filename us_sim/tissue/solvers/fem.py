@@ -41,8 +41,6 @@ from us_sim.tissue.linear_algebra.dense_fields import DenseFields
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["Fem", "FemSettings"]
-
 _ROUNDING = 1e-8
 """Rounding error of full fields, over the force, above which it is measured in every frame: where
 moduli are far apart, that of some pushes is a thousand times that of most."""

@@ -41,8 +41,6 @@ from us_sim.tissue.solvers.solver import (
     same_pose,
 )
 
-__all__ = ["FemCg", "FemCgSettings"]
-
 _REFINEMENT = 1e-2
 """Fraction to which the residual must fall before touched nodes that slid a little are
 corrected."""

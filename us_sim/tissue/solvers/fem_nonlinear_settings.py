@@ -14,8 +14,6 @@ from us_sim.settings.setting import setting
 from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
 from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings
 
-__all__ = ["FemNonlinearSettings"]
-
 
 @dataclass(frozen=True)
 class FemNonlinearSettings(SolverSettings):

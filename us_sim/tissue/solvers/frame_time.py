@@ -11,8 +11,6 @@ import os
 import time
 from collections.abc import Callable
 
-__all__ = ["frame_limit", "shortest", "usable_cores"]
-
 _PERIOD = 1 / 60
 """s, between the poses of the trackers that are meant to be kept up with."""
 

@@ -31,8 +31,6 @@ from us_sim.tissue.solvers.solver import COUNT, TissueSolver
 from us_sim.tissue.solvers.spring_tissue import SpringSettings, spring_tissue
 from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMotion, advance_frame
 
-__all__ = ["Msds", "MsdsSettings"]
-
 _REST_TIME = 0.2
 """Shortest time for which motion is watched before the tissue counts as settled, s."""
 

@@ -52,8 +52,6 @@ from us_sim.tissue.solvers.spring_tissue import (
     spring_volume,
 )
 
-__all__ = ["MsdsImplicit", "MsdsImplicitSettings"]
-
 _REST_TIME = 0.2
 """Shortest time for which motion is watched before the tissue counts as settled, s."""
 

@@ -43,8 +43,6 @@ from us_sim.tissue.linear_algebra.two_level import (
 )
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["Newton"]
-
 _SINGLE_CONTRAST = 1e4
 """Ratio of Young's moduli beyond which rounding in single precision hides the softer forces."""
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from us_sim.errors import UsSimError
 from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
 
-__all__ = ["Failed", "Preparation"]
-
 _logger = logging.getLogger(__name__)
 
 

@@ -14,8 +14,6 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
 
-__all__ = ["rehearsal_model"]
-
 
 def rehearsal_model(model: TissueModel) -> TissueModel:
     """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or

@@ -31,8 +31,6 @@ from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.rehearsal import rehearsal_model
 
-__all__ = ["COUNT", "TOLERANCE", "SolverSettings", "TissueSolver", "create_solver", "same_pose"]
-
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
 TOLERANCE = Quantity("number", 1e-15, 1.0)

@@ -12,8 +12,6 @@ from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings
 
-__all__ = ["SpringSettings", "spring_stiffness", "spring_tissue", "spring_volume"]
-
 
 def spring_stiffness(default: str) -> Any:
     """The setting of the springs' stiffness."""

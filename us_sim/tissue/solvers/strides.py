@@ -15,8 +15,6 @@ import math
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
 
-__all__ = ["strides"]
-
 _STRIDE = 3e-3
 """Way of a probe in tissue that is gone at once, m."""
 

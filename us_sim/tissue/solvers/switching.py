@@ -30,8 +30,6 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.compilation import compiled_solver
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
-__all__ = ["Difference", "Plan", "Prepared", "SwitchableTissue", "difference"]
-
 
 @dataclass(frozen=True)
 class Difference:

@@ -34,8 +34,6 @@ from us_sim.tissue.contact.penetration import pushing_gap
 from us_sim.tissue.elasticity.springs import spring_forces
 from us_sim.tissue.elasticity.volume_term import add_volume_forces
 
-__all__ = ["Contact", "Particles", "ProbeMotion", "advance_frame"]
-
 
 class Particles(NamedTuple):
     """Masses, where they are and how fast they move; kernels write on all but the masses."""

@@ -25,8 +25,6 @@ from us_sim.errors import CalibrationError, TrackingError
 from us_sim.tracking.calibration.settings import BOARD_LENGTH, BOARDS
 from us_sim.tracking.camera.markers import dictionary
 
-__all__ = ["Board", "BoardView"]
-
 _SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
 _Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
 """(N, 3) m on the board and (N, 2) pixels, as of a `BoardView`."""

@@ -31,8 +31,6 @@ from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.board import BoardView
 from us_sim.tracking.camera.model import CameraModel
 
-__all__ = ["INTRINSICS", "CameraCalibration", "calibrate_camera"]
-
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 _FEWEST_VIEWS = 3

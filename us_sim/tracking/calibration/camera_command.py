@@ -22,8 +22,6 @@ from us_sim.tracking.calibration.settings import CameraSettings, Progress
 from us_sim.tracking.camera.info import write_camera_info
 from us_sim.tracking.camera.settings import columns_and_rows
 
-__all__ = ["calibrate_photos", "find_photos"]
-
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 
 

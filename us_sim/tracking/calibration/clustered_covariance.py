@@ -25,8 +25,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ENOUGH_FEATURES", "cluster_numbers", "clustered_covariance"]
-
 ENOUGH_FEATURES = 6
 """Fewer features are too few clusters: each is divided into parts of the recording."""
 

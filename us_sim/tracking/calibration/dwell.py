@@ -21,8 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Dwell", "find_dwells"]
-
 _WINDOW = 0.2  # s, over which the tip is averaged
 
 

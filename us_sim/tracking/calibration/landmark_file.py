@@ -25,8 +25,6 @@ from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.text_file import read_bytes, read_text
 
-__all__ = ["read_landmarks", "read_table", "read_wires"]
-
 _MILLIMETRES = 1e-3  # Plus' unit
 
 

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 
-__all__ = ["LandmarkRegistration", "register_landmarks"]
-
 Array = NDArray[np.float64]
 
 _FLATTEST = 0.02  # width of the landmarks' spread over its length, below which they are in line

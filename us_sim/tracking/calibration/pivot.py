@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 
-__all__ = ["PivotCalibration", "calibrate_pivot"]
-
 Array = NDArray[np.float64]
 
 _FEWEST = 10  # poses

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 
-__all__ = ["PositionSignal", "line_row", "signal_of_images", "signal_of_positions"]
-
 _FEWEST_COLUMNS = 20  # that show the line
 _ENOUGH_COLUMNS = 150
 _FAINTEST = 0.3  # of the brightest columns' brightness, that still shows the line

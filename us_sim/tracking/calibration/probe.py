@@ -36,8 +36,6 @@ from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.clustered_covariance import cluster_numbers, clustered_covariance
 
-__all__ = ["PixelSighting", "ProbeCalibration", "calibrate_probe"]
-
 _FEWEST = 8
 _LARGEST_GAIN = 3.0  # error at the image's edge over the error of one sighting
 _TOO_FAR = 4.0  # deviations from the others, beyond which a sighting is wrong

@@ -21,8 +21,6 @@ from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
 from us_sim.tracking.calibration.settings import ProbeSettings, Progress
 from us_sim.tracking.calibration.transform_file import read_transform, write_transform
 
-__all__ = ["calibrate_image"]
-
 _PIXEL = {"column": "number", "row": "number"}
 _POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(("qx", "qy", "qz", "qw"), "number")
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated

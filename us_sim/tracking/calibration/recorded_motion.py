@@ -35,8 +35,6 @@ from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
 from us_sim.volume.sequences.transform_name import split_transform_name
 
-__all__ = ["read_motion", "read_signal", "seconds_of"]
-
 
 def read_motion(path: Path, name: str | None) -> ProbePath:
     """The valid poses of a body.

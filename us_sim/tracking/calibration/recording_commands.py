@@ -30,8 +30,6 @@ from us_sim.tracking.calibration.transform_file import (
     write_transform,
 )
 
-__all__ = ["calibrate_clock", "calibrate_registration", "calibrate_tip"]
-
 _TABLES = {".csv", ".txt", ".xml"}
 
 

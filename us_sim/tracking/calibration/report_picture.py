@@ -16,8 +16,6 @@ from us_sim.tracking.calibration.camera import CameraCalibration
 from us_sim.tracking.calibration.position_signal import PositionSignal
 from us_sim.tracking.calibration.time_offset import TimeOffset
 
-__all__ = ["draw_coverage", "draw_offset"]
-
 _CELLS = (16, 12)  # of the coverage's map
 
 

@@ -19,17 +19,6 @@ from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""
 
-__all__ = [
-    "BOARDS",
-    "BOARD_LENGTH",
-    "CameraSettings",
-    "ClockSettings",
-    "LandmarkSettings",
-    "PivotSettings",
-    "ProbeSettings",
-    "Progress",
-]
-
 BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
 """The kinds of boards for calibrating a camera."""
 BOARD_LENGTH = Quantity("length", 0.0, 10.0)

@@ -28,8 +28,6 @@ from scipy.optimize import minimize_scalar
 from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.position_signal import PositionSignal
 
-__all__ = ["TimeOffset", "find_time_offset"]
-
 _LARGEST_STEP = 0.005  # s, between tried offsets
 _FEWEST_SAMPLES = 30
 _SHORTEST = 3.0  # s, of both recordings together

@@ -37,14 +37,6 @@ from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
 from us_sim.volume.sequences.transform_name import split_transform_name
 
-__all__ = [
-    "TransformFile",
-    "read_transform",
-    "read_transform_file",
-    "write_calibration",
-    "write_transform",
-]
-
 _KEYS = ("from", "to", "position", "orientation")
 
 

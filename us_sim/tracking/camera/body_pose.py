@@ -27,8 +27,6 @@ from us_sim.tracking.camera.definite_system import solve_definite
 from us_sim.tracking.camera.model import CameraModel, project_points
 from us_sim.tracking.camera.plane_pose import plane_poses
 
-__all__ = ["BodyPose", "body_poses", "rotation_angle"]
-
 CORNER_DEVIATION = 0.1
 """Pixels, of a corner's coordinates in a sharp image with little noise."""
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
-__all__ = ["refined_crossing"]
-
 _STEPS = 12
 _STEADY = 2e-3  # pixels
 _SLOPE = 0.851  # of the hyperbolic tangent that is nearest to the normal integral

@@ -13,8 +13,6 @@ import math
 
 from us_sim.kernels import njit
 
-__all__ = ["solve_definite"]
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve_definite(matrix, right):

@@ -27,8 +27,6 @@ from us_sim.tracking.camera.marker_pattern import fitted_corners, pattern
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody
 
-__all__ = ["Detection", "FiducialDetector", "detect_corners"]
-
 _SPREAD = 0.25  # of the longer extent of points: the shorter one, at least
 _SMALLEST = 0.03  # of the image's larger side: the length of a marker's outline
 _SMALL = 48.0  # pixels, of the longest edge up to which all of a marker's pattern is fitted

@@ -24,8 +24,6 @@ from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.model import CameraModel
 
-__all__ = ["read_camera_info", "write_camera_info"]
-
 
 def read_camera_info(path: Path | str) -> CameraModel:
     """The camera of a YAML file as ``camera_calibration`` and ``camera_info_manager`` write it.

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
-__all__ = ["refined_corners"]
-
 _WIDEST = 4.0  # pixels on either side of an edge that are looked at
 _NARROWEST = 1.2  # pixels
 _LONGEST = 150  # pixels along an edge, evenly spread, that are looked at

@@ -33,8 +33,6 @@ from numpy.typing import NDArray
 
 from us_sim.tracking.camera.markers import dictionary
 
-__all__ = ["fitted_corners", "pattern"]
-
 _DRAWN = 4  # pixels a cell of the drawing from which views are made
 _FINER = 3  # times as many pixels along a side, of which each of a view is the mean
 _BEYOND = 0.5  # cells of white about the marker, to which the drawing is fitted

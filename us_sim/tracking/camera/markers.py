@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.tracking.camera.settings import DICTIONARIES
 
-__all__ = ["dictionary", "family", "marker_count", "proper_name", "square"]
-
 
 @lru_cache(maxsize=32)
 def dictionary(name: str) -> cv2.aruco.Dictionary:

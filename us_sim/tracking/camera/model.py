@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.kernels import njit
 
-__all__ = ["DISTORTION_MODELS", "CameraModel", "project_points"]
-
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """ROS's names of the lens models, and how many coefficients each has."""
 

@@ -26,8 +26,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_between
 from us_sim.tracking.camera.body_pose import BodyPose, rotation_angle
 
-__all__ = ["PlaneAmbiguity"]
-
 _FORGETTING = 0.9  # factor of the evidence of earlier images, from one to the next
 _SURE = 12.0  # log likelihood ratio beyond which more does not count: so that it can be unlearned
 

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.tracking.camera.definite_system import solve_definite
 
-__all__ = ["plane_poses"]
-
 
 def plane_poses(
     points: NDArray[np.float64], rays: NDArray[np.float64]

@@ -32,8 +32,6 @@ from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import Chessboard, RigidBody
 
-__all__ = ["SHARP", "WEBCAMS", "Conditions", "RenderedView"]
-
 _LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
 _SMALL = np.array([[600.0, 0.0, 322.3], [0.0, 601.0, 238.1], [0.0, 0.0, 1.0]])  # pixels
 _LARGE = np.array([[1350.0, 0.0, 965.2], [0.0, 1352.0, 536.7], [0.0, 0.0, 1.0]])  # pixels

@@ -23,8 +23,6 @@ from us_sim.errors import TrackingError
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.camera.settings import MARKER_SIZE
 
-__all__ = ["Chessboard", "RigidBody"]
-
 _FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
 
 

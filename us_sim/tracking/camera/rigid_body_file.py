@@ -38,8 +38,6 @@ from us_sim.tracking.camera.markers import square
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.settings import MARKER_SIZE
 
-__all__ = ["read_rigid_body"]
-
 _NUMBER = Quantity("number", 0, 65535)
 _COUNT = Quantity("number", 1, 1000)
 _Point = tuple[float, float, float]

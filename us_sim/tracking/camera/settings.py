@@ -20,14 +20,6 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = [
-    "BOARDS_OF_MARKERS",
-    "DICTIONARIES",
-    "MARKER_SIZE",
-    "CameraSettings",
-    "columns_and_rows",
-]
-
 BOARDS_OF_MARKERS = ("charuco", "grid")
 """Kinds of flat boards that carry markers."""
 

@@ -34,8 +34,6 @@ from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.stray_markers import StrayMarkers
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["CameraSource"]
-
 REMEMBERED = 0.5
 """s, how long the last pose helps to find the next one and to tell it from its mirror image."""
 

@@ -10,8 +10,6 @@ from us_sim.settings.spelling import counted
 from us_sim.tracking.camera.markers import dictionary, family
 from us_sim.tracking.camera.rigid_body import RigidBody
 
-__all__ = ["StrayMarkers"]
-
 
 class StrayMarkers:
     """Looks for markers that are not the body's, where none of its own is found.

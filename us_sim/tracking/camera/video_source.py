@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 
-__all__ = ["VideoSource"]
-
 _PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
 _USUAL_RATE = 30.0  # Hz, of a file that does not say
 _ERRORS_ONLY = 2  # of OpenCV's levels

@@ -16,8 +16,6 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.source import CameraSource
 
-__all__ = ["practice"]
-
 
 def practice(body: RigidBody) -> bool:
     """Track a drawn marker, or board, twice: from nowhere and from near. Whether it was found."""

@@ -32,8 +32,6 @@ from us_sim.tracking.filter.pose_filter import PoseFilter
 from us_sim.tracking.filter.settings import KalmanSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["ConstantVelocityKalman"]
-
 # The speed of the first pose is not known: one standard deviation of it.
 _INITIAL_SPEED = 0.5  # m/s
 _INITIAL_ANGULAR_SPEED = 5.0  # rad/s

@@ -25,8 +25,6 @@ from us_sim.tracking.filter.pose_filter import PoseFilter
 from us_sim.tracking.filter.settings import OneEuroSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["OneEuro"]
-
 
 class OneEuro(PoseFilter):
     """A low-pass filter whose cutoff rises with speed (Casiez, Roussel, Vogel, CHI 2012).

@@ -22,9 +22,6 @@ from us_sim.geometry.se3 import rotation_between
 from us_sim.tracking.filter.settings import GateSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["OutlierGate", "Verdict"]
-
-
 _DIAGONAL = np.diag_indices(6)
 
 

@@ -13,8 +13,6 @@ from us_sim.settings.registry import FILTERS
 from us_sim.settings.setting import Settings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["PoseFilter", "Unfiltered", "create_filter"]
-
 
 class PoseFilter(ABC):
     """Takes measurements one by one, each newer than the one before, and returns better ones.

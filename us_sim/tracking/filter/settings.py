@@ -18,8 +18,6 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["GateSettings", "KalmanSettings", "OneEuroSettings"]
-
 _CUTOFF = Quantity("frequency", 1e-3, 1e3)
 
 

@@ -26,8 +26,6 @@ from us_sim.errors import TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 
-__all__ = ["ContactModel", "SecantStiffness", "wrench_in_patient"]
-
 _HEAVIEST, _STIFFEST = 1e5, 1e9
 """N and N/m beyond which a model is not believed."""
 

@@ -25,8 +25,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.tracking.haptic.settings import HapticSettings
 from us_sim.tracking.measurement import Measurement
 
-__all__ = ["HapticDevice"]
-
 
 class HapticDevice:
     """The coupling of a haptic arm's handle and the probe.

@@ -36,8 +36,6 @@ from us_sim.tracking.haptic.contact_model import ContactModel
 from us_sim.tracking.haptic.device import HapticDevice
 from us_sim.tracking.haptic.settings import HapticSettings
 
-__all__ = ["HapticRendering"]
-
 _REMEMBERED = 4096
 """Poses of the handle kept for the models that carry their stamps."""
 

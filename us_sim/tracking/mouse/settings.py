@@ -19,8 +19,6 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["MOTION_FRAMES", "MOUSE_MODES", "SixDofMouseSettings"]
-
 MOUSE_MODES = ("rate", "position")
 MOTION_FRAMES = ("probe", "patient")
 

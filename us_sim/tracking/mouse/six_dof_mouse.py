@@ -25,8 +25,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.mouse.settings import SixDofMouseSettings
 
-__all__ = ["SixDofMouse"]
-
 _ROUNDING = 1e-3
 """How far an axis may be beyond ±1: some drivers divide by a rounded full scale."""
 

@@ -23,8 +23,6 @@ from typing import Any
 
 from us_sim.errors import TrackingError
 
-__all__ = ["SpaceMouse", "SpaceMouseReports"]
-
 FULL_DEFLECTION = 350.0
 """The largest number that the device reports."""
 

@@ -25,8 +25,6 @@ from us_sim.tracking.openigtlink.message import (
 )
 from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
 
-__all__ = ["OpenIGTLinkClient"]
-
 LPS_FROM_RAS = Pose(orientation=np.array([0.0, 0.0, 1.0, 0.0]))
 """Half a turn about z: x and y change sign."""
 

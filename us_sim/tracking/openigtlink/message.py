@@ -27,18 +27,6 @@ from us_sim.errors import PoseError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 
-__all__ = [
-    "HEADER",
-    "NAME_LENGTH",
-    "POSE_KINDS",
-    "Header",
-    "header_of",
-    "image_message",
-    "poses_in",
-    "start_tracking_message",
-    "transform_message",
-]
-
 HEADER = struct.Struct(">H12s20sIIQQ")
 """Version, type, device, seconds, fraction of a second, size of the body, its checksum."""
 

@@ -18,8 +18,6 @@ from dataclasses import dataclass, field
 
 from us_sim.errors import TrackingError
 
-__all__ = ["OpenIGTLinkServer"]
-
 _MOST_CLIENTS = 16
 _READ_AT_ONCE = 1 << 16
 

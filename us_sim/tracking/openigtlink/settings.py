@@ -17,8 +17,6 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["CLOCKS", "WORLDS", "OpenIGTLinkSettings"]
-
 WORLDS = ("tracker", "lps", "ras")
 CLOCKS = ("server", "arrival")
 

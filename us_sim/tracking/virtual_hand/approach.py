@@ -24,8 +24,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Approach"]
-
 
 class Approach:
     """One quantity of a movement, of any number of coordinates.

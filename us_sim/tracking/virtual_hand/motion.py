@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.tracking.virtual_hand.approach import Approach
 from us_sim.tracking.virtual_hand.stance import Stance, half_turn
 
-__all__ = ["HandSpeed", "Motion"]
-
 _NEAR, _ALIGNED = 2e-6, 1e-4
 """m and rad from the goal: it is reached, for a pixel is some 80 µm."""
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 
-__all__ = ["Foot", "RestSurface"]
-
 _STEP = 1e-3
 """m: a way over the surface is walked in steps of this, each along the tangent where it begins."""
 _TURNS, _NEAR = 30, 1e-9

@@ -35,8 +35,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import product, rotation_exp
 from us_sim.tracking.virtual_hand.rest_surface import RestSurface
 
-__all__ = ["DEEPEST", "HIGHEST", "STEEPEST", "Stance", "half_turn"]
-
 DEEPEST = 0.02
 """m that a probe is pressed at most: a vein closes at half of it, and deeper hurts."""
 HIGHEST = 0.05

@@ -19,8 +19,6 @@ from us_sim.viewer.meshes.clustering import at_most
 from us_sim.viewer.meshes.coloured_surface import ColouredSurface
 from us_sim.viewer.packet import Packet
 
-__all__ = ["CarriedSurfaces"]
-
 _FARTHEST = 5e-3
 """m: a vertex so far outside the mesh is not of this tissue."""
 WHILE_MOVING = 20_000

@@ -20,8 +20,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["at_most", "clustered"]
-
 _TRIALS = 12
 """Each halves the range in which the cell's size lies."""
 _SMALLEST, _LARGEST = 0.2, 20.0

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["EquivalentStrain"]
-
 
 class EquivalentStrain:
     """Of the states of one mesh, at its nodes."""

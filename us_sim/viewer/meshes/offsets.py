@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FINEST", "Offsets"]
-
 FINEST = 1e-6
 """m: a step is no shorter. So tissue may move by 33 mm before steps must be longer."""
 _MOST = np.iinfo(np.int16).max

@@ -21,8 +21,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.meshes.offsets import Offsets
 from us_sim.viewer.packet import Packet
 
-__all__ = ["RestSurface"]
-
 
 class RestSurface:
     """Points at rest with their triangles and edges, and packets of where they are later.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from us_sim.viewer.meshes.coloured_surface import ColouredSurface
 from us_sim.viewer.packet import Packet
 
-__all__ = ["transducer_packet"]
-
 
 def transducer_packet(
     kind: str,

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 
-__all__ = ["welded"]
-
 
 def welded(
     corners: NDArray[np.floating],

@@ -11,8 +11,6 @@ from us_sim.viewer.panels.while_shown import WhileShown
 from us_sim.viewer.session import NOT_THERE, LoadableScene, SessionState
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build"]
-
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
 ANOTHER = (
     "Ends the scene that runs, and starts this one; what was set in either comes back when it is "

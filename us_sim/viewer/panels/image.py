@@ -8,8 +8,6 @@ from us_sim.viewer.panels.time_gain import TimeGain
 from us_sim.viewer.panels.while_shown import WhileShown
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build"]
-
 NODE = "slice_interpolator"
 COMMON = (
     "depth",

@@ -12,8 +12,6 @@ from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.slider_span import SliderSpan, slider_span
 
-__all__ = ["Change", "ParameterControl", "tip_of"]
-
 
 class Change:
     """Sets a parameter to what a control sends: one change at a time, and of several the last.

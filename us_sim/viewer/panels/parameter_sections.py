@@ -16,8 +16,6 @@ from us_sim.viewer.panels.time_gain import TimeGain
 from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.parameters import NodeParameters, Parameter, State
 
-__all__ = ["ParameterSections"]
-
 Control = ParameterControl | TimeGain
 MakeControl = Callable[[ParameterBoard, Parameter, str], Control]
 

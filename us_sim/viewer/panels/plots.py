@@ -11,8 +11,6 @@ from us_sim.viewer.panels.while_shown import WhileShown
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.status import HISTORY_S, Point, StatusBoard
 
-__all__ = ["build"]
-
 EVERY_S = 0.5
 HELD_BACK_S = 0.15
 """The newest force is left for the next turn: until then a larger one may take its place."""

@@ -8,17 +8,6 @@ from dataclasses import dataclass, field
 
 from us_sim.viewer.parameters import Parameter, in_words
 
-__all__ = [
-    "Arrange",
-    "Section",
-    "chosen_first",
-    "common_first",
-    "given_at_the_start",
-    "groups_in_use",
-    "groups_of",
-    "title_of",
-]
-
 Arrange = Callable[[Mapping[str, Parameter]], list["Section"]]
 """Puts the parameters of a node, by name, into sections."""
 

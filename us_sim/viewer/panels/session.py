@@ -15,8 +15,6 @@ from us_sim.viewer.panels.while_shown import WhileShown
 from us_sim.viewer.session import NOT_THERE, SessionState
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build"]
-
 EVERY_S = 0.3
 """How often it is looked whether something has changed."""
 RATED_S = 5.0

@@ -12,8 +12,6 @@ from us_sim.viewer.panels.status_table import StatusTable
 from us_sim.viewer.panels.while_shown import WhileShown
 from us_sim.viewer.simulator import Simulator
 
-__all__ = ["build"]
-
 EVERY_S = 0.5
 PARAMETERS_S = 0.2
 

@@ -9,8 +9,6 @@ from nicegui.element import Element
 
 from us_sim.viewer.status import Level, NodeStatus
 
-__all__ = ["StatusTable", "row_of"]
-
 PROBLEM_S = 60.0
 """How long the last problem of a node that is well again is shown."""
 

@@ -11,8 +11,6 @@ from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.parameters import Parameter
 from us_sim.viewer.time_gain_sliders import on_sliders, slider_count
 
-__all__ = ["TimeGain"]
-
 REACH = 20.0
 """dB up and down that the sliders cover, as consoles have it."""
 

@@ -22,8 +22,6 @@ from us_sim.viewer.parameters import Parameter
 from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.status import Level, NodeStatus
 
-__all__ = ["arrange_tissue", "build"]
-
 NODE, SKIN, TRACKER = "tissue_deformer", "skin_deformer", "probe_tracker"
 METHOD = ("solver", "compare_with")
 MATERIALS, STIFFNESS = "materials.", ".young_modulus"

@@ -8,8 +8,6 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
-__all__ = ["WhileShown"]
-
 
 class WhileShown(Element, component="while_shown.js"):
     """What is within is worked for only while it can be seen.

@@ -41,8 +41,6 @@ from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume
 from us_sim.volume.volume import Volume
 
-__all__ = ["CASE", "LABELS", "SURFACES", "TISSUE", "VOLUME", "Case", "is_case", "read_case"]
-
 CASE = "case.yaml"
 VOLUME = "volume.nrrd"
 LABELS = "labels.nrrd"

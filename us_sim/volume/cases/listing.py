@@ -23,8 +23,6 @@ from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.registry import PROBES
 from us_sim.volume.cases.case import read_case
 
-__all__ = ["ListedCase", "listed", "table"]
-
 _TITLES = ("case", "region", "probe", "size", "structures")
 _LONGEST = 60  # characters of a column
 

@@ -23,8 +23,6 @@ from us_sim.volume.cases.provenance import Step, add_step
 from us_sim.volume.cases.settings import AROUND, CaseSettings
 from us_sim.volume.cases.writing import changed_case, write_case_settings
 
-__all__ = ["with_moduli", "write_moduli_into"]
-
 
 def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSettings:
     """A case with these moduli (Pa) by structure, `AROUND` for what is in none.

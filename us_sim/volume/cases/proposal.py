@@ -42,8 +42,6 @@ from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
 from us_sim.volume.cases.settings import SLIDE, CaseSettings, CaseStart
 from us_sim.volume.volume import Volume
 
-__all__ = ["proposed_collider", "proposed_probe", "proposed_start", "with_proposal"]
-
 _MOST_POINTS = 200_000
 _FEW_POINTS = 8_000
 _DIRECTIONS = 2000

@@ -39,8 +39,6 @@ from us_sim.settings.text_file import read_text
 from us_sim.settings.writing import document_of
 from us_sim.settings.yaml_text import YamlError, load_yaml
 
-__all__ = ["PROVENANCE", "Source", "Step", "add_step", "read_steps", "settings_said"]
-
 PROVENANCE = "provenance.yaml"
 
 _MOST_STEPS = 1000

@@ -25,8 +25,6 @@ from us_sim.errors import CaseError
 from us_sim.settings.spelling import nearest
 from us_sim.volume.cases.case import CASE, is_case
 
-__all__ = ["case_roots", "cases_in", "find_case"]
-
 
 def case_roots() -> list[Path]:
     """Folders of cases; the first of them goes before the others where a name is in several."""

@@ -25,16 +25,6 @@ from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
 from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 
-__all__ = [
-    "AROUND",
-    "RESERVED",
-    "SLIDE",
-    "CaseSettings",
-    "CaseStart",
-    "CaseStructure",
-    "check_name",
-]
-
 AROUND = "tissue"
 """Name of what is in no structure: label 0, or all of a volume without labels."""
 

@@ -36,8 +36,6 @@ from us_sim.errors import CaseError, MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-__all__ = ["CaseTissue", "read_tissue", "write_tissue"]
-
 _LARGEST = 1 << 29
 """Bytes of the arrays together: a million nodes take less."""
 

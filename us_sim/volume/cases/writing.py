@@ -32,8 +32,6 @@ from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.settings import CaseSettings, check_name
 
-__all__ = ["changed_case", "new_case", "write_case_settings"]
-
 
 @contextmanager
 def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:

@@ -26,8 +26,6 @@ from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, plac
 from us_sim.volume.files.dicom.values import text
 from us_sim.volume.files.dicom.vendors import is_cartesian
 
-__all__ = ["dicom_source"]
-
 _ASSUMED = 0.04  # s, between images of which nothing says it
 
 

@@ -18,8 +18,6 @@ from us_sim.volume.deidentification.source import Progress, Source, spread
 from us_sim.volume.files.readers import grey_voxels, open_image
 from us_sim.volume.files.segments import holds_segments, no_grey_values
 
-__all__ = ["file_source"]
-
 _KINDS = {"m": "MetaImage volume", "nr": "NRRD volume", "nh": "NRRD volume"}
 """By the beginning of a name's ending; all others are NIfTI."""
 

@@ -27,8 +27,6 @@ from us_sim.volume.files.dicom.values import quiet
 from us_sim.volume.files.metaimage import metaimage_header
 from us_sim.volume.files.nifti import NIFTI_TEXTS, nifti_fields
 
-__all__ = ["dicom_names", "other_names"]
-
 _DEEPEST = 12
 
 _METAIMAGE = frozenset(

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from us_sim.volume.deidentification.rectangle import Rectangle
 
-__all__ = ["Imported"]
-
 
 @dataclass(frozen=True, eq=False)
 class Imported:

@@ -36,8 +36,6 @@ from us_sim.volume.deidentification.text_detection import find_text
 from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.readers import ENDINGS
 
-__all__ = ["Import", "import_files", "look_at"]
-
 _MARGIN = 3
 """Pixels around text that are blanked with it: shadows and blurred edges."""
 

@@ -25,8 +25,6 @@ from us_sim.volume.deidentification.rectangle import Rectangle
 from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.values import items, number, numbers, text, whole
 
-__all__ = ["Regions", "never_holds_text", "pixel_size", "ultrasound_regions"]
-
 _TWO_DIMENSIONAL = 1  # Region Spatial Format
 _ECHOES = (1, 2)  # Region Data Type: tissue, colour flow
 _CENTIMETRES = 3  # Physical Units

@@ -21,8 +21,6 @@ from typing import Any
 
 from us_sim.volume.files.dicom.values import items, numbers, text
 
-__all__ = ["CLOSED_LISTS", "NUMBERS", "USED", "KeptNumber", "kept_values"]
-
 _REGIONS = "SequenceOfUltrasoundRegions"
 
 

@@ -18,8 +18,6 @@ from us_sim.volume.files.writing import write_volume
 from us_sim.volume.sequences.image_sequence_file import write_image_sequence
 from us_sim.volume.volume import Volume
 
-__all__ = ["is_images", "refuse_taken", "write_grid", "write_images"]
-
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 

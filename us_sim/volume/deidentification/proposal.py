@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from us_sim.volume.deidentification.rectangle import Rectangle
 
-__all__ = ["proposed_part"]
-
 _MOVES = 16  # grey levels between images
 _SHINES = 8  # grey levels above black
 _CLOSE = 15  # px, gaps that are bridged

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["Rectangle"]
-
 
 @dataclass(frozen=True)
 class Rectangle:

@@ -30,8 +30,6 @@ from us_sim.volume.deidentification.imported import Imported
 from us_sim.volume.deidentification.kept_values import NUMBERS
 from us_sim.volume.deidentification.rectangle import Rectangle
 
-__all__ = ["refuse_report", "report_picture", "report_text", "summary", "write_report"]
-
 _GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (0, 220, 255)  # of OpenCV: blue, green, red
 _REPORT, _PICTURE = "report.md", "first_image.png"
 

@@ -9,8 +9,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.deidentification.rectangle import Rectangle
 
-__all__ = ["ImportSettings"]
-
 
 @dataclass(frozen=True)
 class ImportSettings(Settings):

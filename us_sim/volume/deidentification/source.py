@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from us_sim.volume.deidentification.kept_part import Regions
 
-__all__ = ["LOOKED_AT", "Progress", "Source", "spread"]
-
 Progress = Callable[[float, str], None]
 
 LOOKED_AT = 12

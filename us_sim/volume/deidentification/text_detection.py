@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from us_sim.volume.deidentification.rectangle import Rectangle
 
-__all__ = ["find_text"]
-
 _STILL = 12  # grey levels by which the same letter differs between images; JPEG makes about ten
 _STROKE = 11  # px, wider than the strokes of the largest letters
 _CONTRAST = 45  # grey levels, of one image

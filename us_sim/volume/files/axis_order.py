@@ -22,8 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["file_order", "volume_of_slices"]
-
 _SLAB = 1 << 23  # bytes that are turned at a time
 
 

@@ -19,8 +19,6 @@ from pathlib import Path
 from us_sim.volume.files.metaimage import metaimage_header
 from us_sim.volume.files.nrrd import nrrd_header
 
-__all__ = ["FRAME_KEY", "is_sequence", "sequence_remedy"]
-
 _OVER_TIME = {"list", "time"}
 FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
 """Keys of a frame's fields: its number, and the field's name."""

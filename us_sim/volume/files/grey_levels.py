@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["GreyLevels"]
-
 
 @dataclass(frozen=True)
 class GreyLevels:

@@ -18,8 +18,6 @@ from scipy import ndimage
 
 from us_sim.errors import VolumeError
 
-__all__ = ["on_grid"]
-
 _SAME = 0.02
 """Voxels by which two grids may differ and still be one; single precision, which NIfTI has, makes
 them differ by less."""

@@ -20,8 +20,6 @@ from us_sim.settings.spelling import shown
 from us_sim.settings.text_file import read_text
 from us_sim.volume.anatomical_colours import Colour
 
-__all__ = ["read_label_table"]
-
 _SLICER = re.compile(r"(\d{1,9})\s+(\S+)\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})")
 _SNAP = re.compile(r"(\d{1,9})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})(?:\s+[\d.]{1,9}){3}\s+\"(.*)\"")
 _LONGEST = 1 << 20

@@ -40,8 +40,6 @@ from us_sim.volume.label_map import LabelMap
 from us_sim.volume.structure_terms import coded_name, is_anatomical, readable
 from us_sim.volume.volume import Volume
 
-__all__ = ["read_labels"]
-
 _MOST = 255
 
 

@@ -28,8 +28,6 @@ from us_sim.volume.files.placement import checked_placement, millimetres
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
 
-__all__ = ["metaimage_header", "metaimage_image", "metaimage_voxels"]
-
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""
 

@@ -27,8 +27,6 @@ from us_sim.volume.files.placement import checked_placement
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.files.stored_voxels import StoredVoxels
 
-__all__ = ["NIFTI_TEXTS", "nifti_fields", "nifti_image"]
-
 _TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4"}
 _TYPES |= {1024: "i8", 1280: "u8"}
 _COLOURS = {128: 3, 2304: 4}

@@ -28,8 +28,6 @@ from us_sim.volume.files.placement import checked_placement, millimetres
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
 
-__all__ = ["nrrd_header", "nrrd_image", "nrrd_voxels"]
-
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""
 

@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
 
-__all__ = ["MILLIMETRES", "checked_placement", "millimetres"]
-
 MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "nm": 1e-6}
 MILLIMETRES |= {"meter": 1e3, "centimeter": 10.0, "millimeter": 1.0, "micron": 1e-3, "inch": 25.4}
 """By the names of units in image files."""

@@ -36,8 +36,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.axis_order import file_order
 
-__all__ = ["check_fields", "grid_in_mm", "partial_file", "write_plain"]
-
 _MILLIMETRES = 1e3  # these formats hold millimetres
 _ORTHONORMAL = 1e-6  # of a direction matrix's columns; the readers' own limit is wider
 _SLAB = 1 << 23  # bytes that are turned at a time

@@ -30,8 +30,6 @@ from us_sim.volume.files.nrrd import nrrd_image
 from us_sim.volume.files.stored_image import StoredImage
 from us_sim.volume.volume import Volume
 
-__all__ = ["ENDINGS", "grey_voxels", "open_image", "read_placement", "read_volume"]
-
 _READERS = {
     "mha": metaimage_image,
     "mhd": metaimage_image,

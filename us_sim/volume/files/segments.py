@@ -21,8 +21,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
 from us_sim.volume.anatomical_colours import Colour
 
-__all__ = ["Segment", "check_representation", "holds_segments", "no_grey_values", "segments_of"]
-
 _FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
 
 

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_voxels import StoredVoxels, check_claim
 
-__all__ = ["StoredImage"]
-
 
 @dataclass(frozen=True)
 class StoredImage:

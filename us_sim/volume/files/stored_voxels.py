@@ -35,8 +35,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["LARGEST_VOLUME", "Encoding", "StoredVoxels", "check_claim", "free_memory"]
-
 LARGEST_VOLUME = 1 << 29
 """Numbers in the largest image that is read: 1024 × 1024 × 512."""
 

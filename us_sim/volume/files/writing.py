@@ -37,8 +37,6 @@ from us_sim.volume.files.plain_writing import (
 )
 from us_sim.volume.volume import Volume
 
-__all__ = ["write_labels", "write_volume"]
-
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
 _SLAB = 1 << 24  # voxels that are turned at a time
 _FASTEST = 1  # zlib's level; speckle hardly becomes smaller with any other

@@ -21,8 +21,6 @@ from us_sim.volume.phantom.phantom_cache import cache_folder, kept_volume
 from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.volume import Volume
 
-__all__ = ["cached_phantom", "is_phantom_kept", "upper_arm"]
-
 Progress = Callable[[float, str], None]
 
 _GENERATOR = 2

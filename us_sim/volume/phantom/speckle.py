@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-__all__ = ["PointSpread", "echo_envelope", "log_compress"]
-
 _SIGMA_PER_WIDTH = 1 / (2 * math.sqrt(2 * math.log(2)))
 _REACH = 3.0  # standard deviations after which the point spread counts as 0
 

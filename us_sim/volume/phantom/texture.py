@@ -16,8 +16,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SmoothNoise", "sheets"]
-
 _SPLINE_VARIANCE = 151.0 / 315.0
 """The mean over a cell of the sum of squared cubic B-spline weights: the variance that
 interpolation leaves along an axis."""

@@ -29,8 +29,6 @@ from scipy.ndimage import gaussian_filter1d
 from us_sim.volume.phantom.texture import SmoothNoise, sheets
 from us_sim.volume.phantom.tube import Tube
 
-__all__ = ["UPPER_ARM_BLOCK", "UPPER_ARM_LABELS", "ArmSection", "UpperArm"]
-
 UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
 """Lower and upper corner of the block in frame ``patient``, m."""
 

@@ -35,8 +35,6 @@ from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.frame_transforms import in_metres
 from us_sim.volume.sequences.sequence_header import frame_matrix
 
-__all__ = ["SweepCalibration", "read_calibration"]
-
 _PART = {
     "ClipRectangleOrigin": 2,
     "ClipRectangleSize": 2,

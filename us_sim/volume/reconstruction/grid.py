@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_voxels import LARGEST_VOLUME, free_memory
 
-__all__ = ["Grid", "axes_of_smallest_box", "check_memory", "grid_around", "proposed_spacing"]
-
 _PROPOSED = 1 << 27  # voxels, where nobody asks for more
 
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.kernels import njit
 
-__all__ = ["fill_holes"]
-
 _DIRECTIONS = np.array(
     [
         *((0, 0, 1), (0, 1, 0), (1, 0, 0)),

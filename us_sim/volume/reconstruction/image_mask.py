@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.settings import ImagePart
 
-__all__ = ["image_mask", "outline"]
-
 
 def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
     """(rows, columns) whether a pixel is used.

@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.volume.reconstruction.grid import Grid, check_memory
 
-__all__ = ["VOXEL_BYTES", "Insertion"]
-
 VOXEL_BYTES = 10
 """Of memory a voxel while images are inserted: what it gathers, its grey value and coverage."""
 

@@ -21,8 +21,6 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.reconstruction import Plan, Progress, Reconstruction, reconstruct
 
-__all__ = ["APART", "Prediction", "correlation", "leave_one_out"]
-
 APART = 8
 """Frames from one that is left out to the next: the seven between are enough to predict it."""
 _LEAST = 100  # pixels for a correlation

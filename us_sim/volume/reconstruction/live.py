@@ -23,8 +23,6 @@ from us_sim.volume.reconstruction.insertion import Insertion
 from us_sim.volume.reconstruction.live_settings import LiveBox
 from us_sim.volume.volume import Volume
 
-__all__ = ["LiveReconstruction"]
-
 
 class LiveReconstruction:
     """Inserts one image after the other.

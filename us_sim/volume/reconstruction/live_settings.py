@@ -12,8 +12,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.reconstruction.settings import METHODS
 
-__all__ = ["LIVE_COMPOUNDINGS", "LiveBox", "LiveVolume"]
-
 LIVE_COMPOUNDINGS = ("mean", "max", "latest")
 """Those that need no image twice."""
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.volume import Volume
 
-__all__ = ["draw_slices"]
-
 _NAMES = ("i", "j", "k")
 _BARS = (1, 2, 5, 10, 20, 50, 100, 200)  # mm
 

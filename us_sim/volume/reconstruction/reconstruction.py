@@ -40,8 +40,6 @@ from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
-__all__ = ["Plan", "Progress", "Reconstruction", "Rest", "plan", "reconstruct"]
-
 Progress = Callable[[float, str], None]
 """Is told the fraction done, and what is being done."""
 

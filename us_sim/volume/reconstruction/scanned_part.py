@@ -26,8 +26,6 @@ from scipy.stats import theilslopes
 
 from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["Fan", "Rectangle", "box_around", "fitted_part", "seen_pixels"]
-
 _LOOKED_AT = 32  # frames
 _OFTEN = 0.7
 """Of these frames, in how many a pixel is not black where it was scanned: lossy compression spills

@@ -25,8 +25,6 @@ from us_sim.volume.reconstruction.scanned_part import (
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["ScanningProbe", "scanning_probe"]
-
 _POSES = 33
 _SKEWED = 0.05  # cosine between columns and rows, more than a calibration is inexact
 _UNLIKE = 0.1  # of the two sides of pixels, beyond which an arc in pixels is none in metres

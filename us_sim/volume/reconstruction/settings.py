@@ -13,8 +13,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["COMPOUNDINGS", "METHODS", "Compounding", "ImagePart"]
-
 METHODS = ("nearest", "linear")
 """How a pixel is inserted: into the nearest voxel, or into the eight around it by their weights."""
 

@@ -37,8 +37,6 @@ from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import Sweep, sweep_of
 from us_sim.volume.sequences.time_shift import shifted
 
-__all__ = ["SweepSettings", "reconstruct_sweep"]
-
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 _FRAME = "frame"
 

@@ -34,8 +34,6 @@ from us_sim.volume.surfaces.structure_surface import StructureSurface, structure
 from us_sim.volume.surfaces.surface_files import write_surface
 from us_sim.volume.volume import Volume
 
-__all__ = ["segment_as_asked"]
-
 PICTURE = "segmentation.png"
 REPORT = "segmentation.md"
 

@@ -24,8 +24,6 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.volume.segmentation.morphology import ball_closed, largest_part
 from us_sim.volume.segmentation.region import Region
 
-__all__ = ["Covered", "covered_part"]
-
 
 @dataclass(frozen=True)
 class Covered(Settings):

@@ -28,8 +28,6 @@ from us_sim.volume.segmentation.morphology import (
 from us_sim.volume.segmentation.region import Region, array_of, image_of
 from us_sim.volume.segmentation.vesselness import tube_scales, tubeness
 
-__all__ = ["DarkVessels"]
-
 _DIAMETER = Quantity("length", 5e-4, 0.05)
 _PART = Quantity("number", 0.0, 1.0)
 

@@ -13,8 +13,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.segmentation.region import Region, array_of
 
-__all__ = ["ConfidenceConnected", "SeededGrowing", "Threshold"]
-
 _GREY = Quantity("number", 0.0, 255.0)
 
 

@@ -17,15 +17,6 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 from scipy import ndimage
 
-__all__ = [
-    "ball_closed",
-    "ball_eroded",
-    "ball_opened",
-    "largest_part",
-    "parts_at_least",
-    "parts_with",
-]
-
 _TOUCHING = np.ones((3, 3, 3), bool)
 
 

@@ -20,8 +20,6 @@ from pathlib import Path
 
 from us_sim.errors import VolumeError
 
-__all__ = ["new_folder"]
-
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:

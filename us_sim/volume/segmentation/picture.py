@@ -18,8 +18,6 @@ from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.voxel_surface import voxel_surface
 from us_sim.volume.volume import Volume
 
-__all__ = ["draw_segmentation"]
-
 _AXES = ("i", "j", "k")
 _SLICES = 3  # along each axis
 _MOST_TRIANGLES = 20_000  # of all surfaces; matplotlib draws them in a second or two

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["Index", "Region", "array_of", "image_of"]
-
 Index = tuple[int, int, int]
 
 

@@ -11,8 +11,6 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.volume.structure_terms import problem_with
 from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
-__all__ = ["SegmentRequest"]
-
 
 @dataclass(frozen=True)
 class SegmentRequest(Settings):

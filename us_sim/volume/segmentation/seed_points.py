@@ -22,8 +22,6 @@ from us_sim.volume.segmentation.region import Index
 from us_sim.volume.segmentation.settings import StructureSeeds
 from us_sim.volume.volume import Volume
 
-__all__ = ["box_of", "outside_of", "seeds_of"]
-
 
 def seeds_of(volume: Volume, name: str, asked: StructureSeeds) -> list[Index]:
     """Indices of the voxels that a structure's seeds lie in.

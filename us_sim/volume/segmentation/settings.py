@@ -26,8 +26,6 @@ from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.volume.anatomical_colours import Colour
 from us_sim.volume.structure_terms import problem_with
 
-__all__ = ["SegmentationSettings", "StructureSeeds", "read_seeds"]
-
 _MOST = 255
 _MILLIMETRES = Quantity("number", -1e5, 1e5)
 _INDEX = Quantity("number", 0, 1 << 20)

@@ -41,8 +41,6 @@ from us_sim.volume.segmentation.seed_points import box_of, outside_of, seeds_of
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
 from us_sim.volume.volume import Volume
 
-__all__ = ["segment"]
-
 _BYTES = 40
 """Memory of a voxel that is looked at: some images in single precision, and parts as numbers."""
 

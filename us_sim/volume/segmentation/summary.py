@@ -7,8 +7,6 @@ from pathlib import Path
 
 from us_sim.volume.surfaces.structure_surface import StructureSurface
 
-__all__ = ["summary", "write_report"]
-
 _HEADING = ("structure", "volume", "triangles", "area", "parts", "handles", "volume kept", "moved")
 
 

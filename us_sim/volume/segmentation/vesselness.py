@@ -23,8 +23,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.segmentation.region import Region, array_of
 
-__all__ = ["Vesselness", "tube_scales", "tubeness"]
-
 _DIAMETER = Quantity("length", 2e-4, 0.05)
 _STEP = 1.0
 """Standard deviations between voxels of the grid on which the Hessian is taken."""

@@ -17,8 +17,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.volume.segmentation.region import Index, Region, array_of, image_of
 
-__all__ = ["Watershed"]
-
 _LENGTH = Quantity("length", 0.0, 0.05)
 _INSIDE, _OUTSIDE = 1, 2
 

@@ -25,8 +25,6 @@ from us_sim.volume.sequences.sequence_header import frame_matrix
 from us_sim.volume.sequences.transform_chain import TransformChain
 from us_sim.volume.sequences.transform_name import is_image_frame, split_transform_name
 
-__all__ = ["FrameTransforms", "along", "in_metres", "read_transforms"]
-
 _METRES = 1e-3  # the format holds millimetres
 _SUFFIX = "Transform"
 _MOST_NUMBERS = 1 << 27  # 1 GiB; eight transforms a frame for four hours at 60 Hz

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-__all__ = ["write_image_sequence"]
-
 
 def write_image_sequence(
     path: Path,

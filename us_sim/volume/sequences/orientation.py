@@ -24,8 +24,6 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["is_orientation", "is_transposed", "turned"]
-
 _CODE = re.compile(r"([UM][FN]|[FN][UM])[AD]?")
 
 

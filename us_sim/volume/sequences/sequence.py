@@ -43,8 +43,6 @@ from us_sim.volume.sequences.sequence_file import SequenceFile, read_sequence_fi
 from us_sim.volume.sequences.sequence_header import frame_time
 from us_sim.volume.sequences.stored_images import StoredImages
 
-__all__ = ["TrackedSequence", "read_sequence"]
-
 _LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
 NO_TIME = "no Timestamp"
 NO_IMAGE = "ImageStatus is not OK"

@@ -36,8 +36,6 @@ from us_sim.volume.files.nrrd import nrrd_header, nrrd_voxels
 from us_sim.volume.files.stored_voxels import StoredVoxels
 from us_sim.volume.sequences.sequence_header import frame_fields
 
-__all__ = ["SEQUENCE_SUFFIXES", "SequenceFile", "read_sequence_file"]
-
 SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 
 _GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"

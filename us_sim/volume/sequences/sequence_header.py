@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from us_sim.volume.files.frame_sequence import FRAME_KEY
 
-__all__ = ["frame_fields", "frame_matrix", "frame_time"]
-
 _LARGEST = 1e7
 """mm, of any transform's numbers, so that products of them stay finite."""
 

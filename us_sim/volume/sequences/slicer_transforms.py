@@ -37,13 +37,6 @@ from us_sim.volume.sequences import itk_reader
 from us_sim.volume.sequences.frame_transforms import FrameTransforms, in_metres
 from us_sim.volume.sequences.transform_name import split_transform_name
 
-__all__ = [
-    "SLICER_SCENES",
-    "SLICER_TRANSFORMS",
-    "read_slicer_sequences",
-    "read_slicer_transform",
-]
-
 SLICER_SCENES = (".mrb", ".mrml")
 SLICER_TRANSFORMS = (".h5", ".hdf5", ".tfm")
 _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -28,8 +28,6 @@ from us_sim.volume.files.grey_levels import GreyLevels
 from us_sim.volume.files.stored_voxels import StoredVoxels
 from us_sim.volume.sequences.orientation import turned
 
-__all__ = ["StoredImages"]
-
 
 @dataclass(frozen=True)
 class StoredImages:

@@ -38,8 +38,6 @@ from us_sim.volume.sequences.frame_transforms import FrameTransforms, along
 from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
 from us_sim.volume.sequences.transform_chain import TransformChain, shortest_chain
 
-__all__ = ["Sweep", "read_sweep", "sweep_of"]
-
 IMAGE, REFERENCE = "Image", "Reference"
 
 

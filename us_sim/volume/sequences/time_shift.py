@@ -19,8 +19,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.volume.sequences.sweep import Sweep
 
-__all__ = ["poses_at", "shifted"]
-
 _LONGEST_GAP = 0.3  # s, between poses that are interpolated; three frames of a slow scanner
 _NO_POSE = "no pose at its time"
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 from us_sim.volume.sequences.transform_name import split_transform_name
 
-__all__ = ["TransformChain", "frames_reached", "shortest_chain"]
-
 
 @dataclass(frozen=True)
 class TransformChain:

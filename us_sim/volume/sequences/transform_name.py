@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["is_image_frame", "split_transform_name"]
-
 _TO = re.compile(r"To(?=[^a-z])")
 
 

@@ -23,8 +23,6 @@ from scipy.sparse.csgraph import connected_components
 
 from us_sim.errors import VolumeError
 
-__all__ = ["ClosedSurface"]
-
 
 @dataclass(frozen=True, eq=False)
 class ClosedSurface:

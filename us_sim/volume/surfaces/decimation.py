@@ -15,8 +15,6 @@ from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.smoothing import with_volume
 from us_sim.volume.surfaces.surface_distance import distances_to
 
-__all__ = ["coarsened", "decimated", "surface_distance"]
-
 _FEWEST = 0.02  # of the triangles
 _TRIALS = 6
 """Each halves the logarithm of the range in which the answer lies."""

@@ -23,8 +23,6 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.volume.volume import Volume
 
-__all__ = ["label_surface", "occurs", "spacing_for"]
-
 _SMOOTHING = 0.7
 """Standard deviation of the smoothing, in grid steps: the least that hides the voxels' stairs."""
 

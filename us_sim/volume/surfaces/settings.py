@@ -8,8 +8,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-__all__ = ["SURFACE_FORMATS", "SurfaceSettings"]
-
 SURFACE_FORMATS = ("stl", "ply", "vtp", "obj")
 """What surfaces may be written as."""
 

@@ -20,8 +20,6 @@ from scipy.sparse import csr_array
 from us_sim.geometry.normals import vertex_normals
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 
-__all__ = ["filter_coefficients", "pass_band_for", "response", "smoothed", "with_volume"]
-
 _CORRECTIONS = 4
 """Newton steps to the wanted volume; each leaves the square of the error before."""
 

@@ -25,8 +25,6 @@ from us_sim.volume.surfaces.smoothing import smoothed, with_volume
 from us_sim.volume.surfaces.voxel_surface import structure_name, voxel_surface
 from us_sim.volume.volume import Volume
 
-__all__ = ["StructureSurface", "structure_surface"]
-
 _WAVELENGTH = 6.0
 """Voxels; the stairs of a surface that lies aslant are at most so long nearly everywhere."""
 

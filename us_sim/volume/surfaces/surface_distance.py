@@ -15,8 +15,6 @@ from scipy.spatial import cKDTree
 
 from us_sim.kernels import njit
 
-__all__ = ["distances_to"]
-
 _NEAREST = 6
 """Samples of the surface whose triangles are looked at."""
 

@@ -30,8 +30,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
-__all__ = ["write_surface"]
-
 _MILLIMETRES = 1e3
 _SAID = "us_sim; millimetres; SPACE=LPS"
 

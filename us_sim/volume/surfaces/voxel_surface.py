@@ -21,8 +21,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.volume import Volume
 
-__all__ = ["structure_name", "voxel_surface"]
-
 _LEVEL = 0.49
 """Below one half, where voxels that touch along an edge only would be joined or parted by chance,
 and some edges of the surface would have four triangles. Now they are always joined."""

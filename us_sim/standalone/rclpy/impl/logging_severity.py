@@ -2,8 +2,6 @@
 
 from enum import IntEnum
 
-__all__ = ["LoggingSeverity"]
-
 
 class LoggingSeverity(IntEnum):
     """The severities of ROS; UNSET means that the parent logger decides."""

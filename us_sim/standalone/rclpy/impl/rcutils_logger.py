@@ -15,8 +15,6 @@ from .. import _logging_outputs as outputs
 from ..clock import Clock
 from .logging_severity import LoggingSeverity
 
-__all__ = ["RcutilsLogger"]
-
 _SYSTEM_CLOCK = Clock()
 _OPTIONS = ["throttle_duration_sec", "throttle_time_source_type", "skip_first", "once"]
 

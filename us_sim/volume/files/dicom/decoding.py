@@ -21,8 +21,6 @@ from us_sim.volume.files.dicom import decoder
 from us_sim.volume.files.dicom.header import EXTRA, DicomFile
 from us_sim.volume.files.dicom.image_format import ImageFormat
 
-__all__ = ["decoded_frames"]
-
 _MEMORY = 1 << 30
 """Bytes that decoders may take beside several copies of an image."""
 _SECONDS = 60

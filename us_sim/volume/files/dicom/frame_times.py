@@ -21,8 +21,6 @@ from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.stated_planes import image_times
 from us_sim.volume.files.dicom.values import items, number, numbers, text
 
-__all__ = ["frame_times"]
-
 _MILLISECONDS = 1e-3
 _STAMP = re.compile(r"(\d{14})(\.\d{1,6})?([+-]\d{4})?")  # value representation DT, PS3.5, 6.2
 

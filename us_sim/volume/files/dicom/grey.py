@@ -30,8 +30,6 @@ from us_sim.volume.files.dicom.palette import WEIGHTS, grey_palette
 from us_sim.volume.files.dicom.values import items, number
 from us_sim.volume.files.grey_levels import GreyLevels
 
-__all__ = ["GreyImages", "stored_frames"]
-
 
 class GreyImages:
     """The images of files that belong together, by (number of the file, number of the image).

@@ -24,8 +24,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.values import quiet, text, whole
 from us_sim.volume.files.stored_voxels import check_claim
 
-__all__ = ["EXTRA", "DicomFile", "PixelPlace", "dicom_files", "is_dicom", "open_dicom", "packed_in"]
-
 EXTRA = "pip install 'us_sim[dicom]'"
 
 _DEFER = 1 << 20  # bytes of a value that is not read; a palette has 128 KiB a colour

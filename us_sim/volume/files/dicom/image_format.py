@@ -20,8 +20,6 @@ from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.values import text, whole
 from us_sim.volume.files.stored_voxels import check_claim
 
-__all__ = ["ImageFormat", "image_format"]
-
 _GREY = ("MONOCHROME1", "MONOCHROME2", "PALETTE COLOR")
 _MOST_FRAMES = 1 << 20
 _DIRECT = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "")

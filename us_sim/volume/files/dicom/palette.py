@@ -20,8 +20,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.values import numbers, value
 
-__all__ = ["WEIGHTS", "grey_palette"]
-
 WEIGHTS = {"Red": 77, "Green": 150, "Blue": 29}
 """Of colours in a grey value, in 256ths (ITU-R BT.601, 2.5.1); a grey pixel stays as it is."""
 

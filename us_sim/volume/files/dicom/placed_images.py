@@ -34,8 +34,6 @@ from us_sim.volume.files.dicom.vendors import (
 )
 from us_sim.volume.files.segments import no_grey_values
 
-__all__ = ["PlacedImages", "is_flat", "opened_images", "placed_images"]
-
 SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 """Classes of files that hold labels: masks of segments, and label maps."""
 

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement
 
-__all__ = ["Plane", "grid_of", "image_axes", "sparse_grid_of"]
-
 _PARALLEL = 1e-4  # difference of the components of directions that are the same
 _EVEN = 0.02  # of the distance between images, by which one may be off
 _PLACES = 0.01  # mm, to which some scanners round positions

@@ -25,8 +25,6 @@ from us_sim.volume.files.dicom.stated_planes import stated_planes
 from us_sim.volume.files.dicom.values import items, number, numbers, text, whole
 from us_sim.volume.files.segments import Segment
 
-__all__ = ["DicomSegmentation", "read_segmentation"]
-
 _MOST = 1 << 28  # voxels
 
 

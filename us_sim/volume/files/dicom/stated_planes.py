@@ -15,8 +15,6 @@ from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.planes import Plane, image_axes
 from us_sim.volume.files.dicom.values import items, number, numbers, text, value
 
-__all__ = ["image_kinds", "image_times", "is_cine", "stated_planes"]
-
 _ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _CINE = (0x00181063, 0x00181065)  # FrameTime, FrameTimeVector
 _PLACES = (

@@ -21,8 +21,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["items", "number", "numbers", "private", "quiet", "text", "value", "whole"]
-
 
 @contextmanager
 def quiet() -> Iterator[None]:

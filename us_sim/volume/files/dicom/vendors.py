@@ -25,8 +25,6 @@ from us_sim.volume.files.dicom.header import DicomFile
 from us_sim.volume.files.dicom.planes import Plane
 from us_sim.volume.files.dicom.values import number, numbers, private, text, value, whole
 
-__all__ = ["hidden_volume", "is_cartesian", "one_image_after_another", "vendor_planes"]
-
 _CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
 _CENTIMETRES = 10.0  # mm
 _ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
