@@ -52,8 +52,8 @@ PROBES = Choice(
     error=ProbeError,
     needs=True,
     linear="us_sim.slicing.probe.probe:LinearProbe",
-    convex="us_sim.slicing.probe.fan_probe:ConvexProbe",
-    sector="us_sim.slicing.probe.fan_probe:SectorProbe",
+    convex="us_sim.slicing.probe.probe:ConvexProbe",
+    sector="us_sim.slicing.probe.probe:SectorProbe",
 )
 
 COLLIDERS = Choice(

@@ -1,4 +1,6 @@
-"""A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out.
+"""What the viewer opens: the scene in three dimensions, the image, curves and states.
+
+A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out.
 
 >>> from pathlib import Path
 >>> from us_sim.progress import late_progress
@@ -10,19 +12,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import rerun.blueprint as views
+from rerun.encodings import AbsoluteTimeRange
 
 from us_sim.errors import BagError, UsSimError
 from us_sim.nodes.conversions import nanoseconds_of
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.topic import BagTopic
 from us_sim.settings.spelling import counted
-from us_sim.to_rerun.rerun_file import RerunFile, require_rerun
+from us_sim.to_rerun.converters import CURVES, IMAGE
+from us_sim.to_rerun.rerun_file import STAMP, RerunFile, require_rerun
 
 if TYPE_CHECKING:
-    from us_sim.to_rerun.shown import Shown
+    from us_sim.to_rerun.converters import Shown
+
+
+_BACKGROUND = (14, 17, 19)
+_FROM, _AT, _UP = (0.11, -0.16, -0.11), (0.0, 0.0, 0.012), (0.0, 0.0, -1.0)
+"""Where the eye is, what it looks at, and what is up, in `patient`, m: +z is into the tissue."""
+_TITLES = {
+    "rate": "Rates, Hz",
+    "latency": "Latency of the nodes, ms",
+    "residual": "Residuals",
+}
+
+
+def blueprint_of(
+    shown: Collection[str], images: Collection[str], frame: str, span: tuple[int, int] | None
+) -> Any:
+    """Views of what is there.
+
+    Args:
+        shown: entities of topics that have messages.
+        images: those of them that are images.
+        frame: that the scene is seen in.
+        span: ns since 1970, from the first stamp of a pose to the last, which is played; None where
+            there are none.
+    """
+    scene = views.Spatial3DView(
+        origin="/",
+        name="Scene",
+        contents=["/**", *(f"- /{image}" for image in images), "- /diagnostics/**"],
+        spatial_information=views.SpatialInformation(frame),
+        background=_BACKGROUND,
+        line_grid=False,
+        eye_controls=views.EyeControls3D(position=_FROM, look_target=_AT, eye_up=_UP),
+    )
+    ordered = sorted(images, key=lambda image: (image != IMAGE, image))
+    beside = [views.Spatial2DView(origin=image, name=image) for image in ordered]
+    curves = []
+    if "probe/wrench" in shown:
+        curves.append(views.TimeSeriesView(origin="probe/wrench", name="Force on the probe, N"))
+    if "diagnostics" in shown:
+        curves += [
+            views.TimeSeriesView(origin=f"diagnostics/{curve}", name=_TITLES[curve])
+            for curve in CURVES.values()
+        ]
+        curves.append(views.TextLogView(origin="diagnostics/state", name="States"))
+    right = []
+    if beside:
+        right.append(views.Tabs(*beside, active_tab=0))
+    if curves:
+        right.append(views.Tabs(*curves, active_tab=0))
+    whole = views.Horizontal(scene, views.Vertical(*right, row_shares=[2, 1][: len(right)]))
+    selection = None if span is None else AbsoluteTimeRange(*span)
+    time = views.TimePanel(
+        timeline=STAMP,
+        time_selection=selection,
+        loop_mode=None if span is None else "selection",
+        state="collapsed",
+    )
+    return views.Blueprint(whole if right else scene, time, collapse_panels=True)
+
 
 _OF_POSES = ("/tf", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 """Topics whose messages are stamped as poses are."""
@@ -60,14 +125,16 @@ class _Conversion:
     """Which messages of a bag are logged by whom."""
 
     def __init__(self, bag: Bag, tell: Callable[[float, str], None]) -> None:
-        from us_sim.to_rerun.clouds import Clouds
-        from us_sim.to_rerun.diagnostics import Diagnostics
-        from us_sim.to_rerun.images import Images
-        from us_sim.to_rerun.markers import Markers
-        from us_sim.to_rerun.skin import Skin
-        from us_sim.to_rerun.texts import Texts
-        from us_sim.to_rerun.transforms import Transforms
-        from us_sim.to_rerun.wrenches import Wrenches
+        from us_sim.to_rerun.converters import (
+            Clouds,
+            Diagnostics,
+            Images,
+            Markers,
+            Skin,
+            Texts,
+            Transforms,
+            Wrenches,
+        )
 
         self._bag, self._tell = bag, tell
         self.left_out: list[str] = []
@@ -99,7 +166,7 @@ class _Conversion:
 
     def _carry_structures(self, there: dict[str, BagTopic]) -> None:
         """Make the structures from the scene where they were not recorded."""
-        from us_sim.to_rerun.structures import REST, TETRAHEDRA, Structures
+        from us_sim.to_rerun.converters import REST, TETRAHEDRA, Structures
 
         if "/tissue/structures" in there or not {REST, TETRAHEDRA} <= there.keys():
             return
@@ -112,7 +179,7 @@ class _Conversion:
 
     def write(self, file: RerunFile) -> None:
         """Log all messages, and what the viewer opens."""
-        from us_sim.to_rerun.blueprint import blueprint_of
+        from us_sim.to_rerun.conversion import blueprint_of
 
         total = sum(self._there[name].message_count for name in self.shown)
         refused: dict[str, tuple[int, str]] = {}

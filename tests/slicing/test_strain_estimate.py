@@ -7,13 +7,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from us_sim.errors import ProbeError
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.slicing.strain.compression import compression
-from us_sim.slicing.strain.estimate import estimate_strain
-from us_sim.slicing.strain.least_squares import slope
-from us_sim.slicing.strain.settings import Strain
-from us_sim.slicing.strain.tracking import track
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.settings import Strain
+from us_sim.slicing.strain import compression
+from us_sim.slicing.strain_estimate import estimate_strain, slope, track
 
 LINEAR = LinearProbe(aperture=0.03, depth=0.04, columns=150, rows=400, lines=128, samples=400)
 PROBES = (
