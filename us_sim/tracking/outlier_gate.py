@@ -1,9 +1,9 @@
 """The gate that refuses poses to which no probe could have come, or not so soon.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.filter.settings import GateSettings
+>>> from us_sim.tracking.settings import GateSettings
 >>> from us_sim.tracking.measurement import Measurement
->>> from us_sim.tracking.filter.outlier_gate import OutlierGate
+>>> from us_sim.tracking.outlier_gate import OutlierGate
 >>> gate = OutlierGate(GateSettings(maximum_speed="1 m/s", jump="5 mm", accept_after=3))
 >>> [gate.judge(Measurement(k * 10_000_000, Pose([x, 0, 0]))).value
 ...  for k, x in enumerate([0.0, 0.5, 0.01, 0.2, 0.2, 0.2])]
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.se3 import rotation_between
-from us_sim.tracking.filter.settings import GateSettings
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import GateSettings
 
 _DIAGONAL = np.diag_indices(6)
 

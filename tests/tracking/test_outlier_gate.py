@@ -10,9 +10,9 @@ from scipy.stats import chi2
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
-from us_sim.tracking.filter.outlier_gate import OutlierGate, Verdict
-from us_sim.tracking.filter.settings import GateSettings
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.outlier_gate import OutlierGate, Verdict
+from us_sim.tracking.settings import GateSettings
 
 BELIEVED, REFUSED, NEW_PLACE = Verdict.BELIEVED, Verdict.REFUSED, Verdict.NEW_PLACE
 MS = 1_000_000

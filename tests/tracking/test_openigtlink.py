@@ -14,16 +14,16 @@ from igtl_peers import PlainServer, free_port, pyigtl_server, wait_until
 from pyigtl.messages import CRC64, MessageBase
 
 from us_sim.errors import TrackingError
-from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
-from us_sim.tracking.openigtlink.message import (
+from us_sim.tracking.openigtlink import (
     HEADER,
+    OpenIGTLinkClient,
+    OpenIGTLinkServer,
     header_of,
     image_message,
     poses_in,
     transform_message,
 )
-from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
-from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
+from us_sim.tracking.settings import OpenIGTLinkSettings
 
 MATRIX = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])  # mm
 STAMP = 1_700_000_000_250_000_000  # ns

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from us_sim.errors import TrackingError
 from us_sim.geometry import se3
-from us_sim.tracking.mouse.settings import SixDofMouseSettings
-from us_sim.tracking.mouse.six_dof_mouse import SixDofMouse
+from us_sim.tracking.mouse import SixDofMouse
+from us_sim.tracking.settings import SixDofMouseSettings
 
 MS = 1_000_000
 PLAIN = {
