@@ -284,7 +284,7 @@ class Simulation:
         state, fraction = "running", 1.0
         if self._making is not None:
             fraction, what = self._made
-            state = f"loading {_short(self._asked[0])}: {what}, {100 * fraction:.0f} %"
+            state = f"loading {_short(self._asked[0])}: {what}"
         elif waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"

@@ -268,7 +268,7 @@ class Supervisor:
     def _look_at_the_disk(self) -> None:
         """Note it when the recorder cannot write any more; it may again when there is room."""
         node = self._monitor.node
-        is_full = "rejected disk" in node.reports.get(RECORDER, {})
+        is_full = node.rejected(RECORDER, "disk") > 0
         if is_full and not self._is_disk_full:
             what = f"could not write any more ({node.messages[RECORDER]})"
             self._note(self._loss(RECORDER, what, ""))
