@@ -130,7 +130,7 @@ def _strain() -> None:
 
 def _track_marker() -> None:
     from us_sim.tracking.camera.rigid_body import RigidBody
-    from us_sim.tracking.camera.warm_up import practice
+    from us_sim.tracking.camera.source import practice
 
     practice(RigidBody.single("4X4_50", 7, 0.04))
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
 from us_sim.recording.plus_recording import read_tracker_recording
-from us_sim.tracking.calibration.position_signal import (
+from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     signal_of_images,
     signal_of_positions,
