@@ -39,6 +39,7 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.strain import AxialStrain, compression, strain_scale
 from us_sim.slicing.strain_estimate import estimate_strain, require_short_windows
 from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 _APART = 1.5e-4
 """m, that the probe moves on at most between two images that are compared: some samples."""

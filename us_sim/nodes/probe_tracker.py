@@ -43,6 +43,9 @@ from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filter.pose_filter import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement
 from us_sim.tracking.state import TrackingState
+from us_sim.slicing.probe.outline import image_outline
+from us_sim.tracking.filters import PoseFilter, create_filter
+from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 
 OWN = "probe_tracker"
 FARTHEST = 100.0
