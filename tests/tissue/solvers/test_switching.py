@@ -1,9 +1,4 @@
-"""Switching between solvers, and comparing two on the same poses.
-
-Kernels are compiled before the first frame, and in another process where one goes on.
-
-Making a solver in a thread: the newest plan wins, a failure is told, and nobody waits.
-"""
+"""Switching between solvers, compiling them in another process, and preparing them in a thread."""
 
 import importlib
 import itertools
