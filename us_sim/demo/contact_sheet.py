@@ -38,7 +38,6 @@ from us_sim.slicing.flow.doppler import ColourDoppler
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.strain import AxialStrain, compression, strain_scale
 from us_sim.slicing.strain_estimate import estimate_strain, require_short_windows
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 _APART = 1.5e-4
