@@ -129,7 +129,7 @@ class TissueSolver(ABC):
                 f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
             )
         self._settled = False
-        return replace(self._last, action=action, is_balanced=False)
+        return replace(self._last, action=action, has_failed=True, is_balanced=False)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""

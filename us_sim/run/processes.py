@@ -1,159 +1,166 @@
-"""The node processes of a scene: which run with which parameters, and how they end together."""
+"""Node processes: started, read, told to end, and ended together, the recorder last."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
+import json
 import os
-import secrets
 import signal
+import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
-import yaml
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError, memory_limit, printable
-from us_sim.nodes.session_settings import SessionRecorderSettings
-from us_sim.nodes.settings import checked_parameters
-from us_sim.run.deferred_signals import deferred_signals
-from us_sim.run.forking import ForkServer
-from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
-from us_sim.scene.scene import Scene
-from us_sim.settings.setting import rules_of
-from us_sim.share import full_path
-from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
+from us_sim.run.fork_server import ForkedProcess, ForkServer, end_with_parent, package_on_path
+from us_sim.run.plan import (
+    RECORDER,
+    VIEWER,
+    NodeProcess,
+)
 
-__all__ = [
-    "NodeProcess",
-    "Parameters",
-    "ProcessGroup",
-    "ending",
-    "keep_on_this_host",
-    "parameters_file",
-    "player_settings",
-    "recorder_of",
-    "scene_settings",
-    "simulation_nodes",
-    "video_settings",
-    "viewer_process",
-]
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-Parameters = dict[str, dict[str, str]]
-"""Parameters given by a person: YAML texts by node and name."""
+
+@contextlib.contextmanager
+def deferred_signals() -> Iterator[None]:
+    """SIGINT, SIGTERM and SIGHUP that come within the context are handled at its end.
+
+    Where they are ignored, or not handled in Python, nothing changes; in other threads than the
+    main one neither, since no handler runs there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handlers = {
+        number: handler for number in _NUMBERS if callable(handler := signal.getsignal(number))
+    }
+    for number in handlers:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for each in came:
+            handlers[signal.Signals(each)](each, None)
+
+
+COMPLAINT = "us_sim: "
+"""With which a node begins to say why it cannot work."""
+STOP_S = 0.8
+"""How long nodes may take to end before the recorder is told to."""
+# Of `us_sim.nodes.standby`, which needs rclpy.
+STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
+
+
+class RunningNode:
+    """A node's process, and the thread that reads what it says.
+
+    Args:
+        node: what it runs.
+        show: what is done with its lines; None for one that stands by.
+        forks: that it is forked from, where that can be.
+    """
+
+    def __init__(
+        self,
+        node: NodeProcess,
+        show: Callable[[str], None] | None,
+        forks: ForkServer | None = None,
+    ) -> None:
+        command = node.command()
+        environment = os.environ | {"PYTHONPATH": package_on_path()}
+        environment |= node.secrets
+        environment |= {} if show else {STANDBY: "1"}
+        self.node = node
+        is_fed = show is None
+        forked = forks.fork(node.node, command, environment, is_fed=is_fed) if forks else None
+        self.process: subprocess.Popen[str] | ForkedProcess = forked or subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE if is_fed else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=environment,
+            start_new_session=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        )
+        self.complaint = ""  # why it cannot work
+        self.said = ""
+        self.told = False  # that it has ended
+        self._show = show
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        try:
+            self.reader.start()
+        except RuntimeError as error:
+            self.process.kill()
+            self.process.wait()
+            told = [f"{node.node} cannot be followed: {error}", memory_limit()]
+            raise UsSimError("; ".join(filter(None, told))) from None
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.strip():
+                self.said = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
+            if line.startswith(COMPLAINT):
+                self.complaint = self.said
+            if self._show is not None:
+                self._show(line)
+
+    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
+        """Run the node in earnest, as it is wanted now, after standing by; whether it can."""
+        assert self.process.stdin is not None
+        if self.said != STANDING_BY:
+            self.kill()
+            return False
+        self.node, self._show = node, show
+        try:
+            self.process.stdin.write(json.dumps(node.arguments()) + "\n")
+            self.process.stdin.close()
+        except OSError:
+            return False
+        return True
+
+    def tell_to_end(self) -> None:
+        """SIGTERM, which one that was stopped gets, too."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            self.process.send_signal(signal.SIGCONT)
+
+    def wait(self, seconds: float) -> None:
+        """Wait for its end, at most so long."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(max(seconds, 0.0))
+
+    def wait_after_sigterm(self, seconds: float) -> None:
+        """Tell it to end, and wait at most so long."""
+        self.tell_to_end()
+        self.wait(seconds)
+
+    def kill(self) -> bool:
+        """End it for certain; whether it had not ended by itself."""
+        if self.process.poll() is not None:
+            return False
+        self.process.kill()
+        self.wait(STOP_S)  # one that waits for a disk ends when that answers
+        return True
+
 
 # Of `us_sim.nodes.process`, which needs rclpy.
 INTERRUPTED = 130
-RECORDER, VIEWER = "session_recorder", "viewer"
 RECORDER_STOP_S = 10.0
 """How long the recorder may take to write what it still holds."""
 HUNG_STOP_S = 2.0
 """How long a node that hangs may take to end by itself, before it is killed."""
-
-
-def simulation_nodes(
-    scene: Scene, parameters: Parameters | None = None, *, played: bool = False
-) -> list[NodeProcess]:
-    """The nodes that ``scene`` needs.
-
-    Args:
-        scene: what they work on.
-        parameters: extra ones by node, as YAML texts.
-        played: a path is played on ``tracker/pose``, whatever the scene's tracker is.
-
-    Raises:
-        UsSimError: a parameter is for a node that this scene does not run.
-    """
-    given = dict(parameters or {})
-    common = scene_settings(scene)
-    nodes = [
-        NodeProcess(
-            part.node,
-            common | ({"source": "pose"} if played and part.node == "probe_tracker" else {}),
-            checked_parameters(part.node, scene, given.pop(part.node, {})),
-        )
-        for part in scene.parts()
-        if part.needed
-    ]
-    if given:
-        raise UsSimError(
-            f"--param {next(iter(given))}: this scene does not run such a node; it runs "
-            f"{', '.join(process.node for process in nodes)}"
-        )
-    return nodes
-
-
-def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
-    """The process that shows the simulation in browsers, at an address that it says itself."""
-    settings: dict[str, object] = {"host": view.host, "port": view.port}
-    if view.recordings:
-        settings["recordings"] = view.recordings
-    return NodeProcess(VIEWER, settings, given or {}, secrets={TOKEN: _viewer_token()})
-
-
-@functools.cache
-def _viewer_token() -> str:
-    """One for as long as this program runs: pages find a viewer that was started again by it.
-
-    A person who has set one in the environment keeps it from one run to the next.
-    """
-    return os.environ.get(TOKEN) or secrets.token_urlsafe(16)
-
-
-def scene_settings(scene: Scene) -> dict[str, object]:
-    """The parameters that tell a node the scene, as every node takes them."""
-    settings: dict[str, object] = {"scene": scene.origin}
-    if scene.volume.file:
-        settings["volume"] = scene.volume.file
-    return settings
-
-
-def parameters_file(processes: Sequence[NodeProcess]) -> str:
-    """The parameters of nodes as ROS reads them with ``--params-file``."""
-    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
-    text: str = yaml.safe_dump(document, sort_keys=False)
-    return text
-
-
-def player_settings(
-    scene: Scene, path: Path, recorder: SessionRecorderSettings | None, topic: str = ""
-) -> dict[str, object]:
-    """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
-    return {
-        "path": str(full_path(path)),
-        "topic": topic,
-        **_awaited(["tracker/pose", *scene.ready_topics], recorder),
-    }
-
-
-def video_settings(
-    scene: Scene, video: Path, info: Path, recorder: SessionRecorderSettings | None
-) -> dict[str, object]:
-    """Parameters of a ``camera_driver`` that begins when all of the scene's nodes are ready."""
-    return {
-        "source": str(video),
-        "camera_info": str(info),
-        **_awaited(["camera/camera_info", *scene.ready_topics], recorder),
-    }
-
-
-def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
-    """Parameters that have a player wait for these topics, and for a recorder to record them."""
-    recorded = [topic for topic in topics if recorder and recorder.records(f"/{topic}")]
-    return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
-
-
-def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
-    """The settings of the recorder among them."""
-    for process in processes:
-        if process.node == RECORDER:
-            known = rules_of(SessionRecorderSettings).keys() & process.all_parameters
-            values: Any = {name: process.all_parameters[name] for name in known}
-            return SessionRecorderSettings(**values)
-    return None
 
 
 def keep_on_this_host(*, network: bool) -> None:
