@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from us_sim.errors import UsSimError
-from us_sim.run.supervision_settings import SupervisionSettings
-from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.run.watch import SupervisionSettings
+from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:

@@ -63,7 +63,7 @@ def _add_demo_options(demo: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     with ForkServer() as forks:  # which imports what the nodes need while this process does
         from us_sim.run.live import demo
@@ -118,7 +118,7 @@ def _add_run_options(run: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     asked = read_settings(args, RunSettings)
     if args.dry_run:
@@ -242,7 +242,7 @@ def _view(args: argparse.Namespace) -> int:
     )
     from us_sim.command.simulation import RunSettings
     from us_sim.errors import UsSimError
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     parameters = node_parameters(args.param)
     if args.attach:
