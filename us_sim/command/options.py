@@ -1,10 +1,10 @@
 """Options of commands: made from settings, and those of every command that takes a scene.
 
-A field of settings without a default is a positional argument, or a required option where it is keyword-only;
-a field with one is an option, and a flag where it is a truth.
+A field of settings without a default is a positional argument, or a required option where it is
+keyword-only; a field with one is an option, and a flag where it is a truth.
 
 >>> import argparse
->>> from us_sim.tracking.calibration.settings import ClockSettings
+>>> from us_sim.command.calibration_settings import ClockSettings
 >>> parser = argparse.ArgumentParser()
 >>> add_setting_options(parser, ClockSettings)
 >>> args = parser.parse_args(["a.mcap", "b.mcap", "--largest", "2 min", "--images"])
