@@ -139,7 +139,7 @@ def add_segment(commands: Any) -> None:
 
 
 def _add_segment_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.volume.segmentation.request import SegmentRequest
+    from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 
     add_setting_options(parser, SegmentRequest)
@@ -149,7 +149,7 @@ def _add_segment_options(parser: argparse.ArgumentParser) -> None:
 
 def _segment(args: argparse.Namespace) -> int:
     from us_sim.volume.segmentation.case_segmentation import segment_as_asked
-    from us_sim.volume.segmentation.request import SegmentRequest
+    from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 
     asked = read_settings(args, SegmentRequest)
@@ -177,8 +177,7 @@ def add_cases(commands: Any) -> None:
 
 def _cases(args: argparse.Namespace) -> int:
     from us_sim.errors import UsSimError
-    from us_sim.volume.cases.listing import listed, table
-    from us_sim.volume.cases.roots import case_roots, cases_in
+    from us_sim.volume.cases.case import case_roots, cases_in, listed, table
 
     if args.picture is not None and args.picture.suffix.lower() != ".png":
         raise UsSimError(f"--picture {args.picture}: must be a file that ends in .png")
