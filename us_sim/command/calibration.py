@@ -1,4 +1,4 @@
-"""The calibrations of `us-sim calibrate`: they read files, write files, and return a sentence.
+"""The calibrations of `us-sim calibrate`: they read files, write files, and return a sentence."""
 
 from __future__ import annotations
 
