@@ -1,6 +1,6 @@
-"""The settings of a calibration: each field is an option of ``us-sim calibrate``.
+"""The options of `us-sim calibrate`, each a field of settings.
 
->>> from us_sim.tracking.calibration.settings import ClockSettings
+>>> from us_sim.command.calibration_settings import ClockSettings
 >>> ClockSettings("tracker.mcap", "video.mcap", largest="300 ms").largest
 0.3
 """
@@ -14,15 +14,11 @@ from pathlib import Path
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tracking.settings import BOARDS_OF_MARKERS
+from us_sim.tracking.settings import BOARD_LENGTH, BOARDS
 
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""
 
-BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
-"""The kinds of boards for calibrating a camera."""
-BOARD_LENGTH = Quantity("length", 0.0, 10.0)
-"""Sides and distances on a board; 0 where the board has none such."""
 _PIXEL = Quantity("length", 1e-6, 0.01)
 _PLACE = Quantity("image distance", -1e5, 1e5)
 _POSE = (
