@@ -1,7 +1,7 @@
 """A video of a probe's path, as the camera of a scene would take it: rendered once, and kept.
 
-The camera stands still where the scene's registration says; the markers on the grip are those of
-the scene's body, where the calibration says. So where the probe truly is in each image is known.
+The camera stands where the scene's registration says, and the markers on the grip are those of the
+scene's body; so the true pose in each image is known.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One picture of several cases: what the probe sees in each where it starts."""
+"""One picture of several cases: the probe's first image of each."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
-"""Strain in a session while it is pressed fastest: of the tissue itself, and as it is estimated.
+"""Pictures of a session: around the press, lumen areas, strain and colour Doppler.
 
-Colour Doppler of a session's vessels: touched, under the full press, and let go.
-
-A press across vessels meets their flow at right angles, where no beam sees it. So these pictures
-are of the tissue as it was recorded, on a plane that is tilted along the vessels, as a sonographer
-tilts the probe; and each is of the systole next to its moment.
-
-One picture of a session: images before, during and after the press, and the lumen areas.
+A press across vessels meets their flow at right angles, where no beam sees it. So the pictures of
+colour Doppler are of the recorded tissue on a plane that is tilted along the vessels, each at the
+systole next to its moment.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What a recorded session shows: counts, latency, and the lumen areas over time.
-
-How far the path that a camera tracked is from the true one.
-"""
+"""A recorded session measured: counts, latency, lumen areas, and the error of a tracked path."""
 
 from __future__ import annotations
 

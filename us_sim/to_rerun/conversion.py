@@ -1,23 +1,4 @@
-"""A recording of rerun that is being written: a file that is there when it is whole.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.to_rerun.conversion import RerunFile, require_rerun
->>> require_rerun()  # doctest: +SKIP
->>> file = Path(tempfile.mkdtemp()) / "session.rrd"
->>> with RerunFile(file, "session") as recording:  # doctest: +SKIP
-...     recording.at(stamp=1_700_000_000_000_000_000, recorded=1_700_000_000_004_000_000)
-...     recording.log("probe/force", rerun.Scalars([0.0, 0.0, -2.5]))
-
-A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out.
-
->>> from pathlib import Path
->>> from us_sim.progress import late_progress
->>> from us_sim.to_rerun.conversion import to_rerun
->>> progress = late_progress("to rerun")
->>> to_rerun(Path("demo/session.mcap"), Path("demo/session.rrd"), progress)  # doctest: +SKIP
-[]
-"""
+"""A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out."""
 
 from __future__ import annotations
 

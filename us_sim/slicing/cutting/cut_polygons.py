@@ -1,17 +1,16 @@
-"""The polygons in which an image cuts tetrahedra, and the maps from pixels to rest.
+"""Polygons in which an image cuts tetrahedra, their pixels, and the outline of the mesh at rest.
 
 A node on the plane counts as above it, so that every cut is a triangle or a quadrilateral between
-crossings of the plane with edges of the mesh. A crossing is computed from its edge alone and
-always from the upper node down. So tetrahedra with an edge in common have the very same corner, and
-those with a face in common the very same side.
+crossings of the plane with edges of the mesh. A crossing is computed from its edge alone, from the
+upper node down, so that neighbouring tetrahedra have the very same corners and sides. The cuts of
+outer faces are kept too, as closed outlines: triangles, segments or points.
 
-That rule leaves out what only touches the plane from above. The mesh includes its outer surface, so
-the cuts of its outer faces are kept too, as closed outlines: triangles, segments or points.
+Scan conversion: a row belongs to a side of a polygon from its upper end to just above its lower
+end, and a column to a polygon from its left side to just before its right side. So no pixel between
+two polygons is missed and none is written twice.
 
-The area where an image cuts the mesh at rest, from the mesh's outer faces alone.
-
-Tissue that was there and moved away leaves black behind. How often the outer faces wind around a
-pixel says whether it lies in the mesh: their crossings with its row are counted from the left.
+Tissue that moved away leaves black behind: how often the outer faces of the mesh at rest wind
+around a pixel says whether it lay in the mesh.
 """
 
 from __future__ import annotations

@@ -1,31 +1,12 @@
-"""Scan conversion: which columns of each row of an image lie in which cut.
+"""Grey values of an image from its spans, a row of pixels at a time.
 
-A row belongs to a side of a polygon from its upper end to just above its lower end, and a column
-to a polygon from its left side to just before its right side. Since two tetrahedra compute the
-side between them from the same corners, no pixel is missed there and none is written twice.
-
-Grey values of an image from its spans, a row of pixels at a time.
-
-Where the pixels of a row lie at rest is written span after span, and only then are they sampled,
-so that neither the loads nor the arithmetic stop at the short spans of a fine mesh. Coordinates
-are fixed-point numbers, accurate to a ten-thousandth of a voxel, and grey values are blended in
-16 bits, 32 pixels at a time on a processor with vectors of 512 bits, to a tenth of a level.
+Coordinates at rest are written span after span and only then sampled, so that short spans of a fine
+mesh stop neither loads nor arithmetic. They are fixed-point numbers, accurate to a ten-thousandth
+of a voxel, and grey values are blended in 16 bits, 32 pixels at a time with vectors of 512 bits, to
+a tenth of a level. Two vector operations that numba lacks are written in LLVM's instructions.
 
 Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
 their value; beyond that everything is 0. Values are rounded half up.
-
-Two vector operations that numba lacks, in LLVM's instructions for every processor.
-
->>> import numpy as np
->>> from numba import njit
->>> from us_sim.slicing.cutting.span_sampling import LANES, write_ramp
->>> @njit
-... def write(line):
-...     write_ramp(line, np.uint64(1), np.int32(10), np.int32(3), np.int32(4))
->>> line = np.zeros(1 + LANES, dtype=np.int32)
->>> write(line)
->>> line[:6]
-array([ 0, 10, 13, 16, 19,  0], dtype=int32)
 """
 
 from __future__ import annotations
