@@ -459,7 +459,7 @@ def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
 
 def _require_a_cache() -> None:
     """Raise VolumeError when what is made would be lost, and made again by every node."""
-    from us_sim.volume.phantom.phantom_cache import cache_folder
+    from us_sim.volume.phantom.phantom import cache_folder
 
     folder = cache_folder()
     try:
@@ -495,7 +495,7 @@ def _report(
     summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
     tracked = None
     if video is not None:
-        from us_sim.demo.tracked_path import tracked_path
+        from us_sim.demo.session import tracked_path
 
         tracked = tracked_path(session, video)
         summary["tracked_path"] = tracked.summary
