@@ -17,7 +17,7 @@ from us_sim.share import shared_path
 from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.slicing.strain.settings import Strain
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(

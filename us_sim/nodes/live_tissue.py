@@ -14,9 +14,8 @@ from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.progress import late_progress
 from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.preparation import Failed, Preparation
 from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
 

@@ -25,8 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from us_sim.errors import BagError, PoseError
-from us_sim.geometry.frame_tree import FrameTree
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import FrameTree, Pose
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
 

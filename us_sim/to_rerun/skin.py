@@ -9,7 +9,7 @@ import rerun
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.normals import vertex_normals
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.nodes.conversions import mesh_from, vectors_from
 from us_sim.to_rerun.rerun_file import RerunFile
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 METHOD = "fem_nonlinear"

@@ -20,9 +20,8 @@ from scipy.stats import qmc
 from us_sim.evaluation.stability.meshes import MESHES, fixed_nodes, mesh_named
 from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),

@@ -16,9 +16,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+from us_sim.tissue.mesh.tetrahedral_mesh import (
+    TetrahedralMesh,
+    box_mesh,
+    signed_volumes,
+    uniform_planes,
+)
+from us_sim.tissue.model import face_nodes
 
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
 """What of a tissue is held."""

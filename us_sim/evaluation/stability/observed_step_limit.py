@@ -20,7 +20,7 @@ from us_sim.evaluation.stability.points import damping_factor, spring_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.model import TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
 _AMPLITUDE = 1e-8

@@ -29,10 +29,9 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.springs import springs_of
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 _FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"

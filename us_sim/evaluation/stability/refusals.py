@@ -19,10 +19,9 @@ from us_sim.evaluation.stability.meshes import mesh_named
 from us_sim.evaluation.stability.points import Trial
 from us_sim.geometry.collider import Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
 

@@ -20,7 +20,7 @@ from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
 from skfem.helpers import ddot, div, sym_grad
 
 from us_sim.evaluation.solved import solved
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.materials import volumetric_split
 from us_sim.tissue.model import TissueModel
 
 _MAXIMUM_ITERATIONS = 10_000

@@ -24,7 +24,7 @@ from us_sim.evaluation.tissue.points import Outcome, Point, Timing, compare, hel
 from us_sim.evaluation.tissue.report import table, write_report
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
 from us_sim.progress import Progress
-from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 

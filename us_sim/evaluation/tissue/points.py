@@ -22,9 +22,8 @@ from threadpoolctl import threadpool_limits
 from us_sim.evaluation.row import Row, not_a_column
 from us_sim.evaluation.run_times import RunTimes
 from us_sim.evaluation.tissue.cases import Scene
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver
 
 _PASSES = 3  # along the path; the first is not timed

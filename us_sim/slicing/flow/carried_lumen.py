@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from us_sim.kernels import njit
 from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 _RINGS = 4

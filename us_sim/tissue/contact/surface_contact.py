@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from us_sim.geometry.triangle_parts import part_size
+from us_sim.geometry.triangles import part_size
 from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.penalty_friction import PenaltyFriction
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
-from us_sim.tissue.elasticity.wall import withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import withstood_force
 from us_sim.tissue.model import TissueModel
 
 _FIRMNESS = 30.0

@@ -1,6 +1,6 @@
 """Points spread over the surface that a probe can touch, and what they share with its nodes.
 
-They are in the middles of the triangles' parts (`us_sim.geometry.triangle_parts`) and at the nodes.
+They are in the middles of the triangles' parts (`us_sim.geometry.triangles`) and at the nodes.
 A node that the probe can touch, but no triangle's, is a point by itself.
 
 >>> import numpy as np
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.triangle_parts import TriangleParts
+from us_sim.geometry.triangles import TriangleParts
 from us_sim.kernels import njit
 from us_sim.tissue.model import TissueModel
 

@@ -22,11 +22,14 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.penetration import only_forward, push_out
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
-from us_sim.tissue.elasticity.step_limit import highest_frequency, stabilised, step_limit
-from us_sim.tissue.elasticity.tangling import Tangling
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.elasticity.stability import (
+    ElasticBalance,
+    Tangling,
+    highest_frequency,
+    stabilised,
+    step_limit,
+)
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import COUNT, TissueSolver
 from us_sim.tissue.solvers.spring_tissue import SpringSettings, spring_tissue
 from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMotion, advance_frame
@@ -61,7 +64,7 @@ class Msds(TissueSolver):
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
     so either each mass is raised to what the step set needs or each step is divided. Both follow
     the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
-    turn and stretch (`us_sim.tissue.elasticity.step_limit`).
+    turn and stretch (`us_sim.tissue.elasticity.stability`).
 
     The probe moves from the last pose to the new one over the frame. A node that would enter it
     loses its velocity towards it, which is the measured push, and is put onto its surface.

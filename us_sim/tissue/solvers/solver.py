@@ -27,8 +27,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.rehearsal import rehearsal_model
 
 COUNT = Quantity("number", 1, 10_000)

@@ -7,8 +7,13 @@ from typing import Any
 
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
-from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
+from us_sim.tissue.elasticity.springs import (
+    SpringNetwork,
+    VolumeTerm,
+    fitted_springs,
+    springs_of,
+    volume_term,
+)
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings
 
@@ -66,7 +71,7 @@ def spring_tissue(
     Args:
         model: the tissue.
         settings: of the solver.
-        yielding: as in `us_sim.tissue.elasticity.volume_term.volume_term`.
+        yielding: as in `us_sim.tissue.elasticity.springs.volume_term`.
     """
     mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
     if settings.stiffness == "fitted":

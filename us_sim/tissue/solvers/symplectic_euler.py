@@ -6,7 +6,7 @@ drifts on at its initial speed.
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.tissue.elasticity.springs import SpringArrays
->>> from us_sim.tissue.elasticity.volume_term import VolumeTerm
+>>> from us_sim.tissue.elasticity.springs import VolumeTerm
 >>> from us_sim.tissue.solvers.symplectic_euler import (
 ...     Contact, Particles, ProbeMotion, advance_frame,
 ... )
@@ -28,11 +28,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.turned import turned, turned_back
+from us_sim.geometry.collider_distance import turned, turned_back
 from us_sim.kernels import njit
 from us_sim.tissue.contact.penetration import pushing_gap
-from us_sim.tissue.elasticity.springs import spring_forces
-from us_sim.tissue.elasticity.volume_term import add_volume_forces
+from us_sim.tissue.elasticity.springs import add_volume_forces, spring_forces
 
 
 class Particles(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import UsSimError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import PROBES

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from us_sim.geometry.normals import vertex_normals
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 
 _CORRECTIONS = 4
