@@ -1,4 +1,4 @@
-"""The report of a stiffness fit: a table, a scene with the moduli, and a picture of how they fit."""
+"""Report of a stiffness fit: a table, a scene with the moduli, a picture of how they fit."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def free_stiffness(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
 def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
     """Check that no part of the mesh can move as a rigid body.
 
-    Tetrahedra of a part hang together by faces (`us_sim.tissue.mesh.tetrahedral_mesh.check_mesh` refuses
+    Tetrahedra of a part hang together by faces (`check_mesh` refuses
     hinges), so that three of its nodes hold all of it.
 
     Raises:

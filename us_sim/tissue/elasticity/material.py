@@ -43,7 +43,7 @@ class Material(Settings):
     """Isotropic elastic constants; for `fem_nonlinear`, also the pressure of a vessel's blood.
 
     With a ``lumen_pressure`` it is the inside of a vessel that empties (see
-    `us_sim.tissue.elasticity.neo_hookean_material`), which the solver ``fem_nonlinear`` knows. To the others it is
+    `neo_hookean_material`), which the solver ``fem_nonlinear`` knows. To the others it is
     a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
 
     Raises:

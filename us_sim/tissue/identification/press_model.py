@@ -42,7 +42,7 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 
 _LOCAL_WEIGHT = 12.0
-"""As in `us_sim.tissue.solvers.newton`."""
+"""As in `newton`."""
 
 _TOLERANCE = 1e-6
 """Unbalanced force of a sensitivity, over the force that a modulus changes."""

@@ -1,4 +1,4 @@
-"""Compliance of the surface that a probe can touch, and the displacement field of each force on it."""
+"""Compliance of the surface that a probe can touch, and the field of each force on it."""
 
 from __future__ import annotations
 

@@ -295,7 +295,7 @@ class EmbeddedSurface:
 
         Returns:
             (V, 3) m vertices and (V, 3) unit normals, as
-            `us_sim.geometry.triangles.vertex_normals` says.
+            `vertex_normals` says.
 
         Raises:
             MeshError: there are more or fewer nodes than in the mesh.

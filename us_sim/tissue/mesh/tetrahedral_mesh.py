@@ -55,7 +55,7 @@ def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> N
         idle = np.flatnonzero(~used)
         raise MeshError(
             f"{counted(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
-            f"such as node {idle[0]}: remove them, or let us_sim.tissue.mesh.tetrahedral_mesh do it"
+            f"such as node {idle[0]}: remove them, or call `repair`"
         )
     _check_places(nodes)
     _check_volumes(nodes, tetrahedra)
@@ -117,8 +117,7 @@ def _check_places(nodes: NDArray[np.float64]) -> None:
         node, other = sorted((int(order[same[0]]), int(order[same[0] + 1])))
         raise MeshError(
             f"{counted(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
-            f"lies, such as node {other} on node {node}: join them, or let "
-            f"us_sim.tissue.mesh.tetrahedral_mesh do it"
+            f"lies, such as node {other} on node {node}: join them, or call `repair`"
         )
 
 
@@ -138,8 +137,7 @@ def _check_volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) 
         (
             np.flatnonzero(volumes < -smallest),
             "inverted",
-            "order its nodes so that its volume is positive, or let us_sim.tissue.mesh.tetrahedral_mesh "
-            "do it",
+            "order its nodes so that its volume is positive, or call `repair`",
         ),
     ):
         if len(bad):
@@ -158,7 +156,7 @@ def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
         raise MeshError(
             f"{counted(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
             f"tetrahedron {order[same[0] + 1]}, which has the nodes of tetrahedron "
-            f"{order[same[0]]}: keep each once, or let us_sim.tissue.mesh.tetrahedral_mesh do it"
+            f"{order[same[0]]}: keep each once, or call `repair`"
         )
     order, starts, counts = face_order(tetrahedra)
     crowded = np.flatnonzero(counts > 2)
@@ -238,7 +236,7 @@ class TetrahedralMesh:
     It may be in several parts that touch nowhere.
 
     Raises:
-        MeshError: as `us_sim.tissue.mesh.tetrahedral_mesh.check_mesh`.
+        MeshError: as `check_mesh`.
     """
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient
@@ -346,7 +344,7 @@ def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tu
 
     Raises:
         MeshError: nothing safe can be done about the rest, as
-            `us_sim.tissue.mesh.tetrahedral_mesh.check_mesh` says. Its numbers are those after the repair.
+            `check_mesh` says. Its numbers are those after the repair.
     """
     places = np.asarray(nodes, dtype=np.float64)
     corners: NDArray[Any] = np.asarray(tetrahedra)
