@@ -28,8 +28,7 @@ from us_sim.tissue.mesh.conforming import (
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.decimation import coarsened
-from us_sim.volume.surfaces.structure_surface import structure_surface
+from us_sim.volume.surfaces.structure_surface import coarsened, structure_surface
 from us_sim.volume.volume import Volume
 
 _logger = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ from us_sim.evaluation.latency.run_case import run_case
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.row import failures
 from us_sim.evaluation.timed_cases import timed_cases
-from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
+from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.reading import load_scene
 
 

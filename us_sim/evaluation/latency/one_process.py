@@ -12,7 +12,7 @@ import sys
 import threading
 from typing import Any
 
-from us_sim.run.in_process import node_in_process
+from us_sim.run.lockstep import node_in_process
 
 
 def main(arguments: list[str]) -> int:

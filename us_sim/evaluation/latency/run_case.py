@@ -23,14 +23,9 @@ from us_sim.evaluation.latency.usage import UsageOverTime, usage_of
 from us_sim.evaluation.own_process import start_module
 from us_sim.evaluation.timed_cases import Tell
 from us_sim.recording.reader import read_bag
-from us_sim.run.graph import (
-    NodeProcess,
-    ProcessGroup,
-    player_settings,
-    recorder_of,
-    simulation_nodes,
-)
 from us_sim.run.lockstep import render
+from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
+from us_sim.run.processes import ProcessGroup
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 

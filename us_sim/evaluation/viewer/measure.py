@@ -15,8 +15,8 @@ from us_sim.evaluation.viewer.cases import cases
 from us_sim.evaluation.viewer.points import Point
 from us_sim.evaluation.viewer.report import table, write_report
 from us_sim.evaluation.viewer.run_case import run_case
-from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
+from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.reading import load_scene
 
 
