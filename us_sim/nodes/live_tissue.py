@@ -16,9 +16,6 @@ from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.preparation import Failed, Preparation
-from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
-from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 
 OWN = "tissue_deformer"

@@ -10,13 +10,9 @@ from us_sim.evaluation.tissue.cases import Scene
 from us_sim.evaluation.tissue.linear_equations import LinearEquations
 from us_sim.evaluation.tissue.points import Outcome
 from us_sim.evaluation.tissue_methods import Setting, TissueMethod
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import create_solver
 
 _FRAMES = 400  # at the last pose, at the most

@@ -13,10 +13,6 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import shown, unknown
 from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
 from us_sim.tissue.mesh.tetrahedral_mesh import KINDS as KINDS_OF_MESH
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
-from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
-from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 AROUND = "tissue"
