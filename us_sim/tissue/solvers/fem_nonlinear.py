@@ -50,7 +50,7 @@ from us_sim.tissue.elasticity.neo_hookean import PronyBranch
 from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.newton import Newton, strides
 from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
 

@@ -37,7 +37,6 @@ from us_sim.settings.setting import Settings
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import rehearsal_model
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""

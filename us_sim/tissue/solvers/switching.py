@@ -51,7 +51,6 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, rehearsal_model
-from us_sim.tissue.solvers.switching import compiled_solver
 
 
 @dataclass(frozen=True)
