@@ -1,21 +1,18 @@
-"""Draws docs/architecture.png: the rooms of the package, and who imports whom, read from the code.
+"""Read the structure of the package from its code, and draw it: docs/architecture.png.
 
 python docs/architecture.py
+
+The tests of the structure read it with the same functions.
 """
 
 from __future__ import annotations
 
 import ast
+import functools
+from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-
 PACKAGE = Path(__file__).resolve().parents[1] / "us_sim"
-PICTURE = Path(__file__).with_suffix(".png")
 
 LAYERS = (
     ("compose and measure", (("command",), ("run", "evaluation", "to_rerun"), ("demo", "", ""))),
@@ -35,41 +32,73 @@ LAYERS = (
 
 BESIDE = "standalone"
 """The room that stands beside the others: it imports none, and the nodes alone know of it."""
-COLOURS = ("#dce9f7", "#fbe6cf", "#e0f0dc")
+
+FILES = {
+    ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in sorted(PACKAGE.rglob("*.py"))
+}
+"""The file of each module, by its dotted name."""
 
 
-def imports_of(file: Path) -> set[str]:
-    """The modules of this package that a file imports, also in functions; not those for types."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            node.body = []
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    return {name for name in found if name.startswith("us_sim.")}
+@functools.cache
+def tree(module: str) -> ast.Module:
+    """The syntax tree of a module."""
+    return ast.parse(FILES[module].read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imports(module: str, *, lazy: bool = True) -> frozenset[str]:
+    """Modules of any package that a module imports at run time, and not for its types alone.
+
+    Args:
+        lazy: also those imported within functions.
+    """
+
+    def within(nodes: list[ast.stmt]) -> Iterator[str]:
+        for node in nodes:
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                folder = FILES[module].relative_to(PACKAGE.parent).parts[: -node.level or None]
+                parts = [*(folder if node.level else ()), *filter(None, [node.module])]
+                origin = ".".join(parts)
+                for alias in node.names:
+                    inner = f"{origin}.{alias.name}"
+                    yield inner if inner in FILES else origin
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not lazy:
+                continue
+            elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                yield from within(node.orelse)
+            else:
+                for block in ("body", "orelse", "handlers", "finalbody", "cases"):
+                    yield from within(getattr(node, block, []))
+
+    return frozenset(within(tree(module).body))
+
+
+def room_of(module: str) -> str:
+    """The room that a module of this package is in; its own name where it stands at the top."""
+    return module.split(".")[1] if "." in module else ""
 
 
 def rooms() -> dict[str, str]:
-    """What each room says of itself in its ``__init__.py``, by its name."""
+    """The description of each room in its ``__init__.py``, by its name."""
     return {
-        file.parent.name: (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "")
+        file.parent.name: ast.get_docstring(tree(f"us_sim.{file.parent.name}")) or ""
         for file in sorted(PACKAGE.glob("*/__init__.py"))
     }
 
 
 def arrows() -> set[tuple[str, str]]:
-    """Which room imports which, by their names."""
-    names, found = set(rooms()), set()
-    for room in names:
-        for file in (PACKAGE / room).rglob("*.py"):
-            others = {module.split(".")[1] for module in imports_of(file)}
-            found |= {(room, other) for other in others & names - {room}}
-    return found
+    """Pairs of rooms, of which the first imports the second."""
+    names = set(rooms())
+    pairs = {
+        (room_of(module), room_of(imported))
+        for module in FILES
+        for imported in imports(module)
+        if imported.startswith("us_sim.")
+    }
+    return {(start, end) for start, end in pairs if start != end and {start, end} <= names}
 
 
 def reached(start: str, pairs: set[tuple[str, str]]) -> set[str]:
@@ -84,8 +113,8 @@ def reached(start: str, pairs: set[tuple[str, str]]) -> set[str]:
     return found
 
 
-def drawn(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
-    """Those arrows that are not implied by a way over other rooms."""
+def not_implied(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Those arrows that no way over other rooms implies."""
     return {
         (start, end)
         for start, end in pairs
@@ -93,11 +122,6 @@ def drawn(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
             end in reached(between, pairs) for begin, between in pairs if begin == start != between
         )
     }
-
-
-def described() -> str:
-    """The arrows of the picture in words; the picture keeps them, so that a test can compare."""
-    return ", ".join(f"{start} -> {end}" for start, end in sorted(drawn(arrows())))
 
 
 def places() -> dict[str, tuple[float, float]]:
@@ -116,9 +140,15 @@ def places() -> dict[str, tuple[float, float]]:
 
 def draw() -> None:
     """Write the picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
     at = places()
     figure, axes = plt.subplots(figsize=(11, 9))
-    for (name, rows), colour in zip(LAYERS, COLOURS, strict=True):
+    for (name, rows), colour in zip(LAYERS, ("#dce9f7", "#fbe6cf", "#e0f0dc"), strict=True):
         high = max(at[room][1] for row in rows for room in row if room) + 0.6
         low = min(at[room][1] for row in rows for room in row if room) - 0.6
         layer = FancyBboxPatch((-6.4, low), 12.4, high - low, boxstyle="round,pad=0.05", lw=0)
@@ -131,7 +161,7 @@ def draw() -> None:
         boxes[room].set(facecolor="white", edgecolor="#333333", zorder=3)
         axes.add_patch(boxes[room])
         axes.text(x, y, room, ha="center", va="center", fontsize=13, zorder=4)
-    for start, end in drawn(arrows()):
+    for start, end in not_implied(arrows()):
         arrow = FancyArrowPatch(
             at[start], at[end], patchA=boxes[start], patchB=boxes[end], arrowstyle="-|>"
         )
@@ -140,8 +170,8 @@ def draw() -> None:
     axes.set_xlim(-6.6, 9.2)
     axes.set_ylim(-0.8, max(y for _, y in at.values()) + 0.8)
     axes.axis("off")
-    metadata = {"Software": None, "Description": described()}
-    figure.savefig(PICTURE, dpi=90, bbox_inches="tight", metadata=metadata)
+    picture = Path(__file__).with_suffix(".png")
+    figure.savefig(picture, dpi=90, bbox_inches="tight", metadata={"Software": None})
     plt.close(figure)
 
 

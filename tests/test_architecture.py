@@ -1,86 +1,87 @@
-"""The layers hold, and docs/architecture.md says what the code says."""
+"""The layers hold, nothing is imported in circles, and docs/architecture.md is of this code."""
 
 import ast
-import functools
 import importlib.util
 import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-DOMAIN_MAY_NOT = ("rclpy", "_msgs", "rcl_interfaces")
+DOMAIN_MAY_NOT = ("rclpy", "_msgs", "rcl_interfaces", "rosbag2_interfaces")
 
 
-def drawing():
-    """docs/architecture.py, which reads the rooms and arrows from the code."""
-    spec = importlib.util.spec_from_file_location("drawing", ROOT / "docs" / "architecture.py")
+@pytest.fixture(scope="module")
+def structure():
+    """docs/architecture.py, which reads rooms and imports from the code."""
+    spec = importlib.util.spec_from_file_location("structure", ROOT / "docs" / "architecture.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-@pytest.fixture(scope="module")
-def picture():
-    module = drawing()
-    module.arrows = functools.cache(module.arrows)  # reads every file
-    return module
+def test_every_room_has_its_place_in_a_layer(structure):
+    assert set(structure.places()) == set(structure.rooms())
 
 
-def test_every_room_has_its_place(picture):
-    assert set(picture.places()) == set(picture.rooms())
-
-
-def test_the_picture_shows_the_arrows_that_there_are(picture):
-    with Image.open(picture.PICTURE) as image:
-        assert image.text["Description"] == picture.described(), (
-            "docs/architecture.png is not of this code: draw it anew with "
-            "`python docs/architecture.py`"
-        )
-
-
-def test_no_arrow_leads_to_a_layer_above(picture):
+def test_no_arrow_leads_to_a_layer_above(structure):
     layer = {
         room: number
-        for number, (_, rows) in enumerate(picture.LAYERS)
+        for number, (_, rows) in enumerate(structure.LAYERS)
         for row in rows
         for room in row
     }
-    up = {
-        (start, end)
-        for start, end in picture.arrows()
-        if picture.BESIDE not in (start, end) and layer[start] > layer[end]
-    }
-    assert not up
+    pairs = {pair for pair in structure.arrows() if structure.BESIDE not in pair}
+    assert not {(start, end) for start, end in pairs if layer[start] > layer[end]}
 
 
-def test_no_arrows_lead_in_a_circle(picture):
-    pairs = picture.arrows()
-    assert not [room for room in picture.rooms() if room in picture.reached(room, pairs)]
+def test_rooms_are_not_in_circles(structure):
+    pairs = structure.arrows()
+    assert not [room for room in structure.rooms() if room in structure.reached(room, pairs)]
 
 
-def test_standalone_stands_beside(picture):
-    pairs = picture.arrows()
-    assert [start for start, end in pairs if end == picture.BESIDE] == ["nodes"]
-    assert not [end for start, end in pairs if start == picture.BESIDE]
+def test_modules_are_not_in_circles(structure):
+    names = structure.FILES.keys()
+    graph = {name: (structure.imports(name, lazy=False) & names) - {name} for name in names}
+    TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_the_domain_knows_nothing_of_ros(picture):
-    domain = [room for row in picture.LAYERS[-1][1] for room in row if room]
-    for room in domain:
-        for file in (picture.PACKAGE / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-                modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-                modules += [n.name for n in node.names] if isinstance(node, ast.Import) else []
-                for module in modules:
-                    assert not module.split(".")[0].endswith(DOMAIN_MAY_NOT), (file, module)
+def test_only_what_provides_rclpy_knows_that_it_may_not_be_there(structure):
+    room = f"us_sim.{structure.BESIDE}"
+    inside = {name for name in structure.FILES if f"{name}.".startswith(f"{room}.")}
+    knows = {name for name in structure.FILES if structure.imports(name) & inside} - inside
+    assert knows == {"us_sim.nodes"}
+    known = {each for name in inside for each in structure.imports(name)} - inside
+    assert not [name for name in known if name.startswith("us_sim")]
 
 
-def test_the_page_has_each_rooms_own_sentence(picture):
+def test_the_domain_knows_nothing_of_ros(structure):
+    domain = {room for row in structure.LAYERS[-1][1] for room in row}
+    for name in structure.FILES:
+        if structure.room_of(name) in domain:
+            roots = {imported.split(".")[0] for imported in structure.imports(name)}
+            assert not [root for root in roots if root.endswith(DOMAIN_MAY_NOT)], name
+
+
+def test_settings_import_no_other_room_and_no_numerical_library(structure):
+    assert not [end for start, end in structure.arrows() if start == "settings"]
+    for name in structure.FILES:
+        if structure.room_of(name) == "settings":
+            roots = {imported.split(".")[0] for imported in structure.imports(name)}
+            assert not roots & {"numpy", "scipy", "numba"}, name
+
+
+def test_a_module_is_no_longer_than_700_lines_and_few_are_at_the_top(structure):
+    texts = {name: file.read_text(encoding="utf-8") for name, file in structure.FILES.items()}
+    assert {name for name, text in texts.items() if len(text.splitlines()) > 700} == set()
+    assert len(list(structure.PACKAGE.glob("*.py"))) <= 7
+
+
+def test_the_page_has_each_rooms_own_sentence(structure):
     told = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", PAGE, re.MULTILINE))
-    said = {room: text.partition("\n")[0] for room, text in picture.rooms().items()}
+    said = {room: text.partition("\n")[0] for room, text in structure.rooms().items()}
     assert {room: told.get(room) for room in said} == said
 
 

@@ -11,7 +11,7 @@ import pytest
 from us_sim.command.main import main
 from us_sim.progress import Progress
 from us_sim.recording.writer import BagWriter
-from us_sim.run.graph import ProcessGroup
+from us_sim.run.processes import ProcessGroup
 from us_sim.run.supervision import say
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 

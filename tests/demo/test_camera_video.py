@@ -12,7 +12,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.scene.reading import load_scene
 from us_sim.scene.tracker_building import camera_body_of, tracker_poses_of
-from us_sim.tracking.camera.info import read_camera_info
+from us_sim.tracking.camera.model import read_camera_info
 from us_sim.tracking.camera.source import CameraSource
 
 STEP = round(1e9 / RATE)

@@ -14,8 +14,8 @@ from us_sim.nodes.settings import NODES, checked_parameters
 from us_sim.scene.reading import load_scene
 from us_sim.share import shared_roots
 from us_sim.tracking.calibration.transform_file import read_transform
-from us_sim.tracking.camera.info import read_camera_info
-from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+from us_sim.tracking.camera.model import read_camera_info
+from us_sim.tracking.camera.rigid_body import read_rigid_body
 
 SMALL = Path(__file__).parents[1] / "small_scene.yaml"
 

@@ -53,12 +53,15 @@ class RemoteControl:
 
     def value(self, name, of="session_control"):
         """A parameter's value now."""
-        from us_sim.nodes.conversions.parameters import raw_from
+        from rcl_interfaces.msg import Parameter as ParameterMessage
+        from rclpy.parameter import Parameter
 
         self.until(self._asking(of).services_are_ready)
         asked = self._asking(of).get_parameters([name])
         self.until(asked.done)
-        return raw_from(asked.result().values[0])[1]
+        return Parameter.from_parameter_msg(
+            ParameterMessage(name=name, value=asked.result().values[0])
+        ).value
 
     def until(self, condition, seconds=100):
         """Listen until that is so."""

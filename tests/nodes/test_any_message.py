@@ -40,8 +40,8 @@ from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.tracking.haptic.contact_model import ContactModel
-from us_sim.tracking.openigtlink.message import HEADER, header_of, poses_in
+from us_sim.tracking.haptic import ContactModel
+from us_sim.tracking.openigtlink import HEADER, header_of, poses_in
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

@@ -15,8 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from us_sim.errors import TrackingError, UsSimError
 from us_sim.nodes.camera_driver import CameraDriver
 from us_sim.nodes.camera_images import camera_from, grey_from
-from us_sim.tracking.camera.info import write_camera_info
-from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.model import CameraModel, write_camera_info
 
 
 @pytest.fixture
@@ -132,7 +131,7 @@ class PaperCamera:
 
 
 def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibration):
-    monkeypatch.setattr("us_sim.tracking.camera.video_source.cv2.VideoCapture", PaperCamera)
+    monkeypatch.setattr("us_sim.tracking.camera.source.cv2.VideoCapture", PaperCamera)
     monkeypatch.setattr("us_sim.nodes.camera_driver.RETRY_S", 0.02)
     PaperCamera.left = 0
     node = bench.make(CameraDriver, source=7, camera_info=str(calibration))

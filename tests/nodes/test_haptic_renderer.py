@@ -19,7 +19,7 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.tracking.haptic.contact_model import ContactModel
+from us_sim.tracking.haptic import ContactModel
 
 TRACKER = (
     "tracker: {source: haptic, frame: arm, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s"

@@ -1,13 +1,14 @@
 """Parameters: what ROS shows of each setting, what may change, and what a change does."""
 
 import importlib
+import json
 import math
 import threading
 from typing import Any
 
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 
@@ -83,16 +84,15 @@ def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene
     for parameter, settings, field in asked:
         rule, kind = rules_of(settings)[field], plain(kinds_of(settings)[field])
         shown = node.describe_parameter(parameter)
-        unit = rule.quantity.unit if rule.quantity else ""
+        told = json.loads(shown.additional_constraints)
         assert rule.description, parameter
-        assert shown.description == (f"{rule.description} ({unit})" if unit else rule.description)
-        dial = dial_unit(rule.quantity) if rule.quantity else ""
-        assert (f"shown in {dial}" in shown.additional_constraints) == (dial != unit)
-        assert ("may change while running" in shown.additional_constraints) == (
-            is_live(settings, field)
+        assert shown.description == rule.description
+        unit, dial = (rule.quantity.unit, dial_unit(rule.quantity)) if rule.quantity else ("", "")
+        assert (told.get("unit", ""), told.get("shown_in", "")) == (unit, dial)
+        assert told["live"] is is_live(settings, field)
+        assert tuple(told.get("choices", ())) == (
+            rule.choice.names if rule.choice else rule.choices
         )
-        for choice in rule.choice.names if rule.choice else rule.choices:
-            assert choice in shown.additional_constraints
         ranges = [*shown.integer_range, *shown.floating_point_range]
         assert len(ranges) == (kind in (int, float) and rule.quantity is not None), parameter
         if ranges:
@@ -266,7 +266,8 @@ def test_what_cannot_be_made_is_set_back_and_said(bench, pressed):
     assert {name: node.get_parameter(name).value for name in asked} == old
     bench.spin_until(
         lambda: any(
-            status.message.startswith("msds: ") and status.message.endswith("; it is set back")
+            status.level == DiagnosticStatus.WARN
+            and KeyValue(key="problem", value="setting") in status.values
             for report in reports
             for status in report.status
         )

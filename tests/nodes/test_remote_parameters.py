@@ -154,7 +154,11 @@ def test_a_foreign_node_s_plain_descriptors_will_do(bench, remote):
     node.declare_parameter(
         "reach",
         0.5,
-        ParameterDescriptor(description="of the arm (m)", floating_point_range=[within]),
+        ParameterDescriptor(
+            description="of the arm (m)",
+            additional_constraints="one of many; in m",
+            floating_point_range=[within],
+        ),
     )
     node.declare_parameter(
         "turns", 1.0, ParameterDescriptor(description="a minute (rpm)", read_only=True)
@@ -163,7 +167,7 @@ def test_a_foreign_node_s_plain_descriptors_will_do(bench, remote):
     known = looked_at(bench, remote, "motor")
     assert (known["speed"].value, known["speed"].unit, known["speed"].low) == (3.5, "", None)
     assert known["name"].kind is Kind.TEXT
-    assert (known["reach"].value, known["reach"].unit, known["reach"].high) == (500.0, "mm", 2000.0)
+    assert (known["reach"].value, known["reach"].unit, known["reach"].high) == (0.5, "", 2.0)
     assert (known["turns"].description, known["turns"].unit) == ("a minute (rpm)", "")
     assert not known["turns"].is_live
     assert (known["unset"].kind, known["unset"].is_live) == (Kind.OTHER, False)

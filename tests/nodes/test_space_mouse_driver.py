@@ -10,7 +10,7 @@ from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.space_mouse_driver import SpaceMouseDriver
-from us_sim.tracking.mouse.space_mouse import SpaceMouse, SpaceMouseReports
+from us_sim.tracking.mouse import SpaceMouse, SpaceMouseReports
 
 # In the device's frame: right, towards the person, down.
 RIGHT, BACK, DOWN = 0, 1, 2

@@ -8,10 +8,10 @@ import pytest
 from us_sim.errors import CalibrationError, SceneError, TrackingError
 from us_sim.scene.document import read_document
 from us_sim.settings.text_file import read_text
-from us_sim.tracking.calibration.landmark_file import read_landmarks, read_wires
+from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires
 from us_sim.tracking.calibration.transform_file import read_transform
-from us_sim.tracking.camera.info import read_camera_info
-from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+from us_sim.tracking.camera.model import read_camera_info
+from us_sim.tracking.camera.rigid_body import read_rigid_body
 
 
 def test_a_pipe_is_read(tmp_path):

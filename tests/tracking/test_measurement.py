@@ -1,11 +1,14 @@
-"""What a covariance must be."""
+"""What a covariance must be.
+
+The state by a table: what comes when, and what it is then.
+"""
 
 import numpy as np
 import pytest
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.measurement import Measurement, TrackingClock, TrackingState
 
 
 def test_a_covariance_that_is_symmetric_but_for_rounding_is_taken():
@@ -23,3 +26,56 @@ def test_a_covariance_that_is_symmetric_but_for_rounding_is_taken():
 def test_what_is_no_covariance_is_refused(covariance):
     with pytest.raises(TrackingError, match=r"finite symmetric \(6, 6\) matrix"):
         Measurement(0, Pose(), covariance)
+
+
+WAITING, TRACKED = TrackingState.WAITING, TrackingState.TRACKED
+COASTING, LOST = TrackingState.COASTING, TrackingState.LOST
+
+# ms, what happens (a pose is believed, the tracking is reset, or nothing), and the state then
+TABLE = [
+    (0, "", WAITING),
+    (10_000, "", WAITING),
+    (10_000, "pose", TRACKED),
+    (10_299, "", TRACKED),
+    (10_300, "", COASTING),
+    (10_999, "", COASTING),
+    (11_000, "", LOST),
+    (99_000, "", LOST),
+    (99_000, "pose", TRACKED),
+    (99_200, "pose", TRACKED),
+    (99_450, "", TRACKED),
+    (99_600, "", COASTING),
+    (99_600, "pose", TRACKED),
+    (99_900, "", COASTING),
+    (50_000, "", TRACKED),  # the clock is set back: the age of the pose counts from now on
+    (50_300, "", COASTING),
+    (51_000, "", LOST),
+    (51_000, "reset", WAITING),
+    (51_001, "", WAITING),
+    (51_002, "pose", TRACKED),
+]
+
+
+def test_states_follow_the_table():
+    clock = TrackingClock(coast_for=0.3, lost_after=1.0)
+    for ms, event, expected in TABLE:
+        now = ms * 1_000_000
+        if event == "pose":
+            clock.seen(now)
+        elif event == "reset":
+            clock.reset()
+        assert clock.state(now) is expected, f"at {ms} ms"
+
+
+def test_without_a_time_to_coast_it_is_lost_at_once():
+    clock = TrackingClock(coast_for=0.5, lost_after=0.5)
+    clock.seen(0)
+    assert [clock.state(ms * 1_000_000) for ms in (499, 500)] == [TRACKED, LOST]
+
+
+@pytest.mark.parametrize(
+    ("coast_for", "lost_after"), [(0.0, 1.0), (2.0, 1.0), (float("nan"), 1.0), (0.3, float("inf"))]
+)
+def test_times_that_make_no_sense_are_refused(coast_for, lost_after):
+    with pytest.raises(TrackingError, match="the first must be positive and the second no less"):
+        TrackingClock(coast_for=coast_for, lost_after=lost_after)

@@ -11,12 +11,11 @@ from us_sim.errors import PoseError, TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import FILTERS
-from us_sim.tracking.filter.outlier_gate import OutlierGate
-from us_sim.tracking.filter.pose_filter import create_filter
-from us_sim.tracking.filter.settings import GateSettings
-from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.filters import create_filter
+from us_sim.tracking.measurement import Measurement, TrackingState
+from us_sim.tracking.outlier_gate import OutlierGate
 from us_sim.tracking.probe_tracking import ProbeTracking
-from us_sim.tracking.state import TrackingState
+from us_sim.tracking.settings import GateSettings
 
 MS = 1_000_000
 START = 5_000_000_000

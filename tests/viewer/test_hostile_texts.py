@@ -1,6 +1,7 @@
 """Texts that others chose, on the page: they are shown as they are, and none becomes part of it."""
 
 import ast
+import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,7 +60,7 @@ def stranger(simulator: Simulator) -> Iterator[None]:
         node = bench.add(Node(name, context=bench.context))
         about = ParameterDescriptor(
             description=EVIL,
-            additional_constraints=f"one of a, {EVIL.replace(',', '')}; may change while running",
+            additional_constraints=json.dumps({"choices": {"a": EVIL, EVIL: EVIL}, "unit": EVIL}),
         )
         for parameter in ("solver", "materials.x.young_modulus", EVIL):
             node.declare_parameter(parameter, EVIL, about)
@@ -68,7 +69,7 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     def array(*statuses: DiagnosticStatus) -> DiagnosticArray:
         return DiagnosticArray(status=list(statuses))
 
-    about = {"kind": "case", "region": EVIL, "structures": EVIL, "tracker": EVIL}
+    about = {"kind": "case", "region": EVIL, "structures": json.dumps([EVIL]), "tracker": EVIL}
     for topic in ("session/scenes", "session/bags"):
         message = array(status_of(EVIL, **about), status_of("plain", **about | {"kind": EVIL}))
         foreign.create_publisher(DiagnosticArray, topic, LATCHED).publish(message)

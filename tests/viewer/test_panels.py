@@ -343,5 +343,7 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
     panel.get_by_text("Settings of msds").wait_for()
     panel.get_by_text("Settings of fem").wait_for(state="hidden")
     sentence = "msds: its step is too long; it is set back"
-    simulator.status.tell(NodeStatus(tissue, Level.WARNING, sentence), time.monotonic())
+    simulator.status.tell(
+        NodeStatus(tissue, Level.WARNING, sentence, {"problem": "setting"}), time.monotonic()
+    )
     until(lambda: sentence in panel.inner_text(), "what was set back is said")

@@ -50,8 +50,8 @@ def test_what_a_node_declares_has_a_control(page: Any, graph: Node) -> None:
     gain = page.locator(f'[data-parameter="{NODE}.gain"] input')
     gain.wait_for()
     descriptor = ParameterDescriptor(
-        description="of the gel (m)",
-        additional_constraints="0 for none; shown in mm",
+        description="of the gel",
+        additional_constraints='{"unit": "m", "shown_in": "mm", "none": 0, "live": true}',
         floating_point_range=[FloatingPointRange(from_value=0.0, to_value=0.05)],
     )
     graph.declare_parameter("gel.thickness", 0.002, descriptor)

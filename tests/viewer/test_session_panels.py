@@ -55,7 +55,7 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     page.get_by_role("button", name="Load liver").click()
     until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
     board.tell_state(
-        dataclasses.replace(RUNNING, state="loading liver: reading the volume, 40 %", fraction=0.4)
+        dataclasses.replace(RUNNING, state="loading liver: reading the volume", fraction=0.4)
     )
     page.get_by_text("upper arm: loading liver: reading the volume, 40 %").wait_for()
     until(

@@ -57,7 +57,7 @@ def _add_options(demo: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     with ForkServer() as forks:  # which imports what the nodes need while this process does
         from us_sim.run.live import demo

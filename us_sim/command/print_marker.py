@@ -32,7 +32,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _print_marker(args: argparse.Namespace) -> int:
     from us_sim.tracking.camera.marker_print import PrintSettings, print_markers
-    from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+    from us_sim.tracking.camera.rigid_body import read_rigid_body
 
     asked = read_settings(args, PrintSettings)
     body = read_rigid_body(args.body, asked.dictionary) if args.body else asked.body()

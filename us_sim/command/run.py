@@ -58,7 +58,7 @@ def _add_options(run: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     asked = read_settings(args, RunSettings)
     if args.dry_run:

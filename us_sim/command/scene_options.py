@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from us_sim.command.setting_options import add_setting_options, read_settings
 from us_sim.errors import UsSimError
-from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.watch import SupervisionSettings
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:

@@ -53,7 +53,7 @@ def _view(args: argparse.Namespace) -> int:
     from us_sim.command.scene_options import node_parameters, scene_name, supervision, viewer
     from us_sim.command.setting_options import read_settings
     from us_sim.errors import UsSimError
-    from us_sim.run.forking import ForkServer
+    from us_sim.run.fork_server import ForkServer
 
     parameters = node_parameters(args.param)
     if args.attach:

@@ -23,9 +23,8 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
-from us_sim.tracking.camera.info import read_camera_info
-from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.video_source import VideoSource
+from us_sim.tracking.camera.model import CameraModel, read_camera_info
+from us_sim.tracking.camera.source import VideoSource
 
 RETRY_S = 1.0
 """How long a camera that is not there is left alone."""

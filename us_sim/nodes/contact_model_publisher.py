@@ -14,7 +14,7 @@ from us_sim.nodes.conversions import contact_model_message, nanoseconds_of
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.solvers.switching import SwitchableTissue
-from us_sim.tracking.haptic.contact_model import ContactModel, SecantStiffness, wrench_in_patient
+from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
 
 class ContactModelPublisher:

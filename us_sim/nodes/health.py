@@ -42,7 +42,7 @@ class Health:
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
         self._next: dict[str, tuple[float, float]] = {}  # s, when to say it again, and then when
-        self._last_problem = ""
+        self._last_problem = self._last_kind = ""
         self.warning = ""  # what is wrong for as long as it is
         self._failures_told = 0
         self._clock_differs = False
@@ -83,6 +83,7 @@ class Health:
         """Count a problem of that kind; one that goes on is logged ever more rarely."""
         self._problems[kind] += 1
         self._last_problem = sentence = shown(sentence)
+        self._last_kind = kind
         now = time.monotonic()
         due, wait = self._next.get(kind, (now, SAY_S))
         if now >= due:
@@ -112,6 +113,7 @@ class Health:
             "received": str(self.received),
             "dropped": str(self.dropped),
             **({"preparing": self.preparing} if self.preparing else {}),
+            **({"problem": self._last_kind} if self._last_problem else {}),
             **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},

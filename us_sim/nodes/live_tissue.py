@@ -17,8 +17,7 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.preparation import Failed, Preparation
-from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
+from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 
 OWN = "tissue_deformer"
 LOOK_S = 0.1

@@ -18,8 +18,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
-from us_sim.tracking.openigtlink.message import image_message, transform_message
-from us_sim.tracking.openigtlink.server import OpenIGTLinkServer
+from us_sim.tracking.openigtlink import OpenIGTLinkServer, image_message, transform_message
 
 REMEMBERED = 256
 """Poses kept for the images that carry their stamps."""

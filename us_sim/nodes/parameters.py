@@ -7,6 +7,7 @@ and such a text is empty, since ROS parameters have no value for nothing.
 from __future__ import annotations
 
 import dataclasses
+import json
 from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -184,27 +185,25 @@ def _default(settings: Settings, name: str) -> Any:
 
 
 def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
-    """What `ros2 param describe` says of a setting."""
+    """What `ros2 param describe` shows of a setting.
+
+    What ROS has no field for is a JSON object in ``additional_constraints``: ``unit`` (SI),
+    ``shown_in`` (the unit on a dial), ``choices`` (their meanings by name, as far as told),
+    ``none`` (the value that stands for none), ``live`` (whether it may change while the node runs).
+    """
     rule, kind = rules_of(settings)[name], kinds_of(settings)[name]
     live = is_live(settings, name)
-    unit = rule.quantity.unit if rule.quantity else ""
-    constraints = ["may change while running" if live else "given at the start"]
-    names = rule.choice.names if rule.choice else rule.choices
-    if names:
-        constraints.insert(0, f"one of {', '.join(names)}")
-    if rule.choice:
-        constraints += [
-            f"{each}: {text.replace(';', ',')}" for each, text in rule.choice.in_short.items()
-        ]
+    told: dict[str, Any] = {"live": live}
+    if rule.quantity and rule.quantity.unit:
+        told |= {"unit": rule.quantity.unit, "shown_in": dial_unit(rule.quantity)}
+    meanings = rule.choice.in_short if rule.choice else {}
+    if names := rule.choice.names if rule.choice else rule.choices:
+        told["choices"] = {each: meanings.get(each, "") for each in names}
     if _may_be_none(kind):
-        is_text = str in get_args(kind)
-        none = "''" if is_text else "0"
-        constraints.insert(0, f"{none} for none")
-    if rule.quantity and (dial := dial_unit(rule.quantity)) != unit:
-        constraints.append(f"shown in {dial}")
+        told["none"] = "" if str in get_args(kind) else 0
     descriptor = ParameterDescriptor(
-        description=f"{rule.description} ({unit})" if unit else rule.description,
-        additional_constraints="; ".join(constraints),
+        description=rule.description,
+        additional_constraints=json.dumps(told, ensure_ascii=False),
         read_only=not live,
         dynamic_typing=kind is str and not live,
     )

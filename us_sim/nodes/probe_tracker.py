@@ -40,9 +40,8 @@ from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.tracker_building import source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.outline import image_outline
-from us_sim.tracking.filter.pose_filter import PoseFilter, create_filter
-from us_sim.tracking.measurement import PATIENT, Measurement
-from us_sim.tracking.state import TrackingState
+from us_sim.tracking.filters import PoseFilter, create_filter
+from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 
 OWN = "probe_tracker"
 FARTHEST = 100.0

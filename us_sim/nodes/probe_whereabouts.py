@@ -11,7 +11,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions import pose_from, pose_from_text
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED, STREAM
-from us_sim.tracking.state import TrackingState
+from us_sim.tracking.measurement import TrackingState
 
 
 class ProbeWhereabouts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -122,7 +123,7 @@ class SessionControl(GuardedNode):
             about = {
                 "kind": scene.kind,
                 "region": scene.region,
-                "structures": ", ".join(scene.structures),
+                "structures": json.dumps(scene.structures),
                 "probe": scene.probe,
                 "tracker": scene.tracker,
             }

@@ -8,12 +8,11 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
 
-from us_sim.nodes.conversions.parameters import raw_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.health import Health
 from us_sim.nodes.qos import EVERY
-from us_sim.viewer.parameters import Kind
 
 TOLD = 50
 """Losses that a report tells one by one, the newest."""
@@ -64,9 +63,9 @@ class SessionMonitor(GuardedNode):
         if name not in self._nodes or space != self.get_namespace().rstrip("/"):
             return
         for each in event.changed_parameters:
-            kind, raw = raw_from(each.value)
-            if kind is not Kind.OTHER:
-                value = list(raw) if kind.is_list else raw
+            value = Parameter.from_parameter_msg(each).value
+            if value is not None:
+                value = value if isinstance(value, bool | int | float | str) else list(value)
                 self._set.setdefault(name, {})[each.name] = value
 
     def take_set(self) -> dict[str, dict[str, object]]:
@@ -96,6 +95,10 @@ class SessionMonitor(GuardedNode):
         return sum(
             counts.get(topic, 0) for (name, _), counts in self._published.items() if name == node
         )
+
+    def rejected(self, node: str, kind: str) -> int:
+        """How often ``node`` says that it had a problem of that kind."""
+        return _number(self.reports.get(node, {}).get(f"rejected {kind}", ""))
 
 
 def _number(text: str) -> int:

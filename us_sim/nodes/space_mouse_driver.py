@@ -16,7 +16,7 @@ from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import SpaceMouseDriverSettings
-from us_sim.tracking.mouse.space_mouse import SpaceMouse
+from us_sim.tracking.mouse import SpaceMouse
 
 RETRY_S = 1.0
 """How long a device that is not there is left alone."""

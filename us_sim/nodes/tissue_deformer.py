@@ -22,7 +22,7 @@ from us_sim.nodes.live_tissue import LiveTissue
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.solvers.frame_time import frame_limit, shortest, usable_cores
+from us_sim.tissue.solvers.frame_budget import frame_limit, shortest, usable_cores
 
 if TYPE_CHECKING:
     from us_sim.nodes.contact_model_publisher import ContactModelPublisher

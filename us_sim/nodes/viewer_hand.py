@@ -22,9 +22,7 @@ from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.tracking.measurement import PATIENT
-from us_sim.tracking.virtual_hand.motion import Motion
-from us_sim.tracking.virtual_hand.rest_surface import RestSurface
-from us_sim.tracking.virtual_hand.stance import Stance
+from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
 from us_sim.viewer.asked_poses import AskedPoses
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.hand_command import HOME_PRESS, HandCommand, is_source

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -140,10 +141,19 @@ def _scene_of(status: DiagnosticStatus) -> LoadableScene:
         about.get("kind", "scene"),
         "" if is_wrong else said,
         about.get("region", ""),
-        about.get("structures", ""),
+        _names(about.get("structures", "")),
         about.get("tracker", ""),
         said if is_wrong else "",
     )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """The texts of a JSON list; none where it is no such list."""
+    try:
+        listed = json.loads(text)
+    except (ValueError, RecursionError):
+        return ()
+    return tuple(map(str, listed)) if isinstance(listed, list) else ()
 
 
 def _state_of(status: DiagnosticStatus) -> SessionState:

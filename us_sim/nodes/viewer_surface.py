@@ -10,7 +10,7 @@ from us_sim.nodes.conversions import mesh_from
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.tracking.virtual_hand.rest_surface import RestSurface
+from us_sim.tracking.virtual_hand import RestSurface
 
 _PLANE = 0.1
 """m around the origin, of the plane where nothing has a surface."""

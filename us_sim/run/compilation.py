@@ -130,7 +130,7 @@ def _strain() -> None:
 
 def _track_marker() -> None:
     from us_sim.tracking.camera.rigid_body import RigidBody
-    from us_sim.tracking.camera.warm_up import practice
+    from us_sim.tracking.camera.source import practice
 
     practice(RigidBody.single("4X4_50", 7, 0.04))
 
@@ -138,8 +138,7 @@ def _track_marker() -> None:
 def _reconstruct() -> None:
     """A sweep's images in both ways, and gathered for medians."""
     from us_sim.volume.reconstruction.grid import grid_around
-    from us_sim.volume.reconstruction.hole_filling import fill_holes
-    from us_sim.volume.reconstruction.insertion import Collection, Insertion
+    from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
 
     grid = grid_around(np.array([[0.0, 0.0, 0.0], [0.002, 0.002, 0.002]]), 0.001)
     image, used = np.ones((2, 2), np.uint8), np.ones((2, 2), np.bool_)

@@ -28,7 +28,7 @@ from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.strain.settings import Strain
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.settings import MeshSettings
-from us_sim.tracking.filter.settings import GateSettings
+from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 
 __all__ = [

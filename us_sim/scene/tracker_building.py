@@ -17,8 +17,8 @@ from us_sim.settings.registry import TRACKERS
 
 if TYPE_CHECKING:
     from us_sim.tracking.camera.rigid_body import RigidBody
-    from us_sim.tracking.filter.pose_filter import PoseFilter
-    from us_sim.tracking.haptic.rendering import HapticRendering
+    from us_sim.tracking.filters import PoseFilter
+    from us_sim.tracking.haptic import HapticRendering
     from us_sim.tracking.probe_tracking import ProbeTracking
 
 
@@ -33,13 +33,13 @@ def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking
         CalibrationError: a file of a registration or calibration cannot be used.
         TrackingError: the times make no sense.
     """
-    from us_sim.tracking.filter.pose_filter import create_filter
+    from us_sim.tracking.filters import create_filter
     from us_sim.tracking.probe_tracking import ProbeTracking
 
     tracker = scene.tracker
     gate = None
     if tracker.gate is not None:
-        from us_sim.tracking.filter.outlier_gate import OutlierGate
+        from us_sim.tracking.outlier_gate import OutlierGate
 
         gate = OutlierGate(tracker.gate)
     return ProbeTracking(
@@ -80,8 +80,7 @@ def haptic_rendering_of(scene: Scene) -> HapticRendering:
     Raises:
         CalibrationError: a file of a registration or calibration cannot be used.
     """
-    from us_sim.tracking.haptic.device import HapticDevice
-    from us_sim.tracking.haptic.rendering import HapticRendering
+    from us_sim.tracking.haptic import HapticDevice, HapticRendering
 
     tracker = scene.tracker
     settings = source_settings(scene, "haptic")
@@ -107,7 +106,7 @@ def camera_body_of(scene: Scene) -> RigidBody:
 
     settings = source_settings(scene, "camera")
     if settings.body:
-        from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+        from us_sim.tracking.camera.rigid_body import read_rigid_body
 
         return read_rigid_body(settings.body, settings.dictionary)
     return RigidBody.single(settings.dictionary, settings.marker, settings.size)

@@ -37,13 +37,13 @@ SEGMENTATIONS = Choice(
     "segmentation method",
     key="method",
     error=VolumeError,
-    growing=f"{_SEGMENTATION}.growing:SeededGrowing",
-    confidence=f"{_SEGMENTATION}.growing:ConfidenceConnected",
-    threshold=f"{_SEGMENTATION}.growing:Threshold",
-    watershed=f"{_SEGMENTATION}.watershed:Watershed",
-    vesselness=f"{_SEGMENTATION}.vesselness:Vesselness",
+    growing=f"{_SEGMENTATION}.methods:SeededGrowing",
+    confidence=f"{_SEGMENTATION}.methods:ConfidenceConnected",
+    threshold=f"{_SEGMENTATION}.methods:Threshold",
+    watershed=f"{_SEGMENTATION}.methods:Watershed",
+    vesselness=f"{_SEGMENTATION}.methods:Vesselness",
     dark_vessels=f"{_SEGMENTATION}.dark_vessels:DarkVessels",
-    covered=f"{_SEGMENTATION}.covered:Covered",
+    covered=f"{_SEGMENTATION}.methods:Covered",
 )
 
 PROBES = Choice(
@@ -71,14 +71,14 @@ FILTERS = Choice(
     "filter",
     key="method",
     error=TrackingError,
-    none="us_sim.tracking.filter.pose_filter:Unfiltered",
+    none="us_sim.tracking.filters:Unfiltered",
     one_euro=Option(
-        "us_sim.tracking.filter.one_euro:OneEuro",
-        "us_sim.tracking.filter.settings:OneEuroSettings",
+        "us_sim.tracking.filters:OneEuro",
+        "us_sim.tracking.settings:OneEuroSettings",
     ),
     kalman=Option(
-        "us_sim.tracking.filter.kalman:ConstantVelocityKalman",
-        "us_sim.tracking.filter.settings:KalmanSettings",
+        "us_sim.tracking.filters:ConstantVelocityKalman",
+        "us_sim.tracking.settings:KalmanSettings",
     ),
 )
 
@@ -92,19 +92,15 @@ TRACKERS = Choice(
     pose=Option(f"{_INPUTS}.pose_input:PoseInput", _NOTHING),
     pose_array=Option(f"{_INPUTS}.pose_array_input:PoseArrayInput", _NOTHING),
     tf=Option(f"{_INPUTS}.tf_input:TfInput", _NOTHING),
-    camera=Option(
-        f"{_INPUTS}.camera_input:CameraInput", "us_sim.tracking.camera.settings:CameraSettings"
-    ),
+    camera=Option(f"{_INPUTS}.camera_input:CameraInput", "us_sim.tracking.settings:CameraSettings"),
     six_dof_mouse=Option(
         f"{_INPUTS}.six_dof_mouse_input:SixDofMouseInput",
-        "us_sim.tracking.mouse.settings:SixDofMouseSettings",
+        "us_sim.tracking.settings:SixDofMouseSettings",
     ),
-    haptic=Option(
-        f"{_INPUTS}.haptic_input:HapticInput", "us_sim.tracking.haptic.settings:HapticSettings"
-    ),
+    haptic=Option(f"{_INPUTS}.haptic_input:HapticInput", "us_sim.tracking.settings:HapticSettings"),
     openigtlink=Option(
         f"{_INPUTS}.openigtlink_input:OpenIGTLinkInput",
-        "us_sim.tracking.openigtlink.settings:OpenIGTLinkSettings",
+        "us_sim.tracking.settings:OpenIGTLinkSettings",
     ),
     path=Option(f"{_INPUTS}.path_input:PathInput", _NOTHING),
 )

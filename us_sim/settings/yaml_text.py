@@ -53,7 +53,7 @@ def load_yaml(text: str) -> Any:
     except yaml.YAMLError as error:
         problem = str(getattr(error, "problem", None) or "unreadable")
         mark = getattr(error, "problem_mark", None)
-        if not problem.endswith("keep one"):
+        if not isinstance(error, _RepeatedKey):
             problem = f"is not YAML: {problem}"
         raise YamlError(f"line {mark.line + 1}: {problem}" if mark else problem) from error
     # PyYAML lets those of dates and numbers pass that are none.
@@ -100,6 +100,10 @@ def _check(text: str) -> None:
             )
 
 
+class _RepeatedKey(yaml.constructor.ConstructorError):
+    """A mapping has a key twice."""
+
+
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Refuses what YAML forbids and PyYAML lets pass: a key that is there twice."""
 
@@ -112,7 +116,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
             key = "<<" if key_node.tag.endswith(":merge") else self.construct_object(key_node)
             if key in lines:
                 problem = f"key `{key}` is there twice, first in line {lines[key]}: keep one"
-                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
+                raise _RepeatedKey(None, None, problem, key_node.start_mark)
             lines[key] = line
         made: dict[Any, Any] = super().construct_mapping(node, deep)
         return made

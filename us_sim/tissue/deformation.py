@@ -27,6 +27,7 @@ class Deformation:
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
     is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
+    has_failed: bool = False  # whether it stands in place of a frame that came out wrong
 
 
 @dataclass(frozen=True, eq=False)

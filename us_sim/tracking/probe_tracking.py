@@ -2,10 +2,10 @@
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.filter.settings import GateSettings
+>>> from us_sim.tracking.settings import GateSettings
 >>> from us_sim.tracking.measurement import Measurement
->>> from us_sim.tracking.filter.outlier_gate import OutlierGate
->>> from us_sim.tracking.filter.pose_filter import create_filter
+>>> from us_sim.tracking.outlier_gate import OutlierGate
+>>> from us_sim.tracking.filters import create_filter
 >>> from us_sim.tracking.probe_tracking import ProbeTracking
 >>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
@@ -35,10 +35,9 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import adjoint, product
-from us_sim.tracking.filter.outlier_gate import OutlierGate, Verdict
-from us_sim.tracking.filter.pose_filter import PoseFilter
-from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.state import TrackingClock, TrackingState
+from us_sim.tracking.filters import PoseFilter
+from us_sim.tracking.measurement import Measurement, TrackingClock, TrackingState
+from us_sim.tracking.outlier_gate import OutlierGate, Verdict
 
 RESTART_NS = 1_000_000_000
 """A stamp that jumps back by more is a restarted source, not a late measurement."""

@@ -1,7 +1,7 @@
 """What a page asks of the hand that moves the probe.
 
->>> from us_sim.tracking.virtual_hand.rest_surface import RestSurface
->>> from us_sim.tracking.virtual_hand.stance import Stance
+>>> from us_sim.tracking.virtual_hand import RestSurface
+>>> from us_sim.tracking.virtual_hand import Stance
 >>> from us_sim.viewer.hand_command import HandCommand
 >>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
 >>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
@@ -20,8 +20,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from us_sim.errors import MessageError
-from us_sim.tracking.virtual_hand.rest_surface import RestSurface
-from us_sim.tracking.virtual_hand.stance import Stance
+from us_sim.tracking.virtual_hand import RestSurface, Stance
 
 HOME_PRESS = 1e-3
 """m: where the probe begins it touches, so that there is an image."""

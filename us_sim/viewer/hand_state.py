@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from us_sim.tracking.virtual_hand.rest_surface import RestSurface
-from us_sim.tracking.virtual_hand.stance import DEEPEST, HIGHEST, STEEPEST, Stance
+from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, RestSurface, Stance
 
 
 def hand_state(

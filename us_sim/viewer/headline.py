@@ -26,8 +26,7 @@ def words_of(state: SessionState) -> tuple[str, str]:
     """
     name = state.scene.replace("_", " ")
     if state.is_busy:
-        done = "" if state.state.endswith("%") else f", {100 * state.fraction:.0f} %"
-        return name, f"{state.state}{done}"
+        return name, f"{state.state}, {100 * state.fraction:.0f} %"
     parts = [f"recording {PurePath(state.record).name}"] if state.record else []
     if state.replay:
         parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")

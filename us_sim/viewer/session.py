@@ -29,7 +29,7 @@ class LoadableScene:
     kind: str = "scene"  # or case
     description: str = ""
     region: str = ""  # of the body
-    structures: str = ""
+    structures: tuple[str, ...] = ()
     tracker: str = ""  # where its poses come from, unless the probe is moved by hand
     problem: str = ""  # why it cannot be loaded
 

@@ -49,6 +49,7 @@ class NodeStatus:
     values: Mapping[str, str] = field(default_factory=dict)  # as in its diagnostics
     heard: float = 0.0  # s, monotonic
     problem: str = ""  # the last sentence that something was wrong
+    problem_kind: str = ""  # its code in the diagnostics, if it has one
     problem_heard: float = 0.0  # s, monotonic
 
     @property
@@ -140,12 +141,19 @@ class StatusBoard:
         """A node says how it is, at a time of the monotonic clock in s."""
         with self._lock:
             before = self._nodes.get(status.name)
-            problem, heard = (before.problem, before.problem_heard) if before else ("", 0.0)
             if status.level is not Level.WELL:
-                problem, heard = status.message, now
-            self._nodes[status.name] = dataclasses.replace(
-                status, heard=now, problem=problem, problem_heard=heard
-            )
+                kind = status.values.get("problem", "")
+                status = dataclasses.replace(
+                    status, problem=status.message, problem_kind=kind, problem_heard=now
+                )
+            elif before:
+                status = dataclasses.replace(
+                    status,
+                    problem=before.problem,
+                    problem_kind=before.problem_kind,
+                    problem_heard=before.problem_heard,
+                )
+            self._nodes[status.name] = dataclasses.replace(status, heard=now)
             for key in self.PLOTTED:
                 number = status.number(key)
                 if number is not None:

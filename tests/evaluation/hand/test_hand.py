@@ -286,7 +286,7 @@ def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monk
     monkeypatch.setattr(
         following,
         "create_solver",
-        lambda name, m: Raising(m) if name == "fem_cg" else made(name, m),
+        lambda name, m, **s: Raising(m) if name == "fem_cg" else made(name, m, **s),
     )
     monkeypatch.setattr(Raising, "warm_up", lambda _: None)
     monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, seed=seed)])

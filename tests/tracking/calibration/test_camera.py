@@ -6,8 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
-from us_sim.tracking.calibration.board import Board, BoardView
-from us_sim.tracking.calibration.camera import calibrate_camera
+from us_sim.tracking.calibration.camera import Board, BoardView, calibrate_camera
 from us_sim.tracking.camera.model import CameraModel
 
 CAMERA = CameraModel(

@@ -12,7 +12,7 @@ from us_sim.command.main import main
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.tracking.calibration.transform_file import read_transform, read_transform_file
-from us_sim.tracking.camera.info import read_camera_info
+from us_sim.tracking.camera.model import read_camera_info
 
 TIP = np.array([0.01, -0.02, 0.12])
 

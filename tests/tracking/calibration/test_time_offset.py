@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import CalibrationError
-from us_sim.tracking.calibration.position_signal import (
+from us_sim.tracking.calibration.recorded_motion import read_signal
+from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
+    find_time_offset,
     line_row,
     signal_of_images,
     signal_of_positions,
 )
-from us_sim.tracking.calibration.recorded_motion import read_signal
-from us_sim.tracking.calibration.time_offset import find_time_offset
 from us_sim.volume.sequences.sweep import read_sweep
 
 

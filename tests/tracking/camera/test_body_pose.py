@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
+from us_sim.tracking.camera.body_pose import PlaneAmbiguity, body_poses, plane_poses, rotation_angle
 from us_sim.tracking.camera.markers import square
 from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.plane_ambiguity import PlaneAmbiguity
-from us_sim.tracking.camera.plane_pose import plane_poses
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 PINHOLE = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]])

@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from us_sim.evaluation.tracking.measure import small_marker_point
 from us_sim.tracking.camera.marker_edges import refined_corners
 from us_sim.tracking.camera.marker_pattern import fitted_corners, pattern
+from us_sim.evaluation.tracking.small_markers import small_marker_point
+from us_sim.tracking.camera.corner_refinement import refined_corners
+from us_sim.tracking.camera.markers import fitted_corners, pattern
 
 CORNERS = np.array([[22.3, 20.6], [47.1, 23.2], [44.9, 46.0], [19.8, 43.7]])
 CELLS = pattern("APRILTAG_36h11", 5)

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import TrackingError
-from us_sim.tracking.camera.info import read_camera_info, write_camera_info
-from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.model import CameraModel, read_camera_info, write_camera_info
 
 MATRIX = np.array([[600.0, 0, 320], [0, 610, 240], [0, 0, 1]])
 LENSES = {

@@ -6,8 +6,7 @@ import pytest
 
 from us_sim.errors import TrackingError
 from us_sim.tracking.camera.markers import dictionary, family, proper_name
-from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
 
 def test_boards_are_where_opencv_has_them():

@@ -8,15 +8,14 @@ from camera_views import WEBCAM, faceted_grip, random_views, turned
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import rotation_angle
+from us_sim.tracking.camera.corner_refinement import refined_corners
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector, detect_corners
-from us_sim.tracking.camera.marker_edges import refined_corners
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
-from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.rigid_body_file import read_rigid_body
-from us_sim.tracking.camera.settings import CameraSettings
+from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 from us_sim.tracking.camera.source import CameraSource
+from us_sim.tracking.settings import CameraSettings
 
 FRAME = 33_000_000  # ns
 ORDINARY = Conditions()

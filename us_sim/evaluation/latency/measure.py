@@ -42,6 +42,15 @@ from us_sim.run.graph import (
     simulation_nodes,
 )
 from us_sim.run.lockstep import render
+from us_sim.evaluation.latency.cases import cases
+from us_sim.evaluation.latency.points import Point
+from us_sim.evaluation.latency.report import table, write_report
+from us_sim.evaluation.latency.run_case import run_case
+from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.row import failures
+from us_sim.evaluation.timed_cases import timed_cases
+from us_sim.run.live import prepare_volume
+from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 

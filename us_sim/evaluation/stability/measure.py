@@ -514,7 +514,7 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)
         moved = np.abs(ended.nodes - nodes).max()
-        return bool(ended.action.startswith("the frame") or moved > _SWELLING * np.abs(shape).max())
+        return bool(ended.has_failed or moved > _SWELLING * np.abs(shape).max())
 
     if model.fixed.all():
         return math.inf, math.inf

@@ -23,8 +23,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import exp, rotation_exp
 from us_sim.share import shared_path
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions
-from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.rigid_body_file import read_rigid_body
+from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
 SMALL, LARGE = WEBCAMS  # images, by their sizes
 RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"

@@ -24,9 +24,9 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
 from us_sim.settings.registry import FILTERS
 from us_sim.settings.setting import Settings
-from us_sim.tracking.filter.pose_filter import create_filter
-from us_sim.tracking.filter.settings import KalmanSettings, OneEuroSettings
+from us_sim.tracking.filters import create_filter
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import KalmanSettings, OneEuroSettings
 
 FILTER_METHODS = Named(
     "evaluated filter",

@@ -9,7 +9,7 @@ from us_sim.errors import PoseError, TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.conversions.packing import packed
 from us_sim.nodes.conversions.stamps import nanoseconds_since
-from us_sim.tracking.haptic.contact_model import ContactModel
+from us_sim.tracking.haptic import ContactModel
 
 _CONTACT_PARTS = (("stamp", 2), ("pose", 7), ("wrench", 6), ("stiffness", 36))
 """What a model of the contact holds: seconds and nanoseconds; position and quaternion of the probe;

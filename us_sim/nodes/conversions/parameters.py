@@ -1,22 +1,19 @@
 """Parameters of other nodes: their descriptors and values, read and written.
 
-The nodes of this package say more in a descriptor than ROS has fields for, in sentences that
-`ros2 param describe` shows: the unit behind the description, and constraints such as
-``one of fem, msds; 0 for none; may change while running; shown in mm; fem: linear elasticity``.
-Others need not.
+The nodes of this package say more in a descriptor than ROS has fields for, as a JSON object in
+``additional_constraints``, see `us_sim.nodes.parameters`. Others may write there what they like.
 """
 
 from __future__ import annotations
 
-import re
+import json
 from array import array
 from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, ParameterValue
 
-from us_sim.settings.amount import dial_unit
-from us_sim.settings.quantity import Quantity, units_of
+from us_sim.settings.quantity import units_of
 from us_sim.viewer.parameters import Kind, Parameter
 
 _TYPES: dict[Kind, tuple[int, str]] = {
@@ -29,11 +26,6 @@ _TYPES: dict[Kind, tuple[int, str]] = {
     Kind.TEXTS: (ParameterType.PARAMETER_STRING_ARRAY, "string_array_value"),
 }
 _KINDS = {number: (kind, field) for kind, (number, field) in _TYPES.items()}
-_UNIT_BEHIND = re.compile(r"^(.*?)\s*\(([^()]*(?:\([^()]*\))?[^()]*)\)$", re.DOTALL)
-_ONE_OF, _SHOWN_IN = "one of ", "shown in "
-_NOTHING = ("0 for none", "'' for none")
-_DIMENSIONS = {"m": "length", "Pa": "pressure", "rad": "angle", "rad/s": "angular speed"}
-"""Of units that a person reads otherwise, where a descriptor does not say how."""
 
 
 def parameter_from(
@@ -47,16 +39,13 @@ def parameter_from(
         descriptor, value: what the node says of it.
     """
     kind, raw = raw_from(value)
-    said = [each.strip() for each in str(descriptor.additional_constraints).split(";")]
-    description, unit = _description(str(descriptor.description))
+    told = _extras(descriptor)
+    unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
+    choices = told.get("choices")
+    meanings = {str(k): str(v) for k, v in choices.items()} if isinstance(choices, dict) else {}
     limits = _limits(descriptor)
-    reads = next((each[len(_SHOWN_IN) :] for each in said if each.startswith(_SHOWN_IN)), "")
     if reads not in units_of(unit):
-        dimension = _DIMENSIONS.get(unit)
-        reads = dial_unit(Quantity(dimension)) if dimension and kind is Kind.NUMBER else unit
-    listed = next((each[len(_ONE_OF) :] for each in said if each.startswith(_ONE_OF)), "")
-    choices = tuple(each.strip() for each in listed.split(",") if each.strip())
-    told = (each.partition(": ") for each in said)
+        reads = unit
     return Parameter(
         node,
         name,
@@ -65,12 +54,21 @@ def parameter_from(
         unit=reads,
         size=units_of(unit).get(reads, 1.0),
         limits=limits,
-        choices=choices,
-        meanings={name: text for name, _, text in told if name in choices and text},
-        may_be_nothing=any(each in _NOTHING for each in said),
-        description=description,
+        choices=tuple(meanings),
+        meanings={name: text for name, text in meanings.items() if text},
+        may_be_nothing="none" in told,
+        description=str(descriptor.description),
         is_live=not descriptor.read_only and kind is not Kind.OTHER,
     )
+
+
+def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
+    """The JSON object in the constraints; nothing where another's node has something else there."""
+    try:
+        told = json.loads(str(descriptor.additional_constraints))
+    except (ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
 
 
 def raw_from(value: ParameterValue) -> tuple[Kind, Any]:
@@ -91,14 +89,6 @@ def parameter_message(parameter: Parameter, raw: Any) -> ParameterMessage:
         raw = list(raw)
     value = ParameterValue(type=number, **{field: raw})
     return ParameterMessage(name=parameter.name, value=value)
-
-
-def _description(text: str) -> tuple[str, str]:
-    """The description and the SI unit behind it, if there is one."""
-    match = _UNIT_BEHIND.match(text)
-    if match and units_of(match[2]):
-        return match[1], match[2]
-    return text, ""
 
 
 def _limits(descriptor: ParameterDescriptor) -> tuple[float, float] | None:

@@ -6,8 +6,8 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Bool
 
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.tracking.haptic.device import HapticDevice
-from us_sim.tracking.haptic.settings import HapticSettings
+from us_sim.tracking.haptic import HapticDevice
+from us_sim.tracking.settings import HapticSettings
 
 
 class HapticInput(TrackerInput):

@@ -8,8 +8,8 @@ import threading
 from us_sim.errors import StampError
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.openigtlink.client import OpenIGTLinkClient
-from us_sim.tracking.openigtlink.settings import OpenIGTLinkSettings
+from us_sim.tracking.openigtlink import OpenIGTLinkClient
+from us_sim.tracking.settings import OpenIGTLinkSettings
 
 
 class OpenIGTLinkInput(TrackerInput):

@@ -6,8 +6,8 @@ from geometry_msgs.msg import Twist
 from sensor_msgs.msg import Joy
 
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.tracking.mouse.settings import SixDofMouseSettings
-from us_sim.tracking.mouse.six_dof_mouse import SixDofMouse
+from us_sim.tracking.mouse import SixDofMouse
+from us_sim.tracking.settings import SixDofMouseSettings
 
 
 class SixDofMouseInput(TrackerInput):

@@ -15,12 +15,17 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 from us_sim.settings.spelling import counted
-from us_sim.tracking.calibration.board import Board, BoardView
-from us_sim.tracking.calibration.camera import INTRINSICS, CameraCalibration, calibrate_camera
+from us_sim.tracking.calibration.camera import (
+    INTRINSICS,
+    Board,
+    BoardView,
+    CameraCalibration,
+    calibrate_camera,
+)
 from us_sim.tracking.calibration.report_picture import draw_coverage
 from us_sim.tracking.calibration.settings import CameraSettings, Progress
-from us_sim.tracking.camera.info import write_camera_info
-from us_sim.tracking.camera.settings import columns_and_rows
+from us_sim.tracking.camera.model import write_camera_info
+from us_sim.tracking.settings import columns_and_rows
 
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
 

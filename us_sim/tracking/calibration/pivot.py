@@ -1,4 +1,38 @@
-"""Pivot calibration: where a stylus' tip is, from poses while the tip stays in one place.
+"""Covariance of least squares whose errors come in clusters, such as all those at one wire.
+
+A wire is not quite where the phantom's drawing says, and neighbouring frames err alike, so a
+thousand sightings tell far less than a thousand independent ones. What is assumed instead is that
+errors of different clusters are independent; within one they may be related in any way. The
+estimate is the sandwich of Liang and Zeger (1986) with the correction for few clusters of Bell and
+McCaffrey (2002), known as CR2: residuals are smaller than errors where a cluster pulls the fit
+towards itself, and are made larger by as much (Pustejovsky and Tipton 2018, equation 11).
+
+The mean of 12 numbers in 4 clusters that are each constant is as certain as that of 4 numbers:
+
+>>> import numpy as np
+>>> from us_sim.tracking.calibration.pivot import clustered_covariance
+>>> of_each = np.array([1.0, -1.0, 2.0, -2.0])
+>>> residuals = np.repeat(of_each, 3)[:, None]
+>>> covariance = clustered_covariance(np.ones((12, 1, 1)), residuals, np.repeat(np.arange(4), 3))
+>>> np.allclose(covariance, of_each.var(ddof=1) / 4)
+True
+
+Landmarks that somebody touched: places where a stylus' tip stayed while it was tilted.
+
+As Plus' landmark detection has it: whoever touches a landmark pivots about it for a second, which
+tells it from a stylus that lies on the table.
+
+>>> import numpy as np
+>>> from scipy.spatial.transform import Rotation
+>>> from us_sim.tracking.calibration.pivot import find_dwells
+>>> times = 0.05 * np.arange(60)
+>>> tips = np.outer(np.clip(times - 2.0, 0.0, None), [0.3, 0.0, 0.0])
+>>> tilts = Rotation.from_euler("x", np.sin(times)[:, None]).as_matrix()
+>>> [touched] = find_dwells(times, tips, tilts)
+>>> touched.position, round(touched.start, 2)
+(array([0., 0., 0.]), 0.0)
+
+Pivot calibration: where a stylus' tip is, from poses while the tip stays in one place.
 
 A pose (R, p) of the body puts the tip t at R t + p, which is the same point c for all of them:
 [R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
@@ -24,6 +58,127 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
+
+ENOUGH_FEATURES = 6
+"""Fewer features are too few clusters: each is divided into parts of the recording."""
+
+_PARTS = 12
+"""Clusters at least, where features are divided."""
+
+_OWN = 1e-6
+"""What is left of an error in a direction that a cluster alone determines; its residual is zero."""
+
+
+def cluster_numbers(features: Sequence[str]) -> NDArray[np.intp]:
+    """Which cluster each sighting belongs to (N,): that of its feature, if there are enough.
+
+    Otherwise each feature's sightings are divided, in the order in which they are given, into
+    parts as long as possible: of neighbouring frames one part errs alike.
+    """
+    _, numbers = np.unique(np.array(features), return_inverse=True)
+    count = int(numbers.max()) + 1
+    if count >= ENOUGH_FEATURES:
+        return numbers.astype(np.intp)
+    clusters = np.zeros(len(numbers), np.intp)
+    first = 0
+    for number in range(count):
+        own = np.flatnonzero(numbers == number)
+        parts = np.array_split(own, min(-(-_PARTS // count), len(own)))
+        for k, part in enumerate(parts):
+            clusters[part] = first + k
+        first += len(parts)
+    return clusters
+
+
+def clustered_covariance(
+    jacobian: NDArray[np.float64], residuals: NDArray[np.float64], clusters: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """(P, P) covariance of parameters that minimise the sum of squares of residuals.
+
+    Args:
+        jacobian: (N, D, P) derivatives of each observation's D residuals to the parameters, which
+            they determine.
+        residuals: (N, D) at the minimum.
+        clusters: (N,) from 0, which cluster each observation belongs to.
+    """
+    size = jacobian.shape[2]
+    inverse = np.linalg.inv(np.einsum("nij,nik->jk", jacobian, jacobian))
+    root = np.linalg.cholesky(inverse)
+    pulls = np.empty((int(clusters.max()) + 1, size))
+    for number, pull in enumerate(pulls):
+        own = clusters == number
+        slopes = jacobian[own].reshape(-1, size)
+        left = residuals[own].ravel()
+        # Of the hat matrix's block of this cluster: directions, and the leverage of each.
+        directions, lengths, _ = np.linalg.svd(slopes @ root, full_matrices=False)
+        larger = 1.0 / np.sqrt(np.maximum(1.0 - lengths**2, _OWN)) - 1.0
+        pull[:] = slopes.T @ (left + directions @ (larger * (directions.T @ left)))
+    spread: NDArray[np.float64] = inverse @ (pulls.T @ pulls) @ inverse
+    return spread
+
+
+_WINDOW = 0.2  # s, over which the tip is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Dwell:
+    """A place where the tip stayed."""
+
+    position: NDArray[np.float64]  # (3,) m, mean of the first steady second
+    deviations: NDArray[np.float64]  # (3,) m, of its samples
+    start: float  # s
+
+
+def find_dwells(
+    times: NDArray[np.float64],
+    tips: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    *,
+    stillness: float = 1.5e-3,
+    swing: float = 0.3,
+    seconds: float = 1.0,
+    apart: float = 5e-3,
+) -> list[Dwell]:
+    """The places where the tip stayed, in the order in which it came there first.
+
+    Args:
+        times: (K,) s, ascending.
+        tips: (K, 3) m.
+        rotations: (K, 3, 3) of the stylus.
+        stillness: m, diagonal of the box in which the tip's averages stay.
+        swing: how far one of the stylus' axes swings meanwhile, about in rad.
+        seconds: how long at least.
+        apart: m, nearer places are the same one, of which the first counts.
+    """
+    if len(times) < 2:
+        return []
+    size = max(1, round(_WINDOW / float(np.median(np.diff(times)))))
+    count = len(times) // size
+    means = tips[: count * size].reshape(count, size, 3).mean(axis=1)
+    axes = rotations[size - 1 : count * size : size]
+    needed = max(1, round(seconds / _WINDOW))
+    dwells: list[Dwell] = []
+    start = 0
+    for end in range(1, count + 1):
+        if _diagonal(means[start:end]) > stillness:
+            start = end
+        elif end - start >= needed and _swing(axes[start:end]) >= swing:
+            samples = tips[start * size : (start + needed) * size]
+            position = samples.mean(axis=0)
+            if all(np.linalg.norm(known.position - position) >= apart for known in dwells):
+                dwells.append(Dwell(position, samples.std(axis=0), float(times[start * size])))
+            start = end
+    return dwells
+
+
+def _diagonal(points: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
+def _swing(rotations: NDArray[np.float64]) -> float:
+    """How far the axis swings that swings most, about in rad."""
+    return float(np.linalg.norm(np.ptp(rotations, axis=0), axis=0).max())
+
 
 Array = NDArray[np.float64]
 

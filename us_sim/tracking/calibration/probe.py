@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.calibration.clustered_covariance import cluster_numbers, clustered_covariance
+from us_sim.tracking.calibration.pivot import cluster_numbers, clustered_covariance
 
 _FEWEST = 8
 _LARGEST_GAIN = 3.0  # error at the image's edge over the error of one sighting

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.spelling import counted
-from us_sim.tracking.calibration.dwell import find_dwells
-from us_sim.tracking.calibration.landmark_file import read_landmarks
-from us_sim.tracking.calibration.landmarks import register_landmarks
-from us_sim.tracking.calibration.pivot import calibrate_pivot
+from us_sim.tracking.calibration.landmarks import read_landmarks, register_landmarks
+from us_sim.tracking.calibration.pivot import calibrate_pivot, find_dwells
 from us_sim.tracking.calibration.recorded_motion import read_motion, read_signal, seconds_of
 from us_sim.tracking.calibration.report_picture import draw_offset
 from us_sim.tracking.calibration.settings import (

@@ -11,10 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError
-from us_sim.tracking.calibration.board import BoardView
-from us_sim.tracking.calibration.camera import CameraCalibration
-from us_sim.tracking.calibration.position_signal import PositionSignal
-from us_sim.tracking.calibration.time_offset import TimeOffset
+from us_sim.tracking.calibration.camera import BoardView, CameraCalibration
+from us_sim.tracking.calibration.time_offset import PositionSignal, TimeOffset
 
 _CELLS = (16, 12)  # of the coverage's map
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS
+from us_sim.tracking.settings import BOARDS_OF_MARKERS
 
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""

@@ -21,10 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.tracking.camera.chessboard_corners import refined_crossing
-from us_sim.tracking.camera.marker_edges import refined_corners
-from us_sim.tracking.camera.marker_pattern import fitted_corners, pattern
-from us_sim.tracking.camera.markers import dictionary
+from us_sim.tracking.camera.corner_refinement import refined_corners, refined_crossing
+from us_sim.tracking.camera.markers import dictionary, fitted_corners, pattern
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 _SPREAD = 0.25  # of the longer extent of points: the shorter one, at least

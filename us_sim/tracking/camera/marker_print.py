@@ -31,7 +31,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.settings import BOARDS_OF_MARKERS, MARKER_SIZE, columns_and_rows
+from us_sim.tracking.settings import BOARDS_OF_MARKERS, MARKER_SIZE, columns_and_rows
 
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height in mm."""

@@ -8,20 +8,47 @@
 Traceback (most recent call last):
 ...
 us_sim.errors.TrackingError: marker 50: dictionary 4X4_50 has only markers 0 to 49
+
+Files that say where a body's markers are: YAML, text tables, and PLUS's marker maps.
+
+>>> import tempfile
+>>> from pathlib import Path
+>>> from us_sim.tracking.camera.rigid_body import read_rigid_body
+>>> path = Path(tempfile.mkdtemp()) / "grip.yaml"
+>>> _ = path.write_text('''
+... dictionary: 4X4_50
+... markers:
+...   - {id: 0, size: 30 mm}
+...   - {id: 1, size: 30 mm, position: [0.02, 0, -0.02], orientation: [0, 0.7071, 0, 0.7071]}
+... ''')
+>>> read_rigid_body(path).normals.round(3) + 0.0
+array([[0., 0., 1.],
+       [1., 0., 0.]])
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import TrackingError
+from us_sim.errors import PoseError, TrackingError
+from us_sim.geometry.placement import PLACE
+from us_sim.geometry.pose import Pose
+from us_sim.settings.choice import Choice, Chosen
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import Reader
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.text_file import read_text
+from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
-from us_sim.tracking.camera.settings import MARKER_SIZE
+from us_sim.tracking.settings import MARKER_SIZE
 
 _FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
 
@@ -224,3 +251,238 @@ def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
     normal = total / np.linalg.norm(total)
     if np.abs((corners - corners.mean(axis=0)) @ normal).max() > _FLATNESS * lengths.min():
         raise TrackingError(f"marker {number}: its corners are not in one plane")
+
+
+_NUMBER = Quantity("number", 0, 65535)
+_COUNT = Quantity("number", 1, 1000)
+_Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Marker(Settings):
+    """A marker of a body: its corners, or its size and where it is."""
+
+    error = TrackingError
+
+    id: int = setting(_NUMBER, "number in the dictionary")
+    size: float | None = setting(MARKER_SIZE, "edge of its black square", default=None)
+    position: _Point = setting(PLACE, "of its middle in the body", default=(0.0, 0.0, 0.0))
+    orientation: tuple[float, float, float, float] = setting(
+        Quantity("number", -1e6, 1e6), "quaternion x, y, z, w", default=(0.0, 0.0, 0.0, 1.0)
+    )
+    corners: tuple[_Point, _Point, _Point, _Point] | None = setting(
+        PLACE, "in the body, in place of size, position and orientation", default=None
+    )
+
+    def check(self) -> None:
+        """A size or corners."""
+        if (self.size is None) == (self.corners is None):
+            raise self.refused("size", "give a size, or corners in place of it")
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(4, 3) m, the corners in the body."""
+        if self.corners is not None:
+            return np.array(self.corners)
+        assert self.size is not None
+        try:
+            pose = Pose(np.array(self.position), np.array(self.orientation))
+        except PoseError as error:
+            raise self.refused("orientation", str(error)) from error
+        return pose.apply(square(self.size))
+
+
+@dataclass(frozen=True)
+class GridBoard(Settings):
+    """A flat grid of markers."""
+
+    error = TrackingError
+
+    columns: int = setting(_COUNT, "markers across")
+    rows: int = setting(_COUNT, "markers down")
+    size: float = setting(MARKER_SIZE, "edge of a marker")
+    separation: float = setting(MARKER_SIZE, "between markers")
+    first: int = setting(_NUMBER, "number of the first marker", default=0)
+
+    def body(self, dictionary: str) -> RigidBody:
+        """The board of markers of a dictionary."""
+        return RigidBody.grid(dictionary, **asdict(self))
+
+
+@dataclass(frozen=True)
+class CharucoBoard(Settings):
+    """A chessboard with markers in its white squares."""
+
+    error = TrackingError
+
+    columns: int = setting(_COUNT, "squares across")
+    rows: int = setting(_COUNT, "squares down")
+    square: float = setting(MARKER_SIZE, "side of a square")
+    size: float = setting(MARKER_SIZE, "edge of a marker")
+    legacy: bool = setting(description="as OpenCV before 4.6 drew it", default=False)
+
+    def body(self, dictionary: str) -> RigidBody:
+        """The board with markers of a dictionary."""
+        return RigidBody.charuco(dictionary, **asdict(self))
+
+
+_BOARDS = Choice(
+    "board",
+    key="kind",
+    needs=True,
+    error=TrackingError,
+    grid=f"{__name__}:GridBoard",
+    charuco=f"{__name__}:CharucoBoard",
+)
+
+
+@dataclass(frozen=True)
+class _Body(Settings):
+    """The file."""
+
+    error = TrackingError
+
+    dictionary: str | None = setting(description="of the markers", default=None)
+    markers: tuple[_Marker, ...] = setting(description="one by one", default=())
+    board: Chosen | None = setting(description="in place of markers", choice=_BOARDS, default=None)
+
+    def check(self) -> None:
+        """Markers or a board."""
+        if bool(self.markers) == (self.board is not None):
+            raise self.refused("markers", "give a list of markers, or a board in place of it")
+
+
+_PLUS_DICTIONARIES = {
+    "ARUCO": "ARUCO_ORIGINAL",
+    "ARUCO_MIP_36H12": "ARUCO_MIP_36h12",
+    "TAG16H5": "APRILTAG_16h5",
+    "TAG25H9": "APRILTAG_25h9",
+    "TAG36H10": "APRILTAG_36h10",
+    "TAG36H11": "APRILTAG_36h11",
+}
+
+
+def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> RigidBody:
+    """The body that a file describes.
+
+    Three kinds of file are read:
+
+    - YAML: ``dictionary`` and either ``markers`` (each with ``id`` and either ``corners``,
+      4 × 3 m, or ``size`` with the marker's ``position`` and ``orientation`` in the body), or
+      ``board`` (``kind: grid`` with ``columns``, ``rows``, ``size``, ``separation`` and ``first``,
+      or ``kind: charuco`` with ``columns``, ``rows``, ``square``, ``size`` and ``legacy``);
+    - a marker map of the ArUco library, which PLUS's OpticalMarkerTracker takes as MarkerMapFile:
+      YAML with ``aruco_bc_dict`` and ``aruco_bc_markers``, metres;
+    - a text table (scikit-surgery's): a line for each marker with its number, its middle and its
+      four corners, millimetres.
+
+    Args:
+        path: the file; its name's end says which kind it is (``.txt`` is a table).
+        dictionary: of a file that names none.
+
+    Raises:
+        TrackingError: the file, or the body in it, cannot be used.
+    """
+    path = Path(path)
+    try:
+        text = read_text(path)
+    except OSError as error:
+        raise TrackingError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise TrackingError(f"{path}: not a text file of markers") from error
+    try:
+        if path.suffix.lower() in (".txt", ".tsv", ".csv"):
+            return _table(text, dictionary)
+        content = _yaml(text)
+        if "aruco_bc_markers" in content:
+            return _marker_map(content, dictionary)
+        return _body(path, content, dictionary)
+    except TrackingError as error:
+        said = str(error)
+        raise TrackingError(said if said.startswith(f"{path}: ") else f"{path}: {said}") from error
+
+
+def _table(text: str, dictionary: str) -> RigidBody:
+    ids, corners = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            raise TrackingError(
+                f"line {number}: {line.strip()!r} is not a row of numbers"
+            ) from None
+        if len(values) != 16 or not values[0].is_integer():
+            raise TrackingError(
+                f"line {number}: a marker has 16 numbers (its number, the middle and four corners "
+                f"in mm), not {len(values)}"
+            )
+        ids.append(int(values[0]))
+        corners.append(np.reshape(values[4:], (4, 3)) * 1e-3)
+    if not ids:
+        raise TrackingError("there is no marker in it")
+    return RigidBody(dictionary, np.array(ids), np.array(corners))
+
+
+def _yaml(text: str) -> Mapping[str, Any]:
+    # OpenCV heads its files with "%YAML:1.0", which YAML itself does not know.
+    lines = text.splitlines()
+    if lines and lines[0].startswith("%YAML:"):
+        lines[0] = ""
+    try:
+        content = load_yaml("\n".join(lines))
+    except YamlError as error:
+        raise TrackingError(f"not a YAML file: {error}") from error
+    if not isinstance(content, Mapping):
+        raise TrackingError("it must be a mapping with dictionary and markers or board")
+    return content
+
+
+def _marker_map(content: Mapping[str, Any], dictionary: str) -> RigidBody:
+    if content.get("aruco_bc_mInfoType") != 1:
+        raise TrackingError(
+            "its markers are in pixels (aruco_bc_mInfoType is not 1); convert the map to metres"
+        )
+    named = content.get("aruco_bc_dict")
+    if named is not None:
+        dictionary = _PLUS_DICTIONARIES.get(str(named).upper(), str(named))
+    markers = _list(content, "aruco_bc_markers")
+    ids = [_number(marker, f"aruco_bc_markers[{i}]") for i, marker in enumerate(markers)]
+    corners = [_corners(marker, f"aruco_bc_markers[{i}]") for i, marker in enumerate(markers)]
+    return RigidBody(dictionary, np.array(ids), np.array(corners))
+
+
+def _body(path: Path, content: Mapping[str, Any], dictionary: str) -> RigidBody:
+    body = Reader(str(path), error=TrackingError).read(_Body, content)
+    dictionary = body.dictionary or dictionary
+    if body.board is not None:
+        board: GridBoard | CharucoBoard = body.board.settings(_BOARDS)
+        return board.body(dictionary)
+    corners = np.array([marker.points for marker in body.markers])
+    return RigidBody(dictionary, np.array([marker.id for marker in body.markers]), corners)
+
+
+def _list(content: Mapping[str, Any], key: str) -> list[Any]:
+    items = content[key]
+    if not isinstance(items, list) or not items:
+        raise TrackingError(f"{key}: it must be a list of markers")
+    return items
+
+
+def _number(marker: Any, where: str) -> int:
+    number = marker.get("id") if isinstance(marker, Mapping) else None
+    if not isinstance(number, int) or isinstance(number, bool):
+        raise TrackingError(f"{where}.id: {number!r} is not a marker's number")
+    return number
+
+
+def _corners(marker: Mapping[str, Any], where: str) -> NDArray[np.float64]:
+    try:
+        corners = np.array(marker.get("corners"), dtype=np.float64)
+    except (TypeError, ValueError):
+        corners = np.empty(0)
+    if corners.shape != (4, 3):
+        raise TrackingError(f"{where}.corners: they must be 4 × 3 numbers in metres")
+    return corners

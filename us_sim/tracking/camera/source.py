@@ -1,8 +1,10 @@
-"""The pose of a body of markers by a camera: one image in, one measurement out.
+"""A sentence on the other markers in an image that lacks the ones looked for.
+
+The pose of a body of markers by a camera: one image in, one measurement out.
 
 >>> import cv2, numpy as np
 >>> from us_sim.tracking.camera.model import CameraModel
->>> from us_sim.tracking.camera.settings import CameraSettings
+>>> from us_sim.tracking.settings import CameraSettings
 >>> from us_sim.tracking.camera.source import CameraSource
 >>> from us_sim.tracking.camera.markers import dictionary
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
@@ -14,25 +16,98 @@
 array([0.  , 0.  , 0.25])
 >>> source.measure(np.zeros_like(image), 33_000_000), source.last_problem
 (None, 'no marker of 4X4_50 is in the image, which is black: uncover the lens or add light')
+
+Images from a camera, a stream or a video file, as OpenCV opens them.
+
+>>> from us_sim.tracking.camera.source import VideoSource
+>>> VideoSource("0").is_file, VideoSource("rtsp://camera.local/stream").is_file
+(False, False)
+>>> VideoSource("film.avi")
+Traceback (most recent call last):
+us_sim.errors.TrackingError: film.avi: there is no such file; give a video, a camera's number or ...
+
+Tracking of a drawn image at the start, so that the first real one finds all compiled.
+
+>>> from us_sim.tracking.camera.source import practice
+>>> from us_sim.tracking.camera.rigid_body import RigidBody
+>>> practice(RigidBody.single("4X4_50", 7, 0.04))
+True
 """
 
 from __future__ import annotations
 
 import math
+import os
+import stat
+import time
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.spelling import counted
-from us_sim.tracking.camera.body_pose import BodyPose, body_poses
+from us_sim.tracking.camera.body_pose import BodyPose, PlaneAmbiguity, body_poses
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
+from us_sim.tracking.camera.markers import dictionary, family
 from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.plane_ambiguity import PlaneAmbiguity
 from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.settings import CameraSettings
-from us_sim.tracking.camera.stray_markers import StrayMarkers
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import CameraSettings
+
+
+class StrayMarkers:
+    """Looks for markers that are not the body's, where none of its own is found.
+
+    It tries one dictionary an image, since all would take long.
+    """
+
+    _FAMILIES = (
+        "4X4_1000",
+        "5X5_1000",
+        "6X6_1000",
+        "7X7_1000",
+        "ARUCO_ORIGINAL",
+        "ARUCO_MIP_36h12",
+        "APRILTAG_36h11",
+        "APRILTAG_25h9",
+    )
+
+    def __init__(self, body: RigidBody) -> None:
+        self._body = body
+        own = family(body.dictionary)
+        # The own family first: a marker of another number is the likeliest mistake.
+        self._families = (own, *(name for name in self._FAMILIES if name != own))
+        self._turn = 0
+        self._found = ""
+
+    def look(self, image: NDArray[np.uint8], start: str) -> str:
+        """The sentence that begins with ``start`` and goes on with what is there instead."""
+        name = self._families[self._turn % len(self._families)]
+        if self._turn % len(self._families) == 0:
+            self._found = ""
+        self._turn += 1
+        numbers = _numbers_in(image, name)
+        if numbers:
+            listed = ", ".join(str(number) for number in numbers[:5])
+            own = name == self._families[0]
+            markers = counted(len(numbers), "marker")
+            self._found = (
+                f", only {markers} that the body lacks ({listed}): check the body's numbers"
+                if own
+                else f", but {markers} of {name} ({listed}): check camera.dictionary"
+            )
+        return start.replace("no marker", "no marker of the body") + self._found
+
+
+def _numbers_in(image: NDArray[np.uint8], name: str) -> list[int]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.errorCorrectionRate = 0.0
+    ids = cv2.aruco.ArucoDetector(dictionary(name), parameters).detectMarkers(image)[1]
+    return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
+
 
 REMEMBERED = 0.5
 """s, how long the last pose helps to find the next one and to tell it from its mirror image."""
@@ -253,3 +328,135 @@ def _copies(numbers: tuple[int, ...]) -> str:
     listed = ", ".join(str(number) for number in numbers)
     plural = "marker" if len(numbers) == 1 else "markers"
     return f"the image has two copies of {plural} {listed}: none is used; show only one"
+
+
+_PATIENCE_MS = 5000  # with a stream that is not there or sends nothing
+_USUAL_RATE = 30.0  # Hz, of a file that does not say
+_ERRORS_ONLY = 2  # of OpenCV's levels
+_OLDEST_S = 1.0  # a camera's own time stamp is believed up to this age
+
+
+class VideoSource:
+    """A source of images, one after the other, that can be opened and closed any number of times.
+
+    Args:
+        source: a camera's number ("0"), its device ("/dev/video0"), the address of a stream, or
+            a video file.
+        size: width and height in pixels that a camera is asked for.
+        rate: images a second that a camera is asked for, or at which a file is played; 0 leaves
+            it to them.
+
+    Raises:
+        TrackingError: the file is not there, or it is a folder or a pipe.
+    """
+
+    def __init__(self, source: str, *, size: tuple[int, int] | None = None, rate: float = 0.0):
+        self.name = source.strip()
+        self._size, self._rate = size, rate
+        self._capture: cv2.VideoCapture | None = None
+        path = Path(os.path.expanduser(self.name))
+        is_live = self.name.isdigit() or "://" in self.name
+        if not is_live and not os.path.exists(path):
+            if self.name.startswith("/dev/"):
+                is_live = True  # it may be plugged in later
+            else:
+                raise TrackingError(
+                    f"{source}: there is no such file; give a video, a camera's number or a "
+                    f"stream's address"
+                )
+        mode = 0 if is_live else os.stat(path).st_mode
+        if not (is_live or stat.S_ISREG(mode) or stat.S_ISCHR(mode)):
+            raise TrackingError(
+                f"{source}: it is neither a file nor a device; give a video, a camera's number or "
+                f"a stream's address"
+            )
+        self.is_file = stat.S_ISREG(mode)
+        self._target = str(path) if not is_live else self.name
+
+    def open(self) -> bool:
+        """Begin, or begin again, with the first image; whether there is something to begin with."""
+        self.close()
+        _hush()
+        if self.name.isdigit():
+            capture = cv2.VideoCapture(int(self.name))
+        elif "://" in self.name:
+            patience = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
+            settings = [number for key in patience for number in (key, _PATIENCE_MS)]
+            capture = cv2.VideoCapture(self.name, cv2.CAP_FFMPEG, settings)
+        else:
+            capture = cv2.VideoCapture(self._target)
+        if not capture.isOpened():
+            return False
+        if not self.is_file:
+            if self._size is not None:
+                capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
+                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
+            if self._rate:
+                capture.set(cv2.CAP_PROP_FPS, self._rate)
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self._capture = capture
+        return True
+
+    def close(self) -> None:
+        """Let go of the camera or file."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    @property
+    def interval(self) -> float:
+        """s between two images of a file."""
+        rate = self._rate
+        if not rate and self._capture is not None:
+            rate = float(self._capture.get(cv2.CAP_PROP_FPS))
+        return 1.0 / (rate if 0.01 < rate < 1e4 else _USUAL_RATE)
+
+    def grab(self) -> float | None:
+        """Wait for the next image; its age in s, or None where there is none any more.
+
+        The age is 0 but for cameras under Linux, whose driver stamps what it reads.
+        """
+        if self._capture is None or not self._capture.grab():
+            return None
+        if self.is_file or self._capture.getBackendName() != "V4L2":
+            return 0.0
+        age = time.monotonic() - 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        return age if 0.0 < age < _OLDEST_S else 0.0
+
+    def pixels(self, *, grey: bool) -> NDArray[np.uint8] | None:
+        """The image that was grabbed, (rows, columns) or (rows, columns, 3) blue, green, red."""
+        if self._capture is None:
+            return None
+        ok, image = self._capture.retrieve()
+        if not ok or image is None or image.dtype != np.uint8:
+            return None
+        if image.ndim == 3 and image.shape[2] == 1:
+            image = image[:, :, 0]
+        if grey and image.ndim == 3:
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        elif not grey and image.ndim == 2:
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        return np.asarray(image, dtype=np.uint8)
+
+
+def _hush() -> None:
+    """Silence OpenCV and FFmpeg, as the caller says in a sentence when nothing is there."""
+    # OpenCV 5 has moved it.
+    set_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel
+    set_level(_ERRORS_ONLY)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+def practice(body: RigidBody) -> bool:
+    """Track a drawn marker, or board, twice: from nowhere and from near. Whether it was found."""
+    camera = CameraModel(640, 480, np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]]))
+    image = np.full((480, 640), 255, dtype=np.uint8)
+    if body.chessboard is not None:
+        image[40:440, 70:570] = body.chessboard.board.generateImage((500, 400))
+    else:
+        number = int(body.ids[0])
+        body = RigidBody.single(body.dictionary, number, 0.04)
+        marker = cv2.aruco.generateImageMarker(dictionary(body.dictionary), number, 120)
+        image[180:300, 260:380] = marker
+    source = CameraSource(camera, body)
+    return [source.measure(image, stamp) is not None for stamp in (0, 33_000_000)] == [True] * 2

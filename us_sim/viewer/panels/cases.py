@@ -89,7 +89,7 @@ class _Cases:
                 self._pictures[scene.origin] = picture
                 with ui.column().classes("us-case-text"):
                     ui.label(scene.name.replace("_", " ")).classes("us-case-name")
-                    for text in (scene.region, scene.description, scene.structures):
+                    for text in (scene.region, scene.description, ", ".join(scene.structures)):
                         if text:
                             ui.label(text).classes("us-quiet")
                     if scene.problem:
@@ -128,7 +128,8 @@ def _told(state: SessionState) -> str:
     """What runs, in a line."""
     if not state.is_there:
         return NOT_THERE
-    return f"{state.scene.replace('_', ' ')}: {state.state}"
+    done = f", {100 * state.fraction:.0f} %" if state.is_busy else ""
+    return f"{state.scene.replace('_', ' ')}: {state.state}{done}"
 
 
 def build(simulator: Simulator) -> None:

@@ -95,7 +95,7 @@ def _say(simulator: Simulator, state: ui.label, difference: ui.label, problem: u
     _set(state, f"{preparing}: the tissue goes on as it was until then" if preparing else "")
     _set(difference, _difference(status) if status else "")
     is_recent = status is not None and now - status.problem_heard < RECENT_S
-    is_about_settings = status is not None and status.problem.endswith("it is set back")
+    is_about_settings = status is not None and status.problem_kind == "setting"
     _set(problem, status.problem if status and is_recent and is_about_settings else "")
 
 

@@ -1,0 +1,406 @@
+"""Settings that make no sense are refused by name.
+
+The One-Euro filter against the paper's scalar one, and its lag against the one it states.
+
+The Kalman filter against the linear textbook one, its own statistics, and its stated lag.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import solve_discrete_are
+from scipy.stats import chi2
+
+from us_sim.errors import TrackingError
+from us_sim.geometry import se3
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.filters import ConstantVelocityKalman, OneEuro, Unfiltered, create_filter
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import GateSettings, KalmanSettings, OneEuroSettings
+
+
+@pytest.mark.parametrize(
+    ("settings", "values", "words"),
+    [
+        (OneEuroSettings, {"minimum_cutoff": 0.0}, "filter.minimum_cutoff: 0 Hz is outside"),
+        (OneEuroSettings, {"minimum_cutoff": "2 mm"}, "its units are Hz, kHz"),
+        (KalmanSettings, {"acceleration": float("nan")}, "filter.acceleration: nan is not finite"),
+        (GateSettings, {"maximum_speed": -1.0}, "gate.maximum_speed: -1 m/s is outside"),
+        (GateSettings, {"accept_after": 2.5}, "gate.accept_after: 2.5 is not a whole number"),
+        (GateSettings, {"confidence": 1.0}, "gate.confidence: 1 is outside"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(settings, values, words):
+    with pytest.raises(TrackingError, match=words):
+        settings(**values)
+
+
+def test_units_are_understood():
+    assert GateSettings(maximum_speed="500 mm/s").maximum_speed == 0.5
+    assert GateSettings(maximum_angular_speed="180 deg/s").maximum_angular_speed == pytest.approx(
+        3.14159265
+    )
+    assert GateSettings(accept_after=7.0).accept_after == 7
+
+
+def test_each_method_is_its_filter():
+    kinds = {"none": Unfiltered, "one_euro": OneEuro, "kalman": ConstantVelocityKalman}
+    for method, kind in kinds.items():
+        assert type(create_filter(method)) is kind
+    with pytest.raises(TrackingError, match="filter 'median' is not one of none, one_euro"):
+        create_filter("median")
+
+
+def scalar_one_euro(times, values, minimum, beta, derivative_cutoff):
+    """Casiez, Roussel, Vogel (2012), algorithm 1 and equations 2 to 6, of one number."""
+
+    def alpha(cutoff, period):
+        tau = 1 / (2 * math.pi * cutoff)
+        return 1 / (1 + tau / period)
+
+    filtered, speed = [values[0]], 0.0
+    for k in range(1, len(values)):
+        period = times[k] - times[k - 1]
+        share = alpha(derivative_cutoff, period)
+        speed = share * (values[k] - values[k - 1]) / period + (1 - share) * speed
+        share = alpha(minimum + beta * abs(speed), period)
+        filtered.append(share * values[k] + (1 - share) * filtered[-1])
+    return np.array(filtered)
+
+
+def run(one_euro, times, poses):
+    return [
+        one_euro.update(Measurement(round(1e9 * t), pose)).pose
+        for t, pose in zip(times, poses, strict=True)
+    ]
+
+
+def delay(times, signal, frequency):
+    """s, up to half a period: where the cross correlation with sin(2 pi f t) is largest."""
+    delays = np.linspace(-0.49, 0.49, 98_001) / frequency
+    ahead = 2 * np.pi * frequency
+    sine, cosine = signal @ np.sin(ahead * times), signal @ np.cos(ahead * times)
+    return delays[np.argmax(np.cos(ahead * delays) * sine - np.sin(ahead * delays) * cosine)]
+
+
+SETTINGS = OneEuroSettings(
+    minimum_cutoff=1.2,
+    speed_coefficient=30.0,
+    rotation_minimum_cutoff=0.8,
+    rotation_speed_coefficient=4.0,
+    derivative_cutoff=1.5,
+)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_along_an_axis_it_is_the_papers_scalar_filter(seed):
+    rng = np.random.default_rng(seed)
+    times = 1e-9 * np.round(1e9 * np.cumsum(rng.uniform(0.002, 0.05, 60)))
+    way, turn = (np.cumsum(rng.normal(0, s, 60)) for s in (0.01, 0.05))
+    axis, direction = rng.normal(size=(2, 3))
+    axis, direction = axis / np.linalg.norm(axis), direction / np.linalg.norm(direction)
+    start = Pose(orientation=rng.normal(size=4))
+    poses = [
+        Pose(w * direction, se3.product(se3.rotation_exp(t * axis), start.orientation))
+        for w, t in zip(way, turn, strict=True)
+    ]
+    filtered = run(OneEuro(SETTINGS), times, poses)
+    expected = scalar_one_euro(times, way, 1.2, 30.0, 1.5)
+    np.testing.assert_allclose([p.position @ direction for p in filtered], expected, atol=1e-9)
+    turned = [se3.rotation_between(start.orientation, p.orientation) @ axis for p in filtered]
+    np.testing.assert_allclose(turned, scalar_one_euro(times, turn, 0.8, 4.0, 1.5), atol=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_it_does_not_matter_how_the_frame_lies(seed):
+    rng = np.random.default_rng(seed)
+    frame = Pose(rng.normal(size=3), rng.normal(size=4))
+    times = np.cumsum(rng.uniform(0.005, 0.03, 20))
+    poses = [Pose(rng.normal(0, 0.1, 3), [*rng.normal(0, 0.2, 3), 1.0]) for _ in times]
+    here = run(OneEuro(SETTINGS), times, poses)
+    there = run(OneEuro(SETTINGS), times, [frame @ pose for pose in poses])
+    for a, b in zip(here, there, strict=True):
+        np.testing.assert_allclose((frame @ a).matrix, b.matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [30.0, 200.0, 1000.0])
+@pytest.mark.parametrize(("speed", "turning"), [(0.02, 0.1), (0.3, 2.0)])
+def test_behind_a_uniform_motion_by_the_stated_lag(rate, speed, turning):
+    times = np.arange(round(4 * rate)) / rate
+    one_euro = OneEuro(SETTINGS)
+    poses = [
+        Pose([speed * t, 0, 0], se3.rotation_exp(np.array([0, 0, turning * t]))) for t in times
+    ]
+    last = run(one_euro, times, poses)[-1]
+    behind = (poses[-1].position[0] - last.position[0]) / speed
+    assert behind == pytest.approx(one_euro.lag, rel=1e-3)
+    assert one_euro.lag == pytest.approx(1 / (2 * np.pi * (1.2 + 30.0 * speed)), rel=1e-3)
+    turned = se3.rotation_between(last.orientation, poses[-1].orientation)[2]
+    assert turned / turning == pytest.approx(one_euro.rotation_lag, rel=1e-3)
+    assert one_euro.rotation_lag == pytest.approx(1 / (2 * np.pi * (0.8 + 4.0 * turning)), rel=1e-3)
+
+
+@pytest.mark.parametrize("rate", [30.0, 500.0])
+@pytest.mark.parametrize("frequency", [0.25, 1.0, 3.0])
+def test_behind_a_sway_by_the_stated_lag(rate, frequency):
+    one_euro = OneEuro(OneEuroSettings(minimum_cutoff=3.0, speed_coefficient=0.0))
+    times = np.arange(round(12 * rate)) / rate
+    poses = [Pose([0.01 * math.sin(2 * math.pi * frequency * t), 0, 0]) for t in times]
+    out = np.array([p.position[0] for p in run(one_euro, times, poses)])
+    late = times >= 4.0  # 8 s: whole periods
+    measured = delay(times[late], out[late], frequency)
+    assert measured == pytest.approx(one_euro.lag_at(frequency), rel=0.01, abs=2e-5)
+    if frequency == 0.25:
+        assert measured == pytest.approx(one_euro.lag, rel=0.02)
+
+
+def test_at_rest_noise_shrinks_as_that_of_exponential_smoothing():
+    """Its variance by a / (2 - a), with the share a = 1 / (1 + 1 / (2 pi fc T))."""
+    rng = np.random.default_rng(3)
+    times = np.arange(20_000) / 100.0
+    noise = rng.normal(0, 1e-4, len(times))
+    one_euro = OneEuro(OneEuroSettings(minimum_cutoff=2.0, speed_coefficient=0.0))
+    out = np.array([p.position[0] for p in run(one_euro, times, [Pose([n, 0, 0]) for n in noise])])
+    share = 1 / (1 + 100 / (2 * np.pi * 2.0))
+    assert out[100:].var() / noise.var() == pytest.approx(share / (2 - share), rel=0.05)
+
+
+def test_a_sweep_is_hardly_delayed_with_the_defaults():
+    one_euro = OneEuro(OneEuroSettings())
+    assert one_euro.lag == pytest.approx(0.106, abs=1e-3)  # at rest: 1 / (2 pi 1.5 Hz)
+    for k in range(300):
+        one_euro.update(Measurement(k * 10_000_000, Pose([0.1 * 0.01 * k, 0, 0])))
+    assert one_euro.lag == pytest.approx(0.0082, abs=1e-4)
+
+
+def test_after_a_reset_the_next_pose_is_the_first():
+    one_euro = OneEuro(SETTINGS)
+    for k in range(10):
+        one_euro.update(Measurement(k * 10_000_000, Pose([0.1 * k, 0, 0])))
+    one_euro.reset()
+    seen = Measurement(5, Pose([-1.0, 2.0, 3.0], [1.0, 0, 0, 0]))
+    assert one_euro.update(seen).pose is seen.pose
+    assert one_euro.lag == pytest.approx(1 / (2 * np.pi * 1.2))
+
+
+ACCELERATION, ANGULAR_ACCELERATION = 0.7, 6.0
+KALMAN = KalmanSettings(
+    acceleration=ACCELERATION,
+    angular_acceleration=ANGULAR_ACCELERATION,
+    position_deviation=4e-4,
+    rotation_deviation=6e-3,
+)
+INITIAL_SPEED, INITIAL_ANGULAR_SPEED = 0.5, 5.0  # one standard deviation that it begins with
+
+
+def linear_kalman(times, points, noises):
+    """Position and its covariance: constant velocity in three dimensions, in textbook form.
+
+    Bar-Shalom, Li, Kirubarajan (2001), section 5.2 with the model of 6.2.2.
+    """
+    state = np.r_[points[0], np.zeros(3)]
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = noises[0], INITIAL_SPEED**2 * np.eye(3)
+    observed = np.c_[np.eye(3), np.zeros((3, 3))]
+    answers = [(state[:3], covariance[:3, :3])]
+    for k in range(1, len(times)):
+        step = times[k] - times[k - 1]
+        moved = np.kron([[1, step], [0, 1]], np.eye(3))
+        driven = np.kron([[step**3 / 3, step**2 / 2], [step**2 / 2, step]], np.eye(3))
+        state = moved @ state
+        covariance = moved @ covariance @ moved.T + ACCELERATION**2 * driven
+        innovation = observed @ covariance @ observed.T + noises[k]
+        gain = covariance @ observed.T @ np.linalg.inv(innovation)
+        state = state + gain @ (points[k] - observed @ state)
+        covariance = (np.eye(6) - gain @ observed) @ covariance
+        answers.append((state[:3], covariance[:3, :3]))
+    return answers
+
+
+def random_covariance(rng, position=4e-4, rotation=6e-3):
+    """(6, 6), with correlations."""
+    root = np.diag([position] * 3 + [rotation] * 3) @ rng.normal(size=(6, 6)) * 0.5
+    return root @ root.T + np.diag([0.01 * position**2] * 3 + [0.01 * rotation**2] * 3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_without_rotation_it_is_the_linear_filter(seed, told):
+    """With the measurements' own covariances, whatever the steps; else with the settings'."""
+    rng = np.random.default_rng(seed)
+    stamps = np.cumsum(rng.integers(1_000_000, 80_000_000, 40))
+    points = np.cumsum(rng.normal(0, 2e-3, (40, 3)), axis=0)
+    covariances = np.zeros((40, 6, 6))
+    for k in range(40):
+        covariances[k] = np.diag([4e-4**2] * 3 + [6e-3**2] * 3)
+        if told:
+            covariances[k, :3, :3] = random_covariance(rng)[:3, :3]
+    kalman = ConstantVelocityKalman(KALMAN)
+    expected = linear_kalman(1e-9 * stamps, points, covariances[:, :3, :3])
+    for k, (position, covariance) in enumerate(expected):
+        seen = Measurement(int(stamps[k]), Pose(points[k]), covariances[k] if told else None)
+        filtered = kalman.update(seen)
+        np.testing.assert_allclose(filtered.pose.position, position, atol=1e-12)
+        np.testing.assert_allclose(filtered.covariance[:3, :3], covariance, rtol=1e-6, atol=1e-16)
+        np.testing.assert_allclose(filtered.pose.orientation, [0, 0, 0, 1], atol=1e-15)
+
+
+class Walk:
+    """A body driven by just the white accelerations that the filter's settings claim."""
+
+    def __init__(self, rng):
+        self._rng = rng
+        self.stamp = 1_000_000_000
+        self.pose = Pose(rng.normal(0, 0.1, 3), rng.normal(size=4))
+        scale = np.r_[np.full(3, INITIAL_SPEED), np.full(3, INITIAL_ANGULAR_SPEED)]
+        self.velocity = rng.normal(0, scale)
+        self._density = np.r_[np.full(3, ACCELERATION), np.full(3, ANGULAR_ACCELERATION)]
+
+    def go(self, nanoseconds):
+        step = 1e-9 * nanoseconds
+        root = np.linalg.cholesky([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+        moved, faster = (root @ self._rng.normal(size=(2, 6))) * self._density
+        way = step * self.velocity + moved
+        self.pose = displaced(self.pose, way)
+        self.velocity = self.velocity + faster
+        self.stamp += nanoseconds
+
+    def measured(self):
+        covariance = random_covariance(self._rng)
+        noise = np.linalg.cholesky(covariance) @ self._rng.normal(size=6)
+        return Measurement(self.stamp, displaced(self.pose, noise), covariance)
+
+
+def displaced(pose, way):
+    """A pose displaced (6,) as a measurement's covariance means it."""
+    return Pose(pose.position + way[:3], se3.product(se3.rotation_exp(way[3:]), pose.orientation))
+
+
+def difference(pose, other):
+    turn = se3.rotation_between(pose.orientation, other.orientation)
+    return np.r_[other.position - pose.position, turn]
+
+
+def test_it_errs_as_much_as_it_says():
+    """NEES over runs and NIS over all steps, in the chi-square's middle 99.8 per cent."""
+    rng = np.random.default_rng(11)
+    runs, steps = 120, 30
+    errors, innovations = 0.0, 0.0
+    for _ in range(runs):
+        walk, kalman = Walk(rng), ConstantVelocityKalman(KALMAN)
+        kalman.update(walk.measured())
+        for _ in range(steps):
+            walk.go(int(rng.integers(3_000_000, 50_000_000)))
+            seen = walk.measured()
+            place, covariance = kalman.predicted(seen.stamp)
+            innovation = difference(Pose(*place), seen.pose)
+            covariance = covariance[:6, :6] + seen.covariance
+            innovations += innovation @ np.linalg.solve(covariance, innovation)
+            filtered = kalman.update(seen)
+        error = difference(filtered.pose, walk.pose)
+        errors += error @ np.linalg.solve(filtered.covariance, error)
+    for total, freedom in ((errors, 6 * runs), (innovations, 6 * runs * steps)):
+        low, high = chi2.ppf([0.001, 0.999], freedom)
+        assert low < total < high
+
+
+def test_errors_go_on_as_the_predicted_pose_says_by_differences():
+    """Turning by 1.5 rad within the step, where the rotation's errors turn too."""
+    rng = np.random.default_rng(9)
+    quiet = KalmanSettings(acceleration=1e-6, angular_acceleration=1e-6)
+    stamp, later, step = 10**9, 13 * 10**8, 1e-6
+    place = (rng.normal(size=3), Pose(orientation=rng.normal(size=4)).orientation)
+    velocity = np.array([0.1, -0.2, 0.3, 3.0, -3.5, 2.0])
+    root = rng.normal(size=(12, 12))
+
+    def predicted(error):
+        kalman = ConstantVelocityKalman(quiet)
+        kalman._stamp, kalman._velocity = stamp, velocity + error[6:]
+        moved = displaced(Pose(*place), error[:6])
+        kalman._place, kalman._covariance = (moved.position, moved.orientation), root @ root.T
+        there, covariance = kalman.predicted(later)
+        return Pose(*there), covariance
+
+    transition = np.eye(12)
+    for k, error in enumerate(step * np.eye(12)):
+        behind, ahead = (predicted(sign * error)[0] for sign in (-1, 1))
+        transition[:6, k] = difference(behind, ahead) / (2 * step)
+    expected = transition @ root @ root.T @ transition.T
+    np.testing.assert_allclose(predicted(np.zeros(12))[1], expected, atol=1e-7)
+
+
+def test_before_the_first_measurement_it_predicts_nothing():
+    with pytest.raises(TrackingError, match="predicts nothing before its first measurement"):
+        ConstantVelocityKalman(KALMAN).predicted(5)
+
+
+@pytest.mark.parametrize("rate", [30.0, 1000.0])
+def test_not_behind_a_uniform_motion(rate):
+    kalman = ConstantVelocityKalman(KALMAN)
+    speed, turning = np.array([0.1, -0.05, 0.02]), np.array([0.3, 1.0, -0.4])
+    for k in range(round(3 * rate)):
+        time = k / rate
+        pose = Pose(time * speed, se3.rotation_exp(time * turning))
+        filtered = kalman.update(Measurement(round(1e9 * time), pose)).pose
+    behind = difference(filtered, pose)
+    assert kalman.lag == kalman.rotation_lag == 0.0
+    assert np.linalg.norm(behind[:3]) / np.linalg.norm(speed) < 1e-6  # s
+    assert np.linalg.norm(behind[3:]) / np.linalg.norm(turning) < 1e-6
+
+
+@pytest.mark.parametrize("rate", [30.0, 200.0])
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 4.0])
+def test_kalman_is_behind_a_sway_by_the_stated_lag(rate, frequency):
+    kalman = ConstantVelocityKalman(KalmanSettings(acceleration=0.05, position_deviation=2e-3))
+    times = np.arange(round(12 * rate)) / rate
+    way = 0.01 * np.sin(2 * np.pi * frequency * times)
+    out = np.array(
+        [
+            kalman.update(Measurement(round(1e9 * t), Pose([w, 0, 0]))).pose.position[0]
+            for t, w in zip(times, way, strict=True)
+        ]
+    )
+    late = times >= 4.0  # 8 s: whole periods
+    measured = delay(times[late], out[late], frequency)
+    assert measured == pytest.approx(kalman.lag_at(frequency), rel=0.02, abs=2e-5)
+    if frequency == 2.0:
+        assert measured > 0.01  # s: enough to be told from none
+
+
+def test_it_settles_at_the_steady_gain_of_the_riccati_equation():
+    rng = np.random.default_rng(5)
+    step, noise, acceleration = 0.01, 3e-4, 0.1
+    kalman = ConstantVelocityKalman(KalmanSettings(acceleration=acceleration))
+    for k in range(1000):
+        stamp = round(1e9 * step * k)
+        filtered = kalman.update(Measurement(stamp, Pose(rng.normal(0, noise, 3))))
+    moved = np.array([[1, step], [0, 1]])
+    driven = acceleration**2 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+    before = solve_discrete_are(moved.T, np.array([[1.0], [0.0]]), driven, [[noise**2]])
+    gain = before[0, 0] / (before[0, 0] + noise**2)
+    np.testing.assert_allclose(np.diag(filtered.covariance)[:3], gain * noise**2, rtol=1e-6)
+
+
+def test_a_measurement_that_is_sure_of_itself_is_followed():
+    kalman = ConstantVelocityKalman(KALMAN)
+    sure, unsure = np.diag([1e-14] * 3 + [1e-12] * 3), np.diag([1.0] * 6)
+    for k in range(50):
+        kalman.update(Measurement(k * 10_000_000, Pose(), sure))
+    there = Pose([0.05, 0, 0], se3.rotation_exp(np.array([0.0, 0.5, 0.0])))
+    ignored = kalman.update(Measurement(500_000_000, there, unsure)).pose
+    assert np.abs(difference(Pose(), ignored)).max() < 1e-4
+    followed = kalman.update(Measurement(510_000_000, there, sure)).pose
+    assert np.abs(difference(there, followed)).max() < 1e-4
+
+
+def test_half_a_turn_between_measurements_is_no_exception():
+    kalman = ConstantVelocityKalman(KALMAN)
+    kalman.update(Measurement(0, Pose()))
+    filtered = kalman.update(Measurement(10**10, Pose([0.0, 0, 0], [1.0, 0, 0, 0])))
+    assert math.isclose(np.linalg.norm(filtered.pose.orientation), 1.0)
+    assert np.linalg.eigvalsh(filtered.covariance)[0] > 0

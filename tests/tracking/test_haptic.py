@@ -1,0 +1,590 @@
+"""The local model of the contact: a spring wall, the slope of its energy, never a pull, secants.
+
+The handle and the probe: scale, clutch, registration, and work that is the same on both.
+
+Rendering a wall and real tissue: known forces, no steps, no energy, and zero at any doubt.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tissue_block import block
+
+from us_sim.errors import TrackingError
+from us_sim.geometry import se3
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.solvers.solver import create_solver
+from us_sim.tracking.haptic import ContactModel, HapticDevice, HapticRendering, SecantStiffness
+from us_sim.tracking.settings import HapticSettings
+
+SPRING = 350.0  # N/m
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_model(random):
+    """Pushed with a few newtons, on a stiffness of all signs."""
+    factor = random.normal(size=(6, 6))
+    scale = np.diag([1, 1, 1, 0.03, 0.03, 0.03])
+    stiffness = scale @ (300 * (factor @ factor.T) / 6 - 50 * np.eye(6)) @ scale
+    wrench = random.normal(size=6) * [2, 2, 2, 0.05, 0.05, 0.05]
+    return ContactModel(0, Pose(random.normal(size=3), random.normal(size=4)), wrench, stiffness)
+
+
+def moved(start, twist):
+    return Pose(
+        start.position + twist[:3],
+        se3.product(se3.rotation_exp(twist[3:]), start.orientation),
+    )
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.002, 0.005, 0.02])
+def test_a_wall_gives_stiffness_times_depth_and_its_energy(depth):
+    known = 0.008
+    wall = ContactModel(
+        0,
+        Pose([0.01, 0.0, known]),
+        np.array([0.0, 0.0, -SPRING * known, 0.0, 0.0, 0.0]),
+        np.diag([0.0, 0.0, SPRING, 0.0, 0.0, 0.0]),
+    )
+    pressed = Pose([0.0, 0.03, depth])
+    np.testing.assert_allclose(wall.wrench_at(pressed)[2], -SPRING * depth, atol=1e-12)
+    assert wall.energy_at(pressed) == pytest.approx(0.5 * SPRING * depth**2, abs=1e-15)
+    lifted = Pose([0.0, 0.03, -depth])
+    np.testing.assert_allclose(wall.wrench_at(lifted), 0.0, atol=1e-12)
+
+
+@given(SEEDS)
+@settings(max_examples=50, deadline=None)
+def test_at_its_pose_it_is_the_wrench_and_near_it_falls_by_the_stiffness(seed):
+    random = np.random.default_rng(seed)
+    model = random_model(random)
+    np.testing.assert_allclose(model.wrench_at(model.pose), model.wrench, atol=1e-12)
+    energy, slope = model._slope(np.zeros(6))
+    step = 1e-9 * random.normal(size=6)
+    lacking = model._split[4] + np.outer(model._split[2], model._split[2]) / float(
+        model._split[0] @ model._split[2][:3]
+    )
+    change = model._slope(step)[1] - slope
+    np.testing.assert_allclose(change, -lacking @ step, atol=1e-11)
+    assert energy >= 0.0
+
+
+@given(SEEDS)
+@settings(max_examples=50, deadline=None)
+def test_the_wrench_is_what_works_against_the_energy(seed):
+    """Anywhere, far beyond where contact ends: force and torque times a small motion."""
+    random = np.random.default_rng(seed)
+    model = random_model(random)
+    here = moved(model.pose, random.normal(size=6) * [0.01, 0.01, 0.01, 0.4, 0.4, 0.4])
+    step = 1e-7 * random.normal(size=6)
+    gained = model.energy_at(moved(here, step)) - model.energy_at(moved(here, -step))
+    assert model.wrench_at(here) @ (2 * step) == pytest.approx(-gained, rel=1e-3, abs=1e-11)
+
+
+@given(SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_where_the_push_has_ended_there_is_nothing(seed):
+    model = random_model(np.random.default_rng(seed))
+    away = Pose(model.pose.position + 0.5 * model.push, model.pose.orientation)
+    twist = model.displacement(away)
+    if model._split[1] - model._split[2] @ twist <= 0.0:
+        np.testing.assert_array_equal(model.wrench_at(away), 0.0)
+        assert model.energy_at(away) == 0.0
+
+
+@given(SEEDS)
+@settings(max_examples=50, deadline=None)
+def test_a_light_touch_ends_without_a_kick(seed):
+    """Wherever the probe goes, the force along the push stays within a few times what it was."""
+    random = np.random.default_rng(seed)
+    model = random_model(random)
+    light = ContactModel(0, model.pose, 0.01 * model.wrench, model.stiffness)
+    size = np.linalg.norm(light.wrench[:3])
+    spring = float(light._split[2][:3] @ light.push)
+    for _ in range(50):
+        here = moved(light.pose, random.uniform(-1, 1, 6) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
+        deeper = max(0.0, -float(light._split[2] @ light.displacement(here)))
+        along = float(light.wrench_at(here)[:3] @ light.push)
+        assert abs(along) <= (2.5 * size + deeper) * (1 + 1e-9)
+    assert spring > 0.0
+
+
+def test_without_contact_nothing_is_felt_anywhere():
+    model = ContactModel(0, Pose(), np.zeros(6), np.zeros((6, 6)))
+    np.testing.assert_array_equal(model.wrench_at(Pose([0.0, 0.0, 1.0])), 0.0)
+    np.testing.assert_array_equal(model.push, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("wrench", "stiffness", "sentence"),
+    [
+        (np.zeros(3), np.zeros((6, 6)), "a wrench of 6 numbers"),
+        (np.zeros(6), np.zeros((3, 3)), "a 6 by 6 stiffness"),
+        (np.full(6, np.nan), np.zeros((6, 6)), "not finite"),
+        (np.zeros(6), np.full((6, 6), np.inf), "not finite"),
+        (np.full(6, 1e9), np.zeros((6, 6)), "a wrench of 1e\\+09 N"),
+        (np.zeros(6), 1e12 * np.eye(6), "a stiffness of 1e\\+12 N/m: no tissue is so"),
+        (np.zeros(6), np.triu(np.ones((6, 6))), "not symmetric"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(wrench, stiffness, sentence):
+    with pytest.raises(TrackingError, match=sentence):
+        ContactModel(0, Pose(), wrench, stiffness)
+
+
+def test_a_secant_is_the_springs_along_the_push():
+    secant, push = SecantStiffness(), np.array([0.6, 0.0, -0.8])
+
+    def at(depth, aside):
+        wrench = np.concatenate([SPRING * depth * push, np.zeros(3)])
+        return secant.at(Pose(-depth * push + aside * np.array([0.8, 0.0, 0.6])), wrench)
+
+    np.testing.assert_array_equal(at(0.004, 0.0), 0.0)
+    np.testing.assert_array_equal(at(0.0041, 0.02), 0.0)  # too near to tell
+    for depth in (0.005, 0.0075, 0.003):
+        expected = np.zeros((6, 6))
+        expected[:3, :3] = SPRING * np.outer(push, push)
+        np.testing.assert_allclose(at(depth, 0.01 * depth), expected, atol=1e-9)
+    secant.at(Pose(), np.zeros(6))  # lifted, and all is forgotten
+    np.testing.assert_array_equal(at(0.001, 0.0), 0.0)
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("fem_cg", 0.1), ("msds_implicit", 0.2)])
+def test_secants_come_near_the_tangent_of_solvers_that_know_none(name, tolerance):
+    """Of the push when pressed deeper, against a difference of the settled wrenches."""
+    solver, secant = create_solver(name, block()), SecantStiffness()
+
+    def settled(depth, frames):
+        for _ in range(frames):
+            deformation = solver.deform(Pose([0.0, 0.0, depth]))
+        return np.concatenate([deformation.force, deformation.torque])
+
+    for depth in np.arange(0.0, 0.0101, 0.001):
+        found = secant.at(Pose([0.0, 0.0, depth]), settled(depth, 20))
+    measured = (settled(0.0095, 60) - settled(0.0105, 60))[2] / 0.001
+    assert measured > 200  # N/m
+    assert found[2, 2] == pytest.approx(measured, rel=tolerance)
+
+
+def test_a_solver_that_swings_makes_no_absurd_stiffness():
+    random, secant = np.random.default_rng(0), SecantStiffness()
+    for k in range(200):
+        found = secant.at(Pose([0.0, 0.0, 6e-4 * k]), 50.0 * random.normal(size=6))
+        assert 0.0 <= np.trace(found) <= 3e3 * (1 + 1e-9)
+
+
+def pose(random, way=0.1):
+    return Pose(way * random.normal(size=3), random.normal(size=4))
+
+
+def test_the_probe_goes_as_far_as_the_scale_says_and_turns_as_the_handle():
+    arm = HapticDevice(HapticSettings(scale=0.5))
+    turn = se3.rotation_exp(np.array([0.0, 0.0, 0.3]))
+    body = arm.take(Pose([0.02, 0.0, -0.04], turn), 7)
+    assert body.stamp == 7
+    np.testing.assert_allclose(body.pose.position, [0.01, 0.0, -0.02], atol=1e-15)
+    np.testing.assert_allclose(body.pose.orientation, turn, atol=1e-15)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_the_clutch_never_moves_the_probe(seed):
+    random = np.random.default_rng(seed)
+    arm = HapticDevice(HapticSettings(scale=float(random.uniform(0.1, 5.0))))
+    for _ in range(3):
+        before = arm.take(pose(random), 0).pose
+        arm.clutch(True)
+        held = arm.take(pose(random), 1).pose
+        np.testing.assert_allclose(held.matrix, before.matrix, atol=1e-12)
+        last = pose(random)
+        arm.take(last, 2)
+        arm.clutch(False)
+        np.testing.assert_allclose(arm.take(last, 3).pose.matrix, before.matrix, atol=1e-12)
+    # From there a way and a turn of the handle are the probe's, about the same axes.
+    twist = 0.01 * random.normal(size=6)
+    after = arm.take(moved(last, twist), 4).pose
+    np.testing.assert_allclose(
+        se3.rotation_between(before.orientation, after.orientation), twist[3:], atol=1e-12
+    )
+    arm.reset()
+    body = arm.take(last, 5).pose
+    np.testing.assert_allclose(body.orientation, last.orientation, atol=1e-15)
+
+
+def test_a_clutch_that_is_held_from_the_start_holds_the_first_pose():
+    arm = HapticDevice(HapticSettings())
+    arm.clutch(True)
+    arm.take(Pose([0.01, 0.0, 0.0]), 0)
+    arm.clutch(True)
+    np.testing.assert_array_equal(arm.take(Pose([0.05, 0.0, 0.0]), 1).pose.position, [0.01, 0, 0])
+    arm.clutch(False)
+    arm.clutch(False)
+    np.testing.assert_allclose(
+        arm.take(Pose([0.05, 0.0, 0.02]), 2).pose.position, [0.01, 0, 0.02], atol=1e-15
+    )
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_the_probe_moves_as_the_trackers_frames_say(seed):
+    """The motion since a pose is that of registration, body and calibration, clutch or not."""
+    random = np.random.default_rng(seed)
+    registration, calibration = pose(random), pose(random)
+    arm = HapticDevice(HapticSettings(scale=2.5), registration, calibration)
+    arm.take(pose(random), 0)
+    arm.clutch(True)
+    arm.take(pose(random), 1)
+    arm.clutch(False)
+    first, second = pose(random), pose(random)
+    before = registration @ arm.take(first, 2).pose @ calibration
+    after = registration @ arm.take(second, 3).pose @ calibration
+    motion = arm.probe_moved(before, first, second)
+    np.testing.assert_allclose(motion[:3], after.position - before.position, atol=1e-12)
+    turned = se3.product(se3.rotation_exp(motion[3:]), before.orientation)
+    np.testing.assert_allclose(Pose(orientation=turned).rotation, after.rotation, atol=1e-12)
+
+
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_work_at_the_handle_is_work_at_the_probe(seed):
+    random = np.random.default_rng(seed)
+    arm = HapticDevice(HapticSettings(scale=3.0, force_scale=0.7), pose(random), pose(random))
+    handle, probe, wrench = pose(random), pose(random), random.normal(size=6)
+    felt = arm.on_handle(probe, np.zeros(3), wrench)
+    step = 1e-7 * random.normal(size=6)
+    motion = arm.probe_moved(probe, handle, moved(handle, step))
+    assert felt @ step == pytest.approx(0.7 / 3.0 * (wrench @ motion), rel=1e-5)
+
+
+def test_a_wrench_is_turned_into_the_arms_frame():
+    quarter = se3.rotation_exp(np.array([0.0, 0.0, np.pi / 2]))  # the arm's x is the patient's y
+    arm = HapticDevice(HapticSettings(), Pose(orientation=quarter), Pose([0.0, 0.0, 0.1]))
+    felt = arm.on_handle(Pose(), np.zeros(3), np.array([0.0, 2.0, -1.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(felt[:3], [2.0, 0.0, -1.0], atol=1e-12)
+    # 0.1 m before the handle, 2 N along the patient's y make -0.2 N m about its x, the arm's -y.
+    np.testing.assert_allclose(felt[3:], [0.0, 0.2, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ({"scale": 0.0}, "haptic.scale: 0 is outside 0.01 to 100"),
+        ({"force_limit": -1.0}, "haptic.force_limit"),
+        ({"rate": "1 m"}, "haptic.rate: '1 m' is not a frequency"),
+        ({"ramp": float("nan")}, "haptic.ramp: nan is not finite"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(setting, sentence):
+    with pytest.raises(TrackingError, match=sentence):
+        HapticSettings(**setting)
+
+
+MS = 1_000_000
+COUPLING = 400.0  # N/m
+LOOSE = {"ramp": 0.01, "force_limit": 50.0, "torque_limit": 5.0}
+
+
+class Wall:
+    """Below z = 0 there is a spring, friction nowhere."""
+
+    def model(self, stamp, pose):
+        depth = pose.position[2]
+        wrench = np.array([0.0, 0.0, -COUPLING * max(depth, 0.0), 0.0, 0.0, 0.0])
+        return ContactModel(stamp, pose, wrench, np.diag([0, 0, COUPLING * (depth > 0.0), 0, 0, 0]))
+
+
+class Tissue:
+    """A block of it, by one of the solvers."""
+
+    def __init__(self, name):
+        self._solver = create_solver(name, block())
+        self._secant = SecantStiffness()
+
+    def model(self, stamp, pose):
+        deformation = self._solver.deform(pose)
+        turn = pose.rotation
+        wrench = np.concatenate([turn @ deformation.force, turn @ deformation.torque])
+        stiffness = self._solver.contact_stiffness()
+        if stiffness is None:
+            stiffness = self._secant.at(pose, wrench)
+        return ContactModel(stamp, pose, wrench, stiffness)
+
+
+class Bench:
+    """A handle at 1 kHz, and a tissue that answers after a delay that varies."""
+
+    def __init__(
+        self, world, *, delay=(16, 40), seed=0, registration=None, calibration=None, **own
+    ):
+        settings = HapticSettings(**{**LOOSE, **own})
+        registration, calibration = registration or Pose(), calibration or Pose()
+        self.arm = HapticDevice(settings, registration, calibration)
+        self.rendering = HapticRendering(settings, self.arm)
+        self._frames = registration, calibration
+        self._world, self._delay = world, delay
+        self._random = np.random.default_rng(seed)
+        self._answers = []
+        self._free = 0
+        self.tick = 0
+        self.given = 0.0  # J, to the handle
+        self.most_given = 0.0
+        self.largest = 0.0  # J, of the work done on the tissue so far
+        self._last = None
+        self.felt = np.zeros(6)
+
+    def move(self, pose, *, poses=True, models=True):
+        """One tick with the handle at a pose; what it feels until the next."""
+        now = self.tick * MS
+        stamp = now + 1
+        if self._last is not None:
+            turn = se3.rotation_between(self._last.orientation, pose.orientation)
+            way = np.concatenate([pose.position - self._last.position, turn])
+            self.given += float(self.felt @ way)
+            self.most_given = max(self.most_given, self.given)
+            self.largest = max(self.largest, -self.given)
+        self._last = pose
+        if poses:
+            self.rendering.pose(stamp, pose, now)
+        if models and self.tick >= self._free:
+            registration, calibration = self._frames
+            probe = registration @ self.arm.take(pose, stamp).pose @ calibration
+            lag = int(self._random.integers(*self._delay))
+            self._answers.append((self.tick + lag, self._world.model(stamp, probe)))
+            self._free = self.tick + lag
+        while self._answers and self._answers[0][0] <= self.tick:
+            self.rendering.model(self._answers.pop(0)[1], now)
+        self.tick += 1
+        self.felt = self.rendering.render(now)
+        return self.felt
+
+
+def wall(**own):
+    """A bench with a wall that is wholly felt before it answers again."""
+    return Bench(Wall(), **{"hand_over": 0.01, **own})
+
+
+def press(bench, depth, ticks=100, start=-0.002):
+    for z in np.linspace(start, depth, ticks):
+        bench.move(Pose([0.0, 0.0, z]))
+    for _ in range(100):
+        bench.move(Pose([0.0, 0.0, depth]))
+    return bench.felt
+
+
+def random_path(random, ticks, depth=0.012):
+    """A closed way of the handle, from 4 mm above the tissue into it and back."""
+    t = np.linspace(0.0, 1.0, ticks + 1)
+    rise = np.minimum(1.0, np.minimum(t, 1 - t) / 0.15)
+    window = rise * rise * (3 - 2 * rise)
+
+    def wave(size):
+        turns, phase = random.integers(1, ticks // 300, 3), random.uniform(0, 2 * np.pi, 3)
+        weight = random.dirichlet(np.ones(3))
+        return size * weight @ np.sin(2 * np.pi * turns[:, None] * t + phase[:, None])
+
+    z = -0.004 + window * (0.004 + 0.6 * depth + wave(0.9 * depth))
+    ways = np.array([window * wave(0.02), window * wave(0.01), z]).T
+    turns = np.array([window * wave(0.15) for _ in range(3)]).T
+    return [Pose(way, se3.rotation_exp(turn)) for way, turn in zip(ways, turns, strict=True)]
+
+
+def test_a_wall_gives_stiffness_times_depth():
+    bench = wall()
+    felt = press(bench, 0.005, ticks=1000)
+    np.testing.assert_allclose(felt, [0, 0, -COUPLING * 0.005, 0, 0, 0], atol=1e-9)
+    assert bench.rendering.doubt == ""
+    assert -bench.given == pytest.approx(0.5 * COUPLING * 0.005**2, rel=0.02)
+    # Deeper, before the tissue has answered.
+    felt = bench.move(Pose([0.0, 0.0, 0.0055]), models=False)
+    assert felt[2] == pytest.approx(-COUPLING * 0.0055)
+
+
+def test_scale_and_registration_turn_the_wall_around():
+    quarter = Pose([0.3, 0.0, 0.1], se3.rotation_exp(np.array([0.0, -np.pi / 2, 0.0])))
+    bench = wall(registration=quarter, scale=2.0, force_scale=0.5)
+    # The arm's x is the patient's z: x = -50 mm there is its z = 0, by scale and registration.
+    for x in np.linspace(-0.052, -0.047, 100):
+        bench.move(Pose([x, 0.0, 0.0]))
+    for _ in range(100):
+        bench.move(Pose([-0.047, 0.0, 0.0]))
+    np.testing.assert_allclose(bench.felt[:3], [-0.5 * COUPLING * 0.006, 0, 0], atol=1e-9)
+
+
+def test_nothing_is_felt_in_the_air():
+    bench = wall()
+    for k in range(200):
+        assert not bench.move(Pose([1e-4 * k, 0.0, -0.002])).any()
+    assert bench.rendering.doubt == ""
+
+
+def test_the_force_grows_slowly_at_first():
+    bench = wall(ramp=0.2, delay=(5, 6))
+    felt = [bench.move(Pose([0.0, 0.0, 0.005]))[2] for _ in range(300)]
+    assert felt[4] == 0.0
+    np.testing.assert_allclose(felt[10:200], -COUPLING * 0.005 * np.arange(5, 195) / 200, atol=1e-9)
+    assert felt[-1] == pytest.approx(-COUPLING * 0.005)
+
+
+def test_force_and_torque_stay_within_what_the_arm_may_give():
+    bench = Bench(Tissue("fem"), force_limit=2.0, torque_limit=0.01, calibration=Pose([0, 0, 0.1]))
+    tilt = se3.rotation_exp(np.array([0.2, 0.0, 0.0]))
+    largest = np.zeros(2)
+    for z in np.linspace(-0.105, -0.088, 200):
+        felt = bench.move(Pose([0.0, 0.0, z], tilt))
+        size = [np.linalg.norm(felt[:3]), np.linalg.norm(felt[3:])]
+        largest = np.maximum(largest, size)
+    np.testing.assert_allclose(largest, [2.0, 0.01], rtol=1e-12)
+
+
+def test_a_new_answer_makes_no_step():
+    """The tissue has become twice as stiff: over the hand-over it is felt little by little."""
+    bench = wall(hand_over=0.03, delay=(40, 41))
+    press(bench, 0.005)
+    stiffer = Wall().model(bench.tick * MS + 1, Pose([0.0, 0.0, 0.005]))
+    bench._answers.append((bench.tick, dataclasses.replace(stiffer, wrench=2 * stiffer.wrench)))
+    bench._free = bench.tick + 1000
+    felt = [bench.felt[2], *(bench.move(Pose([0.0, 0.0, 0.005]))[2] for _ in range(60))]
+    assert felt[-1] == pytest.approx(-2 * COUPLING * 0.005)
+    assert np.abs(np.diff(felt)).max() == pytest.approx(COUPLING * 0.005 / 30, rel=1e-6)
+
+
+def test_between_answers_the_force_goes_on_as_the_tissue_would():
+    """Pressed steadily into tissue that answers late, next to the same that answers at once."""
+    slow, quick = Bench(Tissue("fem")), Bench(Tissue("fem"), delay=(1, 2))
+    ways = np.linspace(-0.002, 0.012, 1400)  # 10 mm/s
+    differences = [slow.move(Pose([0.0, 0.0, z])) - quick.move(Pose([0.0, 0.0, z])) for z in ways]
+    assert np.abs(np.array(differences)[:, 2]).max() < 0.06 * -quick.felt[2]
+    assert slow.felt[2] == pytest.approx(quick.felt[2], rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["fem", "fem_nonlinear", "fem_cg", "msds"])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_energy_comes_out_of_a_closed_path(name, seed):
+    """Nor at any time on the way: but for what the way of a single tick may be wrong by."""
+    bench = Bench(Tissue(name), seed=seed)
+    for pose in random_path(np.random.default_rng(seed), 1500):
+        bench.move(pose)
+    assert bench.rendering.stops == 0
+    assert bench.largest > 5e-3  # J, it was pressed
+    assert bench.given < 0.0
+    assert bench.most_given < 1e-3 * bench.largest
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nor_with_scales_frames_limits_noise_and_fewer_poses(seed):
+    random = np.random.default_rng(seed)
+    registration, calibration = Pose([0.1, 0.2, 0.3], random.normal(size=4)), Pose([0, 0.01, 0.1])
+    bench = Bench(
+        Tissue("fem"),
+        seed=seed,
+        registration=registration,
+        calibration=calibration,
+        scale=2.0,
+        force_scale=0.5,
+        force_limit=1.5,
+        torque_limit=0.05,
+        ramp=0.5,
+    )
+    for k, probe in enumerate(random_path(random, 1500)):
+        body = registration.inverse() @ probe @ calibration.inverse()
+        noise = 5e-6 * random.normal(size=3)
+        if k % 2 == 0:
+            handle = Pose(0.5 * body.position + noise, body.orientation)
+        bench.move(handle, poses=k % 2 == 0)
+    assert bench.rendering.stops == 0
+    assert bench.largest > 1e-3
+    assert bench.given < 0.0
+    assert bench.most_given < 2e-2 * bench.largest
+
+
+@pytest.mark.parametrize(("mass", "speed"), [(0.05, 0.3), (0.2, 0.15), (1.0, 0.1)])
+def test_what_is_thrown_at_the_tissue_does_not_come_back_faster(mass, speed):
+    """A mass on the handle, free along z, falls on tissue that answers late."""
+    bench = Bench(Tissue("fem_nonlinear"), seed=1)
+    z, v, deepest = -0.01, speed, 0.0
+    for _ in range(2000):
+        felt = bench.move(Pose([0.0, 0.0, z]))
+        v += 1e-3 * felt[2] / mass
+        z += 1e-3 * v
+        deepest = max(deepest, z)
+        if z < -0.012:
+            break
+    assert deepest > 0.002
+    assert abs(v) <= 1.002 * speed
+
+
+def test_the_handle_is_never_pulled_into_the_tissue():
+    bench = Bench(Tissue("fem"), seed=5)
+    for pose in random_path(np.random.default_rng(5), 1500):
+        force = bench.move(pose)[:3]
+        push = bench.rendering._model.push if bench.rendering._model else np.zeros(3)
+        assert force @ push >= -1e-12
+
+
+@pytest.mark.parametrize(
+    ("disturb", "sentence"),
+    [
+        (lambda b: b.move(Pose([0.02, 0.0, 0.005])), "the handle has jumped by 20.0 mm"),
+        (
+            lambda b: b.move(Pose([0, 0, 0.005], se3.rotation_exp(np.array([0, 0.5, 0])))),
+            "the handle has jumped by 29°",
+        ),
+        (lambda b: [b.move(Pose([0, 0, 0.005]), poses=False) for _ in range(60)], "no pose of the"),
+        (
+            lambda b: [b.move(Pose([0, 0, 0.005]), models=False) for _ in range(340)],
+            "no model of the contact for 3",
+        ),
+        (
+            lambda b: [b.move(Pose([1e-3 * k, 0, 0.005]), models=False) for k in range(22)],
+            "mm from where the contact is known",
+        ),
+        (
+            lambda b: [
+                b.move(
+                    Pose([0, 0, 0.005], se3.rotation_exp(np.array([0, 0.1 * k, 0]))), models=False
+                )
+                for k in range(7)
+            ],
+            "from where the contact is known",
+        ),
+        (
+            lambda b: (b.rendering.distrust("the pose is not finite"), b.move(Pose([0, 0, 0.005]))),
+            "the pose is not finite",
+        ),
+        (lambda b: (b.rendering.clutch(True), b.move(Pose([0, 0, 0.005]))), "the clutch is held"),
+        (
+            lambda b: (setattr(b, "tick", b.tick - 3000), b.move(Pose([0, 0, 0.005]))),
+            "have jumped back",
+        ),
+    ],
+)
+def test_at_any_doubt_nothing_is_felt_and_then_again(disturb, sentence):
+    bench = wall()
+    assert press(bench, 0.005)[2] == pytest.approx(-COUPLING * 0.005)
+    disturb(bench)
+    assert sentence in bench.rendering.stopped
+    assert not bench.felt.any()
+    assert bench.rendering.stops == 1
+    bench.rendering.clutch(False)
+    bench._answers.clear()
+    bench._free = bench.tick
+    last, back = bench._last, Pose([0.0, 0.0, 0.005])
+    for part in np.linspace(0.0, 1.0, 40):
+        bench.move(se3.interpolate(last, back, part), models=part == 1.0)
+    felt = press(bench, 0.004, start=0.005)
+    assert felt[2] == pytest.approx(-COUPLING * 0.004)
+    assert bench.rendering.stops == 1
+
+
+def test_a_model_of_before_a_doubt_is_not_believed():
+    bench = wall(delay=(30, 31))
+    press(bench, 0.005)
+    bench._free = bench.tick
+    bench.move(Pose([0.0, 0.0, 0.005]))  # asks; the answer comes 30 ms later
+    bench.rendering.distrust("something was wrong")
+    felt = [bench.move(Pose([0.0, 0.0, 0.005])).any() for _ in range(100)]
+    assert not any(felt[:45])  # that answer is not taken, but the next
+    assert all(felt[-20:])

@@ -1,0 +1,201 @@
+"""The 6-DOF mouse: motions known beforehand, no step, no wind-up, bad messages refused."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from us_sim.errors import TrackingError
+from us_sim.geometry import se3
+from us_sim.tracking.mouse import SixDofMouse
+from us_sim.tracking.settings import SixDofMouseSettings
+
+MS = 1_000_000
+PLAIN = {
+    "speed": (0.1, 0.1, 0.1),
+    "angular_speed": (1.0, 1.0, 1.0),
+    "reach": (0.05, 0.05, 0.05),
+    "angular_reach": (0.5, 0.5, 0.5),
+    "dead_band": 0.0,
+    "home": (0.0, 0.0, 0.0),
+}
+
+
+def mouse(**changed):
+    return SixDofMouse(SixDofMouseSettings(**{**PLAIN, **changed}))
+
+
+def axes(**deflections):
+    names = ("x", "y", "z", "rx", "ry", "rz")
+    return [deflections.get(name, 0.0) for name in names]
+
+
+def drive(device, deflection, seconds, *, rate=100, start=0, buttons=()):
+    for tick in range(round(seconds * rate) + 1):
+        probe = device.axes(deflection, buttons, start + round(tick * 1000 / rate) * MS)
+    return probe
+
+
+@pytest.mark.parametrize("rate", [50, 125, 1000])
+def test_velocity_is_integrated_over_time_at_any_rate(rate):
+    probe = drive(mouse(), axes(x=0.5, z=-0.25), 1.0, rate=rate)
+    np.testing.assert_allclose(probe.pose.position, [0.05, 0.0, -0.025], atol=1e-12)
+    assert probe.stamp == 1000 * MS
+
+
+def test_a_velocity_that_grows_evenly_is_integrated_exactly():
+    device = mouse()
+    for tick in range(101):
+        probe = device.axes(axes(x=tick / 100), (), 10 * tick * MS)
+    assert probe.pose.position[0] == pytest.approx(0.5 * 0.1 * 1.0, abs=1e-15)  # v t / 2
+
+
+def test_in_the_probes_frame_speed_and_turn_make_a_circle():
+    probe = drive(mouse(), axes(x=1.0, rz=1.0), 1.0)
+    radius = 0.1 / 1.0  # m/s over rad/s
+    np.testing.assert_allclose(
+        probe.pose.position, [radius * math.sin(1.0), radius * (1 - math.cos(1.0)), 0], atol=1e-12
+    )
+    np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, 0, 1], atol=1e-12)
+
+
+def test_in_the_patients_frame_a_turn_does_not_bend_the_way():
+    probe = drive(mouse(frame="patient"), axes(x=1.0, rz=1.0), 1.0)
+    np.testing.assert_allclose(probe.pose.position, [0.1, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("frame", "expected"), [("patient", [0.0, 0.0, 0.05]), ("probe", [0.0, -0.05, 0.0])]
+)
+def test_a_tilted_probe_moves_along_its_own_axes_or_the_patients(frame, expected):
+    turned = (math.sin(math.pi / 4), 0.0, 0.0, math.cos(math.pi / 4))  # its z is the patient's -y
+    probe = drive(mouse(frame=frame, home_orientation=turned), axes(z=1.0), 0.5)
+    np.testing.assert_allclose(probe.pose.position, expected, atol=1e-12)
+
+
+def test_a_long_gap_is_not_travelled():
+    device = mouse(longest_gap=0.1)
+    device.axes(axes(x=1.0), (), 0)
+    device.axes(axes(x=1.0), (), 100 * MS)
+    probe = device.axes(axes(x=1.0), (), 5000 * MS)
+    assert probe.pose.position[0] == pytest.approx(0.01)
+    probe = device.axes(axes(x=1.0), (), 1000 * MS)  # the clock was set back
+    assert probe.pose.position[0] == pytest.approx(0.01)
+    assert device.axes(axes(x=1.0), (), 1050 * MS).pose.position[0] == pytest.approx(0.015)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(0.0, 0.9))
+@settings(max_examples=40, deadline=None)
+def test_the_dead_band_has_no_step_at_its_edge_and_full_deflection_stays_full(deflection, band):
+    device = mouse(mode="position", dead_band=band)
+    place = device.axes(axes(x=deflection), (), 0).pose.position[0] / 0.05
+    expected = math.copysign(max(abs(deflection) - band, 0) / (1 - band), deflection)
+    assert place == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_displacement_is_that_of_the_cap_and_goes_back_with_it():
+    device = mouse(mode="position")
+    probe = device.axes(axes(x=0.4, ry=-1.0), (), 0)
+    np.testing.assert_allclose(probe.pose.position, [0.02, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, -0.5, 0], atol=1e-12)
+    probe = device.axes(axes(), (), 10 * MS)
+    np.testing.assert_array_equal(probe.pose.position, 0.0)
+
+
+def test_with_the_clutch_a_short_reach_goes_far_without_a_jump():
+    device = mouse(mode="position", clutch_button=0)
+    last, largest = 0.0, 0.0
+    stamp = 0
+    for _ in range(3):
+        ups = [k / 10 for k in range(11)]
+        strokes = [(d, [0]) for d in ups] + [(d, [1]) for d in reversed(ups)]
+        for deflection, buttons in strokes:
+            stamp += 10 * MS
+            place = device.axes(axes(x=deflection), buttons, stamp).pose.position[0]
+            largest, last = max(largest, abs(place - last)), place
+    assert last == pytest.approx(3 * 0.05)
+    assert largest == pytest.approx(0.005)  # a tenth of the reach, as the cap moved
+    # Let go of while deflected, displacements count from there.
+    device.axes(axes(x=0.5), [1], stamp + 10 * MS)
+    assert device.axes(axes(x=0.5), [0], stamp + 20 * MS).pose.position[0] == pytest.approx(0.15)
+    assert device.axes(axes(x=0.0), [], stamp + 30 * MS).pose.position[0] == pytest.approx(0.125)
+
+
+def test_the_clutch_stops_the_probe_in_rate_mode():
+    device = mouse(clutch_button=1, reset_button=0)
+    drive(device, axes(x=1.0), 0.5)
+    drive(device, axes(x=1.0), 0.5, start=510 * MS, buttons=[0, 1])
+    # The usual driver lists no buttons with a mere movement: the clutch is still held.
+    probe = drive(device, axes(x=1.0), 0.5, start=1020 * MS)
+    assert probe.pose.position[0] == pytest.approx(0.05)
+    probe = drive(device, axes(x=1.0), 0.1, start=1530 * MS, buttons=[0, 0])
+    assert probe.pose.position[0] == pytest.approx(0.05 + 0.011)
+
+
+@pytest.mark.parametrize("mode", ["rate", "position"])
+def test_the_reset_button_brings_the_probe_home(mode):
+    device = mouse(mode=mode, reset_button=2, home=(0.01, 0.0, -0.02))
+    drive(device, axes(x=1.0, rx=1.0), 0.5)
+    probe = device.axes(axes(x=1.0), [0, 0, 1], 510 * MS)
+    np.testing.assert_array_equal(probe.pose.position, [0.01, 0.0, -0.02])
+    np.testing.assert_array_equal(probe.pose.orientation, [0, 0, 0, 1])
+
+
+def test_the_probe_stops_at_the_workspace_and_comes_back_at_once():
+    device = mouse(workspace_low=(-0.02, -0.02, -0.02), workspace_high=(0.02, 0.02, 0.02))
+    probe = drive(device, axes(x=1.0, y=-0.1), 1.0)
+    np.testing.assert_allclose(probe.pose.position, [0.02, -0.01, 0.0], atol=1e-12)
+    device.axes(axes(x=-1.0), (), 1010 * MS)
+    probe = device.axes(axes(x=-1.0), (), 1020 * MS)
+    assert probe.pose.position[0] == pytest.approx(0.02 - 0.001)
+
+
+def test_axes_are_put_in_any_order():
+    device = mouse(mode="position", axes=(1, 0, 4, 3, 2, 7))
+    probe = device.axes([0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0.6], (), 0)
+    np.testing.assert_allclose(probe.pose.position / 0.05, [0.2, 0.1, 0.5], atol=1e-12)
+    np.testing.assert_allclose(
+        se3.rotation_log(probe.pose.orientation) / 0.5, [0.4, 0.3, 0.6], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("bad", "sentence"),
+    [
+        ([0.0] * 5, "the message has 5 axes, but axis 5 is used"),
+        ([], "the message has 0 axes"),
+        (axes(y=math.nan), "are not finite"),
+        (axes(rz=-math.inf), "are not finite"),
+        (axes(rx=-1.4), "axis 3 is -1.4, beyond 1: set the driver's full scale"),
+    ],
+)
+def test_a_message_that_cannot_be_used_changes_nothing(bad, sentence):
+    device = mouse()
+    drive(device, axes(x=1.0), 0.5)
+    assert device.axes(bad, [1], 505 * MS) is None
+    assert sentence in device.last_problem
+    probe = device.axes(axes(x=1.0), (), 510 * MS)
+    assert probe.pose.position[0] == pytest.approx(0.051)
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ({"mode": "magic"}, "six_dof_mouse.mode: 'magic' is not one of rate, position"),
+        ({"speed": (1, 2)}, "six_dof_mouse.speed"),
+        ({"reach": (0.1, 0.1)}, "six_dof_mouse.reach: needs 3 values, not 2"),
+        ({"axes": (0, 1, 2, 3, 4, 4)}, "six different whole numbers"),
+        ({"axes": (0, 1, 2, 3, 4, 0.5)}, r"axes\[5\]: 0.5 is not a whole number"),
+        ({"axes": (0, 1, 2)}, "axes: needs 6 values, not 3"),
+        ({"clutch_button": 1}, "reset_button: 1 is the clutch already"),
+        ({"home": (1.0, 0.0, 0.0)}, "is outside the workspace"),
+        ({"home_orientation": (0, 0, 0, 0)}, "is no orientation"),
+        ({"dead_band": 1.0}, "dead_band: 1 is outside 0 to 0.9"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(setting, sentence):
+    with pytest.raises(TrackingError, match=sentence):
+        SixDofMouseSettings(**setting)

@@ -1,0 +1,406 @@
+"""Feet on a plane, a cylinder and a sphere, whose closest points are known.
+
+The laws of a movement that must be the same however finely time is cut.
+
+The hand on its way: over the skin, not through it, and in the time that its limits allow.
+
+Stances as poses and back, on surfaces where both are known.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from us_sim.errors import MeshError, PoseError
+from us_sim.geometry.se3 import rotation_between
+from us_sim.skin.surface import bent_surface, plane_surface
+from us_sim.tracking.virtual_hand import (
+    DEEPEST,
+    STEEPEST,
+    Approach,
+    HandSpeed,
+    Motion,
+    RestSurface,
+    Stance,
+)
+
+RADIUS = 0.045
+
+
+def cylinder() -> RestSurface:
+    """Half a cylinder about the line x = 0, z = RADIUS, along y; facets of 2 degrees."""
+    size = (math.pi * RADIUS, 0.1)
+    sheet = bent_surface(size, math.radians(2) * RADIUS, flat_width=0.0, radius=RADIUS)
+    return RestSurface(sheet.vertices, sheet.triangles)
+
+
+def sphere(steps: int = 90) -> RestSurface:
+    """About the origin, by latitude and longitude."""
+    polar, turn = np.linspace(0, math.pi, steps + 1), np.arange(2 * steps) * math.pi / steps
+    grid = np.stack(
+        [
+            np.outer(np.sin(polar), np.cos(turn)),
+            np.outer(np.sin(polar), np.sin(turn)),
+            np.outer(np.cos(polar), np.ones_like(turn)),
+        ],
+        axis=-1,
+    )
+    index = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
+    a, b = index[:-1], index[1:]
+    c, d = np.roll(b, -1, axis=1), np.roll(a, -1, axis=1)
+    triangles = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    return RestSurface(RADIUS * grid.reshape(-1, 3), triangles)
+
+
+PLANE, CYLINDER, SPHERE = RestSurface.plane(0.1), cylinder(), sphere()
+FACET = RADIUS * (1 - math.cos(math.radians(1)))  # how deep a facet of 2 degrees lies below
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
+def test_on_a_plane_the_foot_is_straight_below(x, y, z):
+    foot = PLANE.closest(np.array([x, y, z]))
+    np.testing.assert_allclose(foot.point, [x, y, 0.0], atol=1e-15)
+    np.testing.assert_allclose(foot.normal, [0.0, 0.0, -1.0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-1.3, 1.3), st.floats(-0.045, 0.045), st.floats(-0.02, 0.05))
+def test_on_a_cylinder_the_foot_is_on_the_radius(angle, y, height):
+    outwards = np.array([math.sin(angle), 0.0, -math.cos(angle)])
+    axis = np.array([0.0, y, RADIUS])
+    foot = CYLINDER.closest(axis + (RADIUS + height) * outwards)
+    np.testing.assert_allclose(foot.normal, outwards, atol=math.radians(1.05))
+    # On a facet the closest point is up to the facet's slope times the height beside the radius.
+    beside = math.radians(1.05) * abs(height) + FACET
+    np.testing.assert_allclose(foot.point, axis + RADIUS * outwards, atol=beside)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.3, 2.8), st.floats(-3, 3), st.floats(-0.02, 0.02))
+def test_under_finds_the_normal_through_a_place(polar, turn, press):
+    radius = np.array(
+        [
+            math.sin(polar) * math.cos(turn),
+            math.sin(polar) * math.sin(turn),
+            math.cos(polar),
+        ]
+    )
+    foot, inwards = SPHERE.under((RADIUS - press) * radius)
+    assert inwards == pytest.approx(press, abs=2 * FACET)
+    np.testing.assert_allclose(foot.normal, radius, atol=0.012)  # skewed cells
+    np.testing.assert_allclose(
+        foot.point - inwards * foot.normal, (RADIUS - press) * radius, atol=1e-7
+    )
+
+
+def test_the_normal_does_not_jump_at_the_edges_of_facets():
+    way = np.linspace(-1.2, 1.2, 4001)
+    normals = np.array(
+        [
+            CYLINDER.closest(
+                np.array([RADIUS * math.sin(a), 0.003, RADIUS - RADIUS * math.cos(a)])
+            ).normal
+            for a in way[::10]
+        ]
+    )
+    turns = np.degrees(np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1)))
+    assert turns.max() < 1.5 * np.degrees(way[10] - way[0])  # facets alone would jump by 2 degrees
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-0.05, 0.05), st.floats(-0.04, 0.04))
+def test_walking_keeps_its_length_and_bends_with_the_skin(across, along):
+    start = CYLINDER.closest(np.array([0.0, 0.0, -0.01]))
+    foot = CYLINDER.walk(start, np.array([across, along, 0.0]))
+    angle = math.atan2(foot.point[0], RADIUS - foot.point[2])
+    assert RADIUS * angle == pytest.approx(across, abs=2e-4)
+    assert foot.point[1] == pytest.approx(along, abs=2e-4)
+
+
+def test_at_an_edge_one_stays():
+    foot = PLANE.walk(PLANE.closest(np.zeros(3)), np.array([0.0, 5.0, 0.0]))
+    np.testing.assert_allclose(foot.point, [0.0, 0.1, 0.0], atol=1e-12)
+
+
+def test_above_is_the_side_that_faces_the_probe():
+    top = SPHERE.above(0.0, 0.02)
+    np.testing.assert_allclose(top.point[:2], [0.0, 0.02], atol=1e-12)
+    assert top.point[2] == pytest.approx(-math.sqrt(RADIUS**2 - 0.02**2), abs=2 * FACET)
+    beside = PLANE.above(3.0, 0.0)
+    np.testing.assert_allclose(beside.point, [0.1, 0.0, 0.0], atol=1e-12)
+
+
+def test_the_closest_point_is_that_of_all_triangles_tried_one_by_one():
+    sheet = plane_surface((0.02, 0.02), 0.002)
+    generator = np.random.default_rng(4)
+    vertices = sheet.vertices + generator.normal(scale=3e-4, size=sheet.vertices.shape)
+    surface = RestSurface(vertices, sheet.triangles)
+    weights = generator.dirichlet([1, 1, 1], size=400)
+    for point in generator.uniform(-0.015, 0.015, size=(20, 3)):
+        samples = np.einsum("wc,tcx->twx", weights, vertices[sheet.triangles])
+        least = np.linalg.norm(samples - point, axis=2).min()
+        distance = np.linalg.norm(surface.closest(point).point - point)
+        assert distance <= least + 1e-12
+        assert distance == pytest.approx(least, abs=3e-4)
+
+
+def cube(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and outward triangles of a cube of 2 cm about the origin, turned about y (rad)."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
+    hull = ConvexHull(corners)
+    a, b, c = (corners[hull.simplices[:, k]] for k in range(3))
+    inwards = np.einsum("tx,tx->t", np.cross(b - a, c - a), a) < 0  # about the origin
+    triangles = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return corners @ [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]], triangles
+
+
+def test_the_upper_side_of_a_cube_is_its_face_at_the_least_z():
+    surface = RestSurface.upper_side(*cube())
+    np.testing.assert_allclose(surface.lower, [-0.01, -0.01, -0.01])
+    np.testing.assert_allclose(surface.upper, [0.01, 0.01, -0.01])
+    foot = surface.closest(np.array([0.003, 0.004, 0.02]))  # nearer to the lower face
+    np.testing.assert_allclose(foot.point, [0.003, 0.004, -0.01])
+    np.testing.assert_allclose(foot.normal, [0, 0, -1])
+
+
+@pytest.mark.parametrize(("degrees", "is_upper"), [(15, False), (20, True)])
+def test_a_side_that_is_steeper_than_the_limit_is_not_of_the_upper_side(degrees, is_upper):
+    turn = math.radians(degrees)  # the side faces up by sin(turn): 0.26, and 0.34
+    surface = RestSurface.upper_side(*cube(turn))
+    of_the_top = 0.01 * (math.sin(turn) - math.cos(turn))
+    of_the_side = 0.01 * (math.cos(turn) - math.sin(turn))
+    assert surface.upper[2] == pytest.approx(of_the_side if is_upper else of_the_top)
+
+
+def test_what_faces_down_only_has_no_upper_side():
+    vertices, triangles = cube()
+    down = vertices[triangles][:, :, 2].min(axis=1) > 0
+    with pytest.raises(MeshError, match="no triangle"):
+        RestSurface.upper_side(vertices, triangles[down])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "said"),
+    [
+        (np.zeros((3, 3)), [[0, 1, 2]], "no triangle with an area"),
+        (np.eye(3), [[0, 1, 3]], "vertices 0 to 3, but there are only 3"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "not finite"),
+        (np.eye(3), np.empty((0, 3), dtype=int), "no triangle"),
+    ],
+)
+def test_what_is_no_surface_is_said(vertices, triangles, said):
+    with pytest.raises(MeshError, match=said):
+        RestSurface(vertices, np.asarray(triangles))
+
+
+SPEED, TAU = 0.25, 0.02
+goals = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3).map(np.array)
+steps = st.lists(st.floats(1e-4, 0.1), min_size=1, max_size=12)
+
+
+def towards(goal):
+    approach = Approach(np.zeros(3), SPEED, TAU)
+    approach.goal = goal
+    return approach
+
+
+@settings(max_examples=40, deadline=None)
+@given(goals, steps, goals, steps)
+def test_the_path_does_not_depend_on_the_steps(first, early, second, late):
+    coarse, fine = towards(first), towards(first)
+    coarse.advance(sum(early))
+    for step in early:
+        fine.advance(step)
+    np.testing.assert_allclose(fine.place, coarse.place, atol=1e-12)
+    coarse.goal = fine.goal = second
+    coarse.advance(sum(late))
+    for step in late:
+        fine.advance(step)
+    np.testing.assert_allclose(fine.place, coarse.place, atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(goals, steps)
+def test_from_rest_it_goes_straight_to_the_goal_and_never_beyond(goal, times):
+    approach, length = towards(goal), float(np.linalg.norm(goal))
+    passed = 0.0
+    for step in times:
+        place = approach.advance(step)
+        along = float(place @ goal) / length if length else 0.0
+        assert passed - 1e-12 <= along <= length + 1e-12
+        aside = place - (along / length * goal if length else 0.0)
+        np.testing.assert_allclose(aside, 0.0, atol=1e-12)
+        passed = along
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(goals, st.floats(1e-3, 0.2)), min_size=1, max_size=6))
+def test_speed_and_acceleration_have_their_limits_whatever_the_goals(course):
+    approach, step = towards(course[0][0]), 1e-3
+    places = [approach.place]
+    for goal, duration in course:
+        approach.goal = goal
+        places += [approach.advance(step) for _ in range(math.ceil(duration / step))]
+    velocities = np.diff(places, axis=0) / step
+    assert np.linalg.norm(velocities, axis=1).max(initial=0.0) <= SPEED * (1 + 1e-9)
+    accelerations = np.diff(velocities, axis=0) / step
+    assert np.linalg.norm(accelerations, axis=1).max(initial=0.0) <= 2 * SPEED / TAU * (1 + 1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(goals)
+def test_it_ends_at_the_goal(goal):
+    approach = towards(goal)
+    approach.advance(float(np.linalg.norm(goal)) / SPEED + 25 * TAU)
+    assert approach.distance() < 1e-9
+
+
+def test_near_the_goal_it_is_critically_damped():
+    approach = towards(np.array([1e-3, 0.0, 0.0]))  # less than speed times time constant
+    for k in range(1, 20):
+        s = 0.25 * k
+        reached = 1e-3 * (1.0 - (1.0 + s) * math.exp(-s))  # the step response
+        assert abs(approach.advance(0.25 * TAU)[0] - reached) < 1e-15
+
+
+def test_it_moves_within_the_first_sixtieth_of_a_second():
+    approach = towards(np.array([0.02, 0.0, 0.0]))
+    t = 1 / 60
+    far = SPEED * (t - TAU * (1 - math.exp(-t / TAU)))  # a first-order lag behind a ramp
+    assert abs(approach.advance(t)[0] - far) < 1e-15
+    assert far > 1e-3
+
+
+def at(angle: float, **held: float) -> Stance:
+    return Stance([RADIUS * math.sin(angle), 0.0, RADIUS * (1 - math.cos(angle))], **held)
+
+
+def test_a_jump_around_the_arm_goes_over_its_skin():
+    motion = Motion(at(-1.0, press=0.003))
+    motion.aim(at(1.0, press=0.003))
+    for _ in range(60):
+        position = motion.advance(1 / 60).pose(CYLINDER).position
+        distance = math.hypot(position[0], position[2] - RADIUS)
+        assert distance == pytest.approx(RADIUS - 0.003, abs=2e-5)
+    assert motion.is_at_rest
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.0, 0.02), st.floats(-3, 3), st.floats(-1, 1), st.lists(st.floats(0.002, 0.05)))
+def test_poses_do_not_depend_on_the_steps(press, rotation, fan, steps):
+    coarse, fine = Motion(Stance()), Motion(Stance())
+    goal = Stance([0.01, 0.02, 0.0], press, rotation, fan)
+    coarse.aim(goal)
+    fine.aim(goal)
+    coarse.advance(sum(steps))
+    for step in steps:
+        fine.advance(step)
+    first, second = coarse.stance.pose(CYLINDER), fine.stance.pose(CYLINDER)
+    np.testing.assert_allclose(first.position, second.position, atol=1e-9)
+    assert np.abs(rotation_between(first.orientation, second.orientation)).max() < 1e-6
+
+
+def test_a_press_takes_as_long_as_its_speed_says():
+    speed = HandSpeed(press=0.1, time_constant=0.02)
+    motion = Motion(Stance(press=-0.05), speed)
+    motion.aim(Stance(press=0.02))
+    motion.advance(0.4)  # 40 mm further, less the lag of a time constant
+    assert motion.stance.press == pytest.approx(-0.05 + 0.1 * (0.4 - 0.02), abs=1e-9)
+
+
+def test_rotation_takes_the_shorter_way():
+    motion = Motion(Stance(rotation=3.0))
+    motion.aim(Stance(rotation=-3.0))
+    motion.advance(0.05)
+    assert abs(motion.stance.rotation) > 3.0
+    motion.advance(1.0)
+    assert motion.stance.rotation == pytest.approx(-3.0, abs=1e-6)
+
+
+def test_who_takes_the_probe_begins_where_it_is():
+    motion = Motion(Stance())
+    motion.aim(Stance(press=0.02))
+    motion.advance(0.03)
+    motion.rest_at(Stance(press=-0.01))
+    assert motion.is_at_rest
+    assert motion.advance(0.1).press == -0.01
+
+
+angles = st.floats(-STEEPEST, STEEPEST)
+turns = st.floats(-math.pi, math.pi)
+
+
+def test_upright_on_a_cylinder_the_array_stays_across_it():
+    angle = math.radians(40)
+    point = [RADIUS * math.sin(angle), 0.01, RADIUS * (1 - math.cos(angle))]
+    pose = Stance(point, press=0.004).pose(CYLINDER)
+    across, elevation, inwards = pose.rotation.T
+    np.testing.assert_allclose(across, [math.cos(angle), 0, math.sin(angle)], atol=1e-3)
+    np.testing.assert_allclose(elevation, [0, 1, 0], atol=1e-3)
+    np.testing.assert_allclose(inwards, [-math.sin(angle), 0, math.cos(angle)], atol=1e-3)
+    np.testing.assert_allclose(pose.position, point + 0.004 * inwards, atol=2e-5)
+
+
+def test_each_angle_turns_about_its_own_axis():
+    quarter = math.radians(30)
+    c, s = math.cos(quarter), math.sin(quarter)
+    x, y, z = Stance(fan=quarter).pose(PLANE).rotation.T
+    np.testing.assert_allclose([x, y, z], [[1, 0, 0], [0, c, s], [0, -s, c]], atol=1e-12)
+    x, y, z = Stance(rock=quarter).pose(PLANE).rotation.T
+    np.testing.assert_allclose([x, y, z], [[c, 0, -s], [0, 1, 0], [s, 0, c]], atol=1e-12)
+    x, y, z = Stance(rotation=quarter).pose(PLANE).rotation.T
+    np.testing.assert_allclose([x, y, z], [[c, s, 0], [-s, c, 0], [0, 0, 1]], atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.2, 2.9), turns, st.floats(-0.02, 0.02), turns, angles, angles)
+def test_the_way_back_from_a_pose(polar, turn, press, rotation, fan, rock):
+    outwards = [math.sin(polar) * math.cos(turn), math.sin(polar) * math.sin(turn)]
+    point = RADIUS * np.array([*outwards, math.cos(polar)])
+    pose = Stance(point, press, rotation, fan, rock).pose(SPHERE)
+    found = Stance.of(pose, SPHERE)
+    again = found.pose(SPHERE)
+    np.testing.assert_allclose(again.position, pose.position, atol=1e-8)
+    assert np.abs(rotation_between(again.orientation, pose.orientation)).max() < 1e-6
+    assert found.press == pytest.approx(press, abs=1e-5)
+    assert math.remainder(found.rotation - rotation, math.tau) == pytest.approx(0, abs=2e-3)
+    assert (found.fan, found.rock) == pytest.approx((fan, rock), abs=2e-3)
+
+
+def test_a_probe_that_lies_on_its_side_has_a_stance_too():
+    pose = Stance(rotation=0.3, fan=math.pi / 2).pose(PLANE)
+    again = Stance.of(pose, PLANE).pose(PLANE)
+    assert np.abs(rotation_between(again.orientation, pose.orientation)).max() < 1e-6
+
+
+def test_sliding_is_along_the_probes_own_axes():
+    turned = Stance(rotation=math.pi / 2)
+    np.testing.assert_allclose(turned.slid(PLANE, 0.01, 0.0).point, [0, 0.01, 0], atol=1e-12)
+    np.testing.assert_allclose(turned.slid(PLANE, 0.0, 0.01).point, [-0.01, 0, 0], atol=1e-12)
+    bent = Stance().slid(CYLINDER, RADIUS * 0.5, 0.0).point
+    np.testing.assert_allclose(
+        bent, [RADIUS * math.sin(0.5), 0, RADIUS * (1 - math.cos(0.5))], atol=2e-4
+    )
+
+
+def test_home_is_above_the_origin_or_in_the_middle():
+    np.testing.assert_allclose(Stance.home(PLANE, 0.001).point, [0, 0, 0])
+    assert Stance.home(SPHERE, 0.0).point[2] == pytest.approx(-RADIUS, abs=1e-5)
+
+
+def test_no_hand_presses_or_turns_without_end():
+    held = Stance(press=1.0, rotation=3.5, fan=-2.0, rock=2.0).within_reach()
+    assert (held.press, held.fan, held.rock) == (DEEPEST, -STEEPEST, STEEPEST)
+    assert held.rotation == pytest.approx(3.5 - math.tau)
+
+
+@pytest.mark.parametrize("wrong", [{"press": math.nan}, {"point": [0, 0]}, {"fan": math.inf}])
+def test_numbers_that_are_none_are_refused(wrong):
+    with pytest.raises(PoseError, match="not finite, or not seven"):
+        Stance(**wrong)

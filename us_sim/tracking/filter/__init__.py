@@ -1,1 +1,0 @@
-"""Filters of poses, and which poses are not believed."""

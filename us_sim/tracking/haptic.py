@@ -1,0 +1,654 @@
+"""The tissue's answer near a pose of the probe, as an energy whose slope is the wrench.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.haptic import ContactModel
+>>> wrench = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])  # N: pressed 10 mm into 200 N/m
+>>> stiffness = np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
+>>> wall = ContactModel(0, Pose(position=[0.0, 0.0, 0.01]), wrench, stiffness)
+>>> for depth in (0.015, 0.005, -0.005):
+...     print(wall.wrench_at(Pose(position=[0.0, 0.0, depth]))[2].round(6))
+-3.0
+-1.0
+0.0
+
+The wrench on a haptic arm's handle, a thousand times a second between the tissue's solutions.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.haptic import ContactModel
+>>> from us_sim.tracking.haptic import HapticDevice
+>>> from us_sim.tracking.haptic import HapticRendering
+>>> from us_sim.tracking.settings import HapticSettings
+>>> settings = HapticSettings(ramp="10 ms", hand_over="5 ms")
+>>> rendering = HapticRendering(settings, HapticDevice(settings))
+>>> wrench, stiffness = np.zeros(6), np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
+>>> for tick in range(100):  # down by 1 mm in 10 ms, into a wall of 200 N/m from z = 0 on
+...     now, depth = tick * 1_000_000, tick * 1e-4
+...     rendering.pose(now, Pose([0.0, 0.0, depth]), now)
+...     wrench[2] = -200 * depth
+...     rendering.model(ContactModel(now, Pose([0.0, 0.0, depth]), wrench, stiffness), now)
+...     felt = rendering.render(now)
+>>> float(felt[2].round(3)), rendering.doubt
+(-1.98, '')
+>>> rendering.render(now + 400_000_000), rendering.doubt
+(array([0., 0., 0., 0., 0., 0.]), 'no pose of the handle for 400 ms')
+
+A haptic arm's handle moves the probe, and feels what the probe feels.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.tracking.haptic import HapticDevice
+>>> from us_sim.tracking.settings import HapticSettings
+>>> arm = HapticDevice(HapticSettings(scale=2.0))
+>>> arm.take(Pose([0.01, 0.0, 0.0]), 1).pose.position
+array([0.02, 0.  , 0.  ])
+>>> arm.clutch(True)
+>>> arm.take(Pose([0.03, 0.0, 0.0]), 2).pose.position  # stays
+array([0.02, 0.  , 0.  ])
+>>> arm.clutch(False)
+>>> arm.take(Pose([0.03, 0.0, 0.01]), 3).pose.position
+array([0.02, 0.  , 0.02])
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import TrackingError
+from us_sim.geometry import se3
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import HapticSettings
+
+_HEAVIEST, _STIFFEST = 1e5, 1e9
+"""N and N/m beyond which a model is not believed."""
+
+_FADING = 0.5
+"""Fraction of the push at the model's pose below which the rest of the energy fades."""
+
+_FARTHEST = 0.03
+"""m: distance after which the push ends at the latest, however soft the tissue is."""
+
+_STIFFEST_SECANT = 3e3
+"""N/m: beyond it the stiffness is an oscillation of the solver, not tissue."""
+
+_NEAR = 5e-4
+"""m along the push: poses nearer than this do not determine the stiffness between them."""
+
+
+def wrench_in_patient(
+    pose: Pose, force: NDArray[np.float64], torque: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(6,) N, N m: force and torque (3,) along the probe's axes, along those of ``patient``."""
+    return np.concatenate([pose.rotation @ force, pose.rotation @ torque])
+
+
+@dataclass(frozen=True, eq=False)
+class ContactModel:
+    """The wrench on the probe near a pose, from the tissue's last solution.
+
+    With d the displacement of the probe's origin and its rotation vector about the axes of
+    ``patient``, the energy is ``-wrench · d + d · stiffness d / 2``. The part of it along the push
+    is that of a spring, which ends where it would pull. The rest is bounded by the energy of that
+    spring, and fades with the push, so that it is zero without one. The wrench is the slope of
+    this one energy: over a closed path no work is done.
+
+    Raises:
+        TrackingError: a number is not finite or absurd, a shape is wrong, or the stiffness is not
+            symmetric.
+    """
+
+    stamp: int  # ns, of the pose
+    pose: Pose  # of the probe in patient
+    wrench: NDArray[np.float64]  # (6,) N, N m, on the probe, about its origin, axes of patient
+    stiffness: NDArray[np.float64]  # (6, 6) N/m, N, N m, how the wrench falls with the motion
+
+    def __post_init__(self) -> None:
+        wrench = np.array(self.wrench, dtype=np.float64)
+        stiffness = np.array(self.stiffness, dtype=np.float64)
+        if wrench.shape != (6,) or stiffness.shape != (6, 6):
+            raise TrackingError(
+                f"a model of the contact needs a wrench of 6 numbers and a 6 by 6 stiffness, not "
+                f"{wrench.shape} and {stiffness.shape}"
+            )
+        if not (np.isfinite(wrench).all() and np.isfinite(stiffness).all()):
+            raise TrackingError("the model of the contact is not finite")
+        if np.abs(wrench).max() > _HEAVIEST or np.abs(stiffness).max() > _STIFFEST:
+            raise TrackingError(
+                f"the model of the contact has a wrench of {np.abs(wrench).max():.3g} N or a "
+                f"stiffness of {np.abs(stiffness).max():.3g} N/m: no tissue is so"
+            )
+        if not np.allclose(stiffness, stiffness.T, rtol=1e-6, atol=1e-9):
+            raise TrackingError("the stiffness of the contact is not symmetric")
+        object.__setattr__(self, "wrench", wrench)
+        object.__setattr__(self, "stiffness", stiffness)
+
+    @property
+    def push(self) -> NDArray[np.float64]:
+        """(3,) unit direction in which the tissue pushes the probe; zero without contact."""
+        return self._split[0]
+
+    @cached_property
+    def _split(
+        self,
+    ) -> tuple[
+        NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+    ]:
+        """The push's direction (3,), N, and how it falls (6,); the rest's wrench (6,) and stiffness
+        (6, 6)."""
+        force = float(np.linalg.norm(self.wrench[:3]))
+        if force == 0.0:
+            return np.zeros(3), 0.0, np.zeros(6), np.zeros(6), np.zeros((6, 6))
+        direction = self.wrench[:3] / force
+        along = np.concatenate([direction, np.zeros(3)])
+        slope = self.stiffness @ along
+        lacking = max(force / _FARTHEST - float(direction @ slope[:3]), 0.0)
+        slope += lacking * along
+        shape = slope / float(direction @ slope[:3])
+        rest = self.stiffness + lacking * np.outer(along, along) - np.outer(slope, shape)
+        return direction, force, slope, self.wrench - force * shape, rest
+
+    def displacement(self, pose: Pose) -> NDArray[np.float64]:
+        """(6,) m, rad: of the origin, and the rotation vector, from the model's pose to another."""
+        turn = se3.rotation_between(self.pose.orientation, pose.orientation)
+        return np.concatenate([pose.position - self.pose.position, turn])
+
+    def energy_at(self, pose: Pose) -> float:
+        """J, energy that the tissue returns until the probe is let go, by this model."""
+        return self.answer(self.displacement(pose))[0]
+
+    def wrench_at(self, pose: Pose) -> NDArray[np.float64]:
+        """(6,) N, N m on the probe at another pose, about its origin there, axes of ``patient``."""
+        return self.answer(self.displacement(pose))[1]
+
+    def answer(self, displacement: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
+        energy, wrench = self._slope(displacement)
+        turn = displacement[3:]
+        if wrench[3:].any() and turn.any():
+            # The energy falls along rotation vectors; a torque works on angular velocities.
+            wrench[3:] = np.linalg.solve(se3.left_jacobian(turn).T, wrench[3:])
+        return energy, wrench
+
+    def _slope(self, d: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """The energy (J) at a displacement (6,), and how it falls with that (6,)."""
+        direction, force, slope, wrench, stiffness = self._split
+        if force == 0.0:
+            return 0.0, np.zeros(6)
+        spring = float(direction @ slope[:3])
+        push = force - float(slope @ d)
+        if push <= 0.0:
+            return 0.0, np.zeros(6)
+        fade, fade_slope = _fade(push / force)
+        pulled = wrench - stiffness @ d
+        # At most what the spring along the push stored, or light contact would end with a kick.
+        most = 0.5 * force * force / spring
+        part = math.tanh(-0.5 * float((wrench + pulled) @ d) / most)
+        rest = most * part
+        energy = 0.5 * push * push / spring + fade * rest
+        answer = (push / spring + fade_slope / force * rest) * slope
+        answer += fade * (1.0 - part * part) * pulled
+        return energy, answer
+
+
+def _fade(push: float) -> tuple[float, float]:
+    """The factor of the rest of the energy at a fraction of the push, and its slope."""
+    x = push / _FADING
+    if x >= 1.0:
+        return 1.0, 0.0
+    return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / _FADING
+
+
+class SecantStiffness:
+    """The stiffness along the push, by the secant between two poses.
+
+    It is for solvers that know no stiffness of their own. A few poses do not determine the
+    stiffness across the push or against turns: so that is zero.
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as after the contact was lost."""
+        self._spring = 0.0  # N/m
+        self._last: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def at(self, pose: Pose, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The stiffness (6, 6) at the next pose of the probe.
+
+        Args:
+            pose: in ``patient``.
+            wrench: (6,) N, N m, on the probe, about its origin, axes of ``patient``.
+        """
+        stiffness = np.zeros((6, 6))
+        force = wrench[:3]
+        size = float(np.linalg.norm(force))
+        if size == 0.0:
+            self.forget()
+            return stiffness
+        push = force / size
+        if self._last is None:
+            self._last = pose.position, force
+        else:
+            distance = float((pose.position - self._last[0]) @ push)
+            if abs(distance) >= _NEAR:
+                spring = -float((force - self._last[1]) @ push) / distance
+                spring = min(max(spring, 0.0), _STIFFEST_SECANT)
+                self._spring = 0.5 * (self._spring or spring) + 0.5 * spring
+                self._last = pose.position, force
+        stiffness[:3, :3] = self._spring * np.outer(push, push)
+        return stiffness
+
+
+_REMEMBERED = 4096
+"""Poses of the handle kept for the models that carry their stamps."""
+
+_BETWEEN = 20_000_000
+"""ns: between two poses nearer in time than this the handle's pose is interpolated."""
+
+_RESTART = 1_000_000_000
+"""ns: a stamp that jumps back by more is a restarted device, not a late pose."""
+
+_LEVER = 0.05
+"""m: a turn of the handle by an angle counts as a displacement of this lever times the angle."""
+
+_SMOOTHED = 5
+"""Ticks over which the handle's displacement is averaged to predict the next tick's."""
+
+_RESERVE = 10
+"""Ticks for which the energy left must last: one tick returns at most an equal part of it."""
+
+_STORED = 2.0
+"""Energy returned to the handle at most, over what the model says the tissue has stored, so that
+energy that was lost meanwhile does not come back as a kick."""
+
+_DAMPING = 10.0
+"""N s/m, the strongest damping by which energy returned in excess is taken back."""
+
+
+class HapticRendering:
+    """Evaluates the newest model of the contact at the newest pose, and adds no energy.
+
+    Each model is tied by its stamp to the pose of the handle from which it was made, so it does not
+    matter what the tracker did in between. From one model to the next the wrench goes on without a
+    step. The work done by the wrench on the handle is added up (the passivity observer of B.
+    Hannaford and J.-H. Ryu, Time-domain passivity control of haptic interfaces, IEEE Trans.
+    Robotics and Automation 18, 2002); as soon as the handle would get more than it has put in since
+    contact began, the force along its motion is taken off (their controller, for the next tick as
+    in J.-H. Ryu, C. Preusche, B. Hannaford and G. Hirzinger, Time domain passivity control with
+    reference energy following, IEEE Trans. Control Systems Technology 13, 2005).
+
+    After any doubt the wrench is zero, until a model comes that is newer, and then grows slowly.
+
+    `pose`, `model`, `clutch` and `distrust` may be called while another thread renders.
+
+    Args:
+        settings: limits and times.
+        device: how the handle moves the probe.
+        time_offset: s that the tracker adds to the device's stamps.
+    """
+
+    def __init__(
+        self, settings: HapticSettings, device: HapticDevice, *, time_offset: float = 0.0
+    ) -> None:
+        self._settings, self._device = settings, device
+        self._time_offset = round(1e9 * time_offset)
+        self._metric = np.array([1.0, 1.0, 1.0, _LEVER, _LEVER, _LEVER])
+        self._arrived: deque[tuple[int, Pose, int]] = deque(maxlen=_REMEMBERED)
+        self._arrived_model: deque[tuple[ContactModel, int]] = deque(maxlen=1)
+        self._distrusted: deque[str] = deque(maxlen=1)
+        self._is_clutched = False
+        self._stamps: list[int] = []
+        self._poses: list[Pose] = []
+        self._pose_time: int | None = None
+        self._model: ContactModel | None = None
+        self._model_time = 0
+        self._not_before: int | None = None  # ns, the next model's stamp must be later
+        self._anchor = Pose()  # of the handle, when the model was made
+        self._begun: int | None = None  # ns, when the ramp began
+        self._left_over, self._since = (
+            np.zeros(6),
+            0,
+        )  # wrench of earlier models, and since when, ns
+        self._felt = np.zeros(6)
+        self._motion = np.zeros(6)  # m, rad, of the handle since the last tick
+        self._motions: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
+        #: J, work done by the handle since contact began, less work done on it.
+        self.energy = 0.0
+        #: Why nothing is felt; '' while something may be.
+        self.doubt = "no pose of the handle yet"
+        #: How often a doubt has ended what was felt, and the last that did.
+        self.stops, self.stopped = 0, ""
+        self._doubted(self.doubt)
+
+    @property
+    def stamp(self) -> int | None:
+        """ns, of the newest pose of the handle."""
+        return self._stamps[-1] if self._stamps else None
+
+    def pose(self, stamp: int, pose: Pose, now: int) -> None:
+        """Take a pose of the handle in the arm's frame; stamp and time of arrival in ns."""
+        self._arrived.append((stamp, pose, now))
+
+    def model(self, model: ContactModel, now: int) -> None:
+        """Take a model of the contact; time of arrival in ns."""
+        self._arrived_model.append((model, now))
+
+    def clutch(self, held: bool) -> None:
+        """Take the state of the clutch: while it is held nothing is felt."""
+        self._is_clutched = held
+
+    def distrust(self, why: str) -> None:
+        """Stop, for a reason, because input cannot be used."""
+        self._distrusted.append(why)
+
+    def render(self, now: int) -> NDArray[np.float64]:
+        """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
+
+        Args:
+            now: ns, of the clock of `pose` and `model`.
+        """
+        doubt = self._take_poses(now)
+        self.energy -= float(self._felt @ self._motion)
+        self._motions.append(self._motion)
+        if doubt:
+            # Only models of poses from here on are believed.
+            self._not_before = self._stamps[-1] if self._stamps else None
+            return self._doubted(doubt)
+        doubt = self._take_model(now)
+        if doubt:
+            return self._doubted(doubt)
+        assert self._model is not None
+        moved = self._device.probe_moved(self._model.pose, self._anchor, self._poses[-1])
+        doubt = self._far(moved)
+        if doubt:
+            return self._doubted(doubt)
+        self.doubt = ""
+        if self._begun is None:
+            self._begun = now
+        stored, wrench = self._model.answer(moved)
+        wrench += self._left(now)
+        felt = self._device.on_handle(self._model.pose, moved[3:], wrench)
+        felt = self._limited(self._unilateral(felt))
+        felt *= min(1e-9 * (now - self._begun) / self._settings.ramp, 1.0)
+        if self.energy > 0.0:
+            most = max(_STORED * self._device.work_ratio * stored, 0.0) if wrench.any() else 0.0
+            self.energy = min(self.energy, most)
+        self._felt = self._passive(felt)
+        return self._felt.copy()
+
+    def _take_poses(self, now: int) -> str:
+        """Take the poses that arrived; returns a doubt about the handle, or an empty text."""
+        doubt = self._distrusted.popleft() if self._distrusted else ""
+        self._motion = np.zeros(6)
+        while self._arrived:
+            stamp, pose, time = self._arrived.popleft()
+            step = stamp - self._stamps[-1] if self._stamps else 1
+            if step <= -_RESTART:
+                self._stamps.clear()
+                self._poses.clear()
+                doubt = "the stamps of the handle's poses have jumped back"
+            elif step <= 0:
+                continue  # repeated or late: the handle is where the newest says
+            if self._poses:
+                motion = _motion(self._poses[-1], pose)
+                distance, turn = _lengths(motion)
+                if distance > self._settings.jump:
+                    doubt = f"the handle has jumped by {1e3 * distance:.1f} mm"
+                elif turn > self._settings.rotation_jump:
+                    doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
+                else:
+                    self._motion = self._motion + motion
+            self._stamps.append(stamp)
+            self._poses.append(pose)
+            self._pose_time = time
+        if len(self._stamps) > 2 * _REMEMBERED:
+            del self._stamps[:-_REMEMBERED], self._poses[:-_REMEMBERED]
+        if doubt:
+            return doubt
+        if self._pose_time is None:
+            return "no pose of the handle yet"
+        if now - self._pose_time > 1e9 * self._settings.pose_timeout:
+            return f"no pose of the handle for {1e-6 * (now - self._pose_time):.0f} ms"
+        return "the clutch is held" if self._is_clutched else ""
+
+    def _take_model(self, now: int) -> str:
+        """Take the newest model if it belongs to a pose; returns a doubt, or an empty text."""
+        if self._arrived_model:
+            self._adopt(*self._arrived_model.popleft())
+        if self._model is None:
+            return "no model of the contact yet"
+        if now - self._model_time > 1e9 * self._settings.model_timeout:
+            return f"no model of the contact for {1e-6 * (now - self._model_time):.0f} ms"
+        return ""
+
+    def _adopt(self, model: ContactModel, time: int) -> None:
+        """Change to a newer model, if it is known where the handle was."""
+        stamp = model.stamp - self._time_offset
+        if self._not_before is not None and stamp <= self._not_before:
+            return
+        anchor = self._pose_at(stamp)
+        if anchor is None:
+            return
+        before = self._model
+        if before is not None and not self.doubt:
+            # The wrench felt now fades into the new model's.
+            handle = self._poses[-1]
+            _, old = before.answer(self._device.probe_moved(before.pose, self._anchor, handle))
+            _, new = model.answer(self._device.probe_moved(model.pose, anchor, handle))
+            self._left_over = old + self._left(time) - new
+            self._since = time
+        self._model, self._anchor, self._model_time = model, anchor, time
+        self._not_before = stamp
+
+    def _pose_at(self, stamp: int) -> Pose | None:
+        """Where the handle was, or None where that is not known."""
+        place = bisect_left(self._stamps, stamp)
+        if place == len(self._stamps):
+            return None
+        if self._stamps[place] == stamp:
+            return self._poses[place]
+        if place == 0 or self._stamps[place] - self._stamps[place - 1] > _BETWEEN:
+            return None
+        first, second = self._stamps[place - 1], self._stamps[place]
+        fraction = (stamp - first) / (second - first)
+        return se3.interpolate(self._poses[place - 1], self._poses[place], fraction)
+
+    def _far(self, moved: NDArray[np.float64]) -> str:
+        """A doubt about a model made at a displacement (6,) m, rad, or an empty text."""
+        distance, turn = _lengths(moved)
+        if distance > self._settings.model_reach:
+            return f"the probe is {1e3 * distance:.1f} mm from where the contact is known"
+        if turn > self._settings.model_rotation_reach:
+            return f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
+        return ""
+
+    def _doubted(self, doubt: str) -> NDArray[np.float64]:
+        """Return a wrench of zero, and begin anew with the next model."""
+        if not self.doubt:
+            self.stopped = doubt
+            self.stops += 1
+        self.doubt = doubt
+        self._begun = None
+        self._model = None
+        self._left_over, self._since = np.zeros(6), 0
+        self._felt = np.zeros(6)
+        self._motions.clear()
+        self.energy = min(self.energy, 0.0)  # energy returned in excess is still owed
+        return np.zeros(6)
+
+    def _left(self, now: int) -> NDArray[np.float64]:
+        """(6,) N, N m, what is still felt of earlier models."""
+        fraction = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
+        return self._left_over * min(max(fraction, 0.0), 1.0)
+
+    def _unilateral(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The wrench, less a force that would pull the handle against the tissue's push."""
+        assert self._model is not None
+        push = self._device.direction_on_handle(self._model.push)
+        pulled = float(felt[:3] @ push)
+        if pulled < 0.0:
+            felt[:3] -= pulled * push
+        return felt
+
+    def _limited(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The wrench within the limits of the arm."""
+        force, torque = _lengths(felt)
+        if force > self._settings.force_limit:
+            felt[:3] *= self._settings.force_limit / force
+        if torque > self._settings.torque_limit:
+            felt[3:] *= self._settings.torque_limit / torque
+        return felt
+
+    def _passive(self, felt: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The wrench, less the part along the motion that would return too much energy."""
+        motion = sum(self._motions) / len(self._motions)
+        work = float(felt @ motion)
+        left = self.energy
+        allowed = left / _RESERVE if left > 0.0 else left
+        if work <= allowed:
+            return felt
+        direction = motion * self._metric
+        square = float(direction @ direction)
+        if square == 0.0:
+            return felt
+        # No more is taken off along the motion than there is, and than the damping allows.
+        most = max(work, 0.0) + _DAMPING * self._settings.rate * square
+        off = min(work - allowed, most) / square
+        return self._limited(self._unilateral(felt - off * self._metric * direction))
+
+
+def _motion(first: Pose, second: Pose) -> NDArray[np.float64]:
+    """(6,) m, rad, from one pose of the handle to another, along the axes of the arm."""
+    turn = se3.rotation_between(first.orientation, second.orientation)
+    return np.concatenate([second.position - first.position, turn])
+
+
+def _lengths(pair: NDArray[np.float64]) -> tuple[float, float]:
+    """The norms of the first and of the last three numbers."""
+    a, b, c, d, e, f = pair.tolist()
+    return math.sqrt(a * a + b * b + c * c), math.sqrt(d * d + e * e + f * f)
+
+
+class HapticDevice:
+    """The coupling of a haptic arm's handle and the probe.
+
+    The handle's translation is scaled, its rotation is not. While the clutch is held the probe
+    stays; then it goes on from there, with the handle wherever it is.
+
+    Args:
+        settings: the scales.
+        registration: the arm's base in ``patient``.
+        calibration: the probe in the handle's frame.
+    """
+
+    def __init__(
+        self,
+        settings: HapticSettings,
+        registration: Pose | None = None,
+        calibration: Pose | None = None,
+    ) -> None:
+        self._scale, self._force_scale = settings.scale, settings.force_scale
+        #: Work on the handle over work on the probe.
+        self.work_ratio = settings.force_scale / settings.scale
+        registration, calibration = registration or Pose(), calibration or Pose()
+        self._turn = registration.rotation
+        #: (3,) m, from the handle's origin to the probe's, along the probe's axes.
+        self._lever = calibration.rotation.T @ calibration.position
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the displacement of the handle's frame by the clutch."""
+        self._offset = np.zeros(3)  # m, added to the scaled position
+        self._regrip = Pose().orientation  # turns the handle in its own frame
+        self._held: Pose | None = None  # where the body is kept
+        self._last: Pose | None = None  # of the handle
+        self.is_held = False
+
+    def take(self, pose: Pose, stamp: int) -> Measurement:
+        """The body that carries the probe, in the arm's frame.
+
+        Args:
+            pose: of the handle in the arm's frame.
+            stamp: ns.
+        """
+        self._last = pose
+        body = self._held or self._body(pose)
+        if self.is_held:
+            self._held = body
+        return Measurement(stamp, body)
+
+    def clutch(self, held: bool) -> None:
+        """Hold the probe where it is, or let it go on from there."""
+        if held and not self.is_held and self._last is not None:
+            self._held = self._body(self._last)
+        if not held and self._held is not None and self._last is not None:
+            x, y, z, w = self._last.orientation
+            self._offset = self._held.position - self._scale * self._last.position
+            self._regrip = se3.product(np.array([-x, -y, -z, w]), self._held.orientation)
+            self._held = None
+        self.is_held = held
+
+    def _body(self, pose: Pose) -> Pose:
+        return Pose(
+            self._scale * pose.position + self._offset,
+            se3.product(pose.orientation, self._regrip),
+        )
+
+    def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:
+        """How the probe moves with the handle, whatever the clutch did earlier.
+
+        Args:
+            probe: in ``patient``, when the handle was at ``before``.
+            before, now: of the handle in the arm's frame.
+
+        Returns:
+            (6,) m, rad: displacement of its origin, and its rotation vector, axes of ``patient``.
+        """
+        moved = np.empty(6)
+        moved[:3] = self._turn @ (self._scale * (now.position - before.position))
+        moved[3:] = self._turn @ se3.rotation_between(before.orientation, now.orientation)
+        if self._lever.any():
+            arm = probe.rotation @ self._lever
+            moved[:3] += _turned(arm, moved[3:]) - arm
+        return moved
+
+    def on_handle(
+        self, probe: Pose, turn: NDArray[np.float64], wrench: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
+
+        Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
+        takes none here.
+
+        Args:
+            probe: in ``patient``, before it has turned.
+            turn: (3,) rad, its rotation vector since.
+            wrench: (6,) N, N m, on the probe about its origin, axes of ``patient``.
+        """
+        force, torque = wrench[:3], wrench[3:]
+        if self._lever.any():
+            arm = _turned(probe.rotation @ self._lever, turn)
+            torque = torque + se3.cross_matrix(arm) @ force
+        felt = np.empty(6)
+        felt[:3] = self._force_scale * (force @ self._turn)
+        felt[3:] = self.work_ratio * (torque @ self._turn)
+        return felt
+
+    def direction_on_handle(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3,) along the axes of the arm, of (3,) along those of ``patient``."""
+        return direction @ self._turn
+
+
+def _turned(vector: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A vector (3,), turned by a rotation vector (3,) rad."""
+    return Pose(orientation=se3.rotation_exp(turn)).rotation @ vector

@@ -1,1 +1,0 @@
-"""A haptic arm: its handle moves the probe, and feels the tissue."""

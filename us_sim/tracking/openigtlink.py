@@ -1,0 +1,561 @@
+"""OpenIGTLink messages as bytes: poses in, images and transforms out (openigtlink.org, v1 to v3).
+
+Everything is big-endian and in millimetres; a checksum is written but, over TCP, not asked for.
+
+>>> import numpy as np
+>>> from us_sim.tracking.openigtlink import HEADER, header_of, poses_in, transform_message
+>>> matrix = np.eye(4)
+>>> matrix[:3, 3] = [0.01, 0.02, 0.03]
+>>> message = transform_message("ProbeToTracker", 1_500_000_000, matrix)
+>>> header = header_of(message[: HEADER.size])
+>>> header.kind, header.device, header.stamp, header.size
+('TRANSFORM', 'ProbeToTracker', 1500000000, 48)
+>>> [(name, matrix)] = poses_in(header, message[HEADER.size :])
+>>> name, matrix[:3, 3].round(6)
+('ProbeToTracker', array([0.01, 0.02, 0.03]))
+
+Poses from an OpenIGTLink server (Plus, 3D Slicer, a tracker's own), whenever it is there.
+
+An OpenIGTLink server that sends each client the newest messages and never waits for one.
+
+>>> from us_sim.tracking.openigtlink import OpenIGTLinkServer
+>>> server = OpenIGTLinkServer("localhost", 0)
+>>> server.send("ProbeToReference", b"...")
+>>> server.clients
+0
+>>> server.close()
+"""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import PoseError, TrackingError
+from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
+from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import OpenIGTLinkSettings
+
+HEADER = struct.Struct(">H12s20sIIQQ")
+"""Version, type, device, seconds, fraction of a second, size of the body, its checksum."""
+
+NAME_LENGTH = 20
+"""Bytes of a device's name, which is cut to that."""
+
+POSE_KINDS = ("TRANSFORM", "TDATA", "QTDATA", "POSITION")
+"""Types of message in which there are poses."""
+
+_METRES = 1e-3
+_VERSIONS = (1, 2, 3)
+_EXTENSION = struct.Struct(">HHII")  # its size, metadata's header and body, message number
+_METADATA = struct.Struct(">HHI")  # key's length, value's encoding and length
+_MATRIX = np.dtype((">f4", 12))  # column after column of the upper three rows
+_ELEMENTS = {
+    "TDATA": np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("matrix", _MATRIX)]),
+    "QTDATA": np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("pose", (">f4", 7))]),
+}
+_IMAGE = struct.Struct(">HBBBB3H12f6H")
+_UINT8, _BIG_ENDIAN = 3, 1
+_WORLDS = {"ras": 1, "lps": 2}
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a message."""
+
+    version: int
+    kind: str
+    device: str
+    stamp: int  # ns, 0 where the sender does not say
+    size: int  # bytes of the body
+
+
+def header_of(data: bytes) -> Header:
+    """The header in its 58 bytes.
+
+    Raises:
+        TrackingError: they are none.
+    """
+    version, kind, device, seconds, fraction, size, _ = HEADER.unpack(data)
+    try:
+        name = kind.rstrip(b"\0 ").decode("ascii")
+    except UnicodeDecodeError:
+        name = ""
+    if version not in _VERSIONS or not name.replace("_", "").isalnum():
+        raise TrackingError("what came is no OpenIGTLink message")
+    stamp = seconds * 10**9 + (fraction * 10**9 + 2**31 >> 32)
+    return Header(version, name, _text(device), stamp, size)
+
+
+def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]]]:
+    """Names and matrices (4, 4) m of the bodies in a message of one of `POSE_KINDS`.
+
+    The matrices are as they were sent: maybe not rigid, or not finite.
+
+    Raises:
+        TrackingError: the body is cut or of another layout, or the sender says that the pose is
+            not valid.
+    """
+    content = body
+    if header.version > 1:
+        content, metadata = _without_extension(header, body)
+        status = metadata.get("TransformStatus", "OK")  # of Plus
+        if status.upper() != "OK":
+            raise TrackingError(f"the server says that {header.device} is {status}")
+    if header.kind in _ELEMENTS:
+        element = _ELEMENTS[header.kind]
+        if len(content) % element.itemsize:
+            raise _wrong_size(header, len(content))
+        rows = np.frombuffer(content, dtype=element)
+        field = "matrix" if header.kind == "TDATA" else "pose"
+        make = _of_columns if header.kind == "TDATA" else _of_quaternion
+        return [(_text(row["name"]), make(row[field].astype(np.float64))) for row in rows]
+    wanted = 12 if header.kind == "TRANSFORM" else 7
+    if len(content) != 4 * wanted:
+        raise _wrong_size(header, len(content))
+    numbers = np.frombuffer(content, dtype=">f4").astype(np.float64)
+    make = _of_columns if header.kind == "TRANSFORM" else _of_quaternion
+    return [(header.device, make(numbers))]
+
+
+def transform_message(
+    device: str, stamp: int, matrix: NDArray[np.float64], *, per_pixel: bool = False
+) -> bytes:
+    """A TRANSFORM message of version 1, at ``stamp`` ns, of an affine matrix (4, 4).
+
+    It leads from metres to metres or, ``per_pixel``, from pixels to metres.
+    """
+    numbers = matrix[:3].T.copy()
+    numbers[0 if per_pixel else 3 :] /= _METRES
+    return _packed("TRANSFORM", device, stamp, numbers.astype(">f4").tobytes())
+
+
+def image_message(
+    device: str,
+    stamp: int,
+    pixels: NDArray[np.uint8],
+    matrix: NDArray[np.float64],
+    world: str,
+) -> bytes:
+    """An IMAGE message of version 1, at ``stamp`` ns, of grey pixels (rows, columns).
+
+    Args:
+        device: name of the image.
+        stamp: ns.
+        pixels: (rows, columns).
+        matrix: (4, 4), from (column, row, slice, 1) of pixel centres to m of the world.
+        world: "ras" or "lps".
+
+    Raises:
+        TrackingError: OpenIGTLink has no images of that size.
+    """
+    rows, columns = pixels.shape
+    if max(rows, columns) > 65_535:
+        raise TrackingError(f"an image of {columns} × {rows} pixels is too large for OpenIGTLink")
+    middle = matrix.copy()
+    middle[:3, 3] = (matrix @ [(columns - 1) / 2, (rows - 1) / 2, 0.0, 1.0])[:3]
+    # A map from pixels to metres becomes one to millimetres in all of its columns.
+    numbers = middle[:3].T.ravel() / _METRES
+    size = (columns, rows, 1)
+    head = _IMAGE.pack(1, 1, _UINT8, _BIG_ENDIAN, _WORLDS[world], *size, *numbers, 0, 0, 0, *size)
+    return _packed("IMAGE", device, stamp, head + np.ascontiguousarray(pixels).tobytes())
+
+
+def start_tracking_message(interval: float) -> bytes:
+    """Ask for TDATA at most every ``interval`` s."""
+    body = struct.pack(">I32s", max(round(interval * 1e3), 1), b"")
+    return _packed("STT_TDATA", "", 0, body)
+
+
+def _packed(kind: str, device: str, stamp: int, body: bytes) -> bytes:
+    seconds, rest = divmod(stamp, 10**9)
+    fraction = min((rest * 2**32 + 5 * 10**8) // 10**9, 2**32 - 1)
+    name = device.encode("ascii", "replace")[:NAME_LENGTH]
+    checksum = int(_crc64(np.frombuffer(body, dtype=np.uint8), _CRC_TABLE))
+    return HEADER.pack(1, kind.encode(), name, seconds, fraction, len(body), checksum) + body
+
+
+def _text(name: bytes) -> str:
+    return bytes(name).split(b"\0")[0].decode("ascii", "replace").strip()
+
+
+def _wrong_size(header: Header, size: int) -> TrackingError:
+    return TrackingError(f"a {header.kind} of {header.device!r} has {size} bytes, which cannot be")
+
+
+def _without_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, str]]:
+    """The content and the metadata of a message of version 2 or 3."""
+    try:
+        begin, heads, values, _ = _EXTENSION.unpack_from(body)
+        end = len(body) - heads - values
+        if not _EXTENSION.size <= begin <= end:
+            raise _wrong_size(header, len(body))
+        metadata: dict[str, str] = {}
+        if heads:
+            (count,) = struct.unpack_from(">H", body, end)
+            at = end + heads
+            for number in range(count):
+                key, _, value = _METADATA.unpack_from(body, end + 2 + number * _METADATA.size)
+                text = body[at : at + key + value].decode("utf-8", "replace")
+                metadata[text[:key]] = text[key:]
+                at += key + value
+    except struct.error as error:
+        raise _wrong_size(header, len(body)) from error
+    return body[begin:end], metadata
+
+
+def _of_columns(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3] = numbers.reshape(4, 3).T
+    matrix[:3, 3] *= _METRES
+    return matrix
+
+
+def _of_quaternion(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x, y, z mm and the quaternion x, y, z, w; nan where that is none."""
+    try:
+        return Pose(_METRES * numbers[:3], numbers[3:]).matrix
+    except PoseError:
+        return np.full((4, 4), np.nan)
+
+
+def _crc_table() -> NDArray[np.uint64]:
+    """Checksums of single bytes: CRC-64 of ECMA-182, most significant bit first."""
+    table = np.empty(256, dtype=np.uint64)
+    for byte in range(256):
+        crc = byte << 56
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x42F0E1EBA9EA3693 if crc >> 63 else 0)) & (2**64 - 1)
+        table[byte] = crc
+    return table
+
+
+_CRC_TABLE = _crc_table()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crc64(data, table):
+    crc = np.uint64(0)
+    for byte in data:
+        crc = table[(crc >> np.uint64(56)) ^ np.uint64(byte)] ^ (crc << np.uint64(8))
+    return crc
+
+
+LPS_FROM_RAS = Pose(orientation=np.array([0.0, 0.0, 1.0, 0.0]))
+"""Half a turn about z: x and y change sign."""
+
+_RETRY_S = 1.0
+_CONNECT_S = 2.0
+_LONGEST_POSES = 1 << 20  # bytes: a message with more than that is no list of poses
+_SKIPPED_AT_ONCE = 1 << 16
+_SAY_EVERY_S = 1.0
+_MOST_NAMES = 100  # of a server's bodies, to be told
+
+
+class OpenIGTLinkClient:
+    """A thread that stays connected and hands on each pose of one body.
+
+    Args:
+        settings: the server's address, and the frame of its poses.
+        body: name of the device, or of the body in a TDATA; None for the only one.
+        take: called in the client's thread with each measurement, whose stamp is the message's
+            (0 where it has none).
+        problem: called there with the kind and a sentence when something is not as it should be.
+        connected: called there when the connection stands.
+    """
+
+    def __init__(
+        self,
+        settings: OpenIGTLinkSettings,
+        body: str | None,
+        take: Callable[[Measurement], None],
+        problem: Callable[[str, str], None],
+        connected: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._settings = settings
+        self._body = body
+        self._take, self._problem, self._say_connected = take, problem, connected
+        #: The server's address, for a person.
+        self.place = f"{settings.host}:{settings.port}"
+        self._names: dict[str, None] = {}
+        self._heard = time.monotonic()
+        self._stamp = 0  # ns, of the newest pose handed on
+        self._closing = threading.Event()
+        self._socket: socket.socket | None = None
+        self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Disconnect, and wait for the thread to end."""
+        self._closing.set()
+        connection = self._socket
+        if connection is not None:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        self._thread.join(_CONNECT_S + _RETRY_S)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._converse()
+            except Exception as error:  # whatever it sends, it is tried again
+                if not self._closing.is_set():
+                    why = getattr(error, "strerror", None) or error
+                    self._problem(
+                        "connection",
+                        f"no poses from an OpenIGTLink server at {self.place} ({why}): start it, "
+                        f"or set tracker.openigtlink in the scene; it is tried again",
+                    )
+            self._closing.wait(_RETRY_S)
+
+    def _converse(self) -> None:
+        """Connect and read until the server or `close` ends it.
+
+        Raises:
+            OSError, TrackingError: the connection fails, is lost, or is of another protocol.
+        """
+        settings = self._settings
+        with socket.create_connection((settings.host, settings.port), _CONNECT_S) as connection:
+            self._socket = connection
+            connection.settimeout(None)
+            _keep_alive(connection)
+            if settings.tracking_data:
+                connection.sendall(start_tracking_message(settings.interval))
+            self._names.clear()
+            self._heard = time.monotonic()
+            self._say_connected()
+            while not self._closing.is_set():
+                header = header_of(_read(connection, HEADER.size))
+                if header.kind not in POSE_KINDS:
+                    _skip(connection, header.size)
+                    continue
+                if header.size > _LONGEST_POSES:
+                    raise TrackingError(f"a {header.kind} of {header.size} bytes cannot be")
+                self._handle(header, _read(connection, header.size))
+
+    def _handle(self, header: Header, body: bytes) -> None:
+        try:
+            poses = poses_in(header, body)
+        except TrackingError as error:
+            if self._is_wanted(header.device) or header.kind.endswith("TDATA"):
+                self._problem("message", f"{self.place}: {error}; it is not used")
+            return
+        for name, matrix in poses:
+            if not self._is_wanted(name):
+                continue
+            self._heard = time.monotonic()
+            try:
+                pose = self._in_metres(matrix)
+            except PoseError as error:
+                self._problem("pose", f"{self.place}: {name}: {error}; it is not used")
+                continue
+            if header.stamp and header.stamp == self._stamp:
+                # Some servers repeat the last pose of a body that they do not see.
+                self._problem("repeated", f"{self.place}: {name} is only a repeat; it is not used")
+                continue
+            self._stamp = header.stamp
+            self._take(Measurement(header.stamp, pose))
+
+    def _is_wanted(self, name: str) -> bool:
+        """Whether a name is the body's; reports now and then when only others come."""
+        if len(self._names) < _MOST_NAMES:
+            self._names[name] = None
+        if self._body is None:
+            if len(self._names) == 1:
+                return True
+            wanted = "the body"
+        elif name == self._body or name == self._body[:NAME_LENGTH]:
+            return True
+        else:
+            wanted = self._body
+        if time.monotonic() - self._heard > _SAY_EVERY_S:
+            self._heard = time.monotonic()
+            self._problem(
+                "body",
+                f"{self.place} sends no poses of {wanted}: set tracker.body in the scene to one "
+                f"of {', '.join(self._names)}",
+            )
+        return False
+
+    def _in_metres(self, matrix: NDArray[np.float64]) -> Pose:
+        pose = Pose.from_matrix(matrix)
+        return LPS_FROM_RAS @ pose if self._settings.world == "ras" else pose
+
+
+def _keep_alive(connection: socket.socket) -> None:
+    """Notice within seconds that the other computer is gone, though nothing is sent to it."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):
+        if hasattr(socket, option):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def _read(connection: socket.socket, size: int) -> bytes:
+    """Read that many bytes.
+
+    Raises:
+        TrackingError: the server has closed the connection.
+    """
+    data = bytearray(size)
+    view = memoryview(data)
+    while view:
+        count = connection.recv_into(view)
+        if not count:
+            raise TrackingError("it has closed the connection")
+        view = view[count:]
+    return bytes(data)
+
+
+def _skip(connection: socket.socket, size: int) -> None:
+    while size:
+        size -= len(_read(connection, min(size, _SKIPPED_AT_ONCE)))
+
+
+_MOST_CLIENTS = 16
+_READ_AT_ONCE = 1 << 16
+
+
+@dataclass(eq=False)
+class _Client:
+    """A connection, the message being sent, and the newest of each name that wait."""
+
+    connection: socket.socket
+    underway: memoryview = field(default_factory=lambda: memoryview(b""))
+    waiting: dict[str, bytes] = field(default_factory=dict)
+
+
+class OpenIGTLinkServer:
+    """A thread that sends the newest message of each name to every client.
+
+    A client that is too slow for all messages gets the newest ones; what a client sends is not
+    listened to.
+
+    Args:
+        host: name or address to listen at; an empty text for every one this computer has.
+        port: TCP port; 0 for any that is free, see `port`.
+
+    Raises:
+        TrackingError: it cannot listen there.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise TrackingError(
+                f"cannot serve OpenIGTLink at {host or 'every address'}, port {port} "
+                f"({error.strerror or error}): end what uses the port, or choose another"
+            ) from error
+        self.port = int(self._listener.getsockname()[1])
+        self._clients: dict[socket.socket, _Client] = {}
+        self._lock = threading.Lock()
+        self._closing = False
+        self._selector = selectors.DefaultSelector()
+        self._bell, self._ear = socket.socketpair()
+        for listening in (self._listener, self._ear, self._bell):
+            listening.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._selector.register(self._ear, selectors.EVENT_READ)
+        self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
+        self._thread.start()
+
+    @property
+    def clients(self) -> int:
+        """Number of clients connected."""
+        return len(self._clients)
+
+    def send(self, name: str, message: bytes) -> None:
+        """Send a message to all clients; one of the same name that has not left yet is dropped."""
+        with self._lock:
+            for client in self._clients.values():
+                client.waiting[name] = message
+        self._ring()
+
+    def close(self) -> None:
+        """Disconnect all, and wait for the thread to end."""
+        self._closing = True
+        self._ring()
+        self._thread.join()
+        for end in (self._ear, self._bell):  # not by the thread, which may be done before the ring
+            end.close()
+
+    def _ring(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # it has been rung often enough already
+            self._bell.send(b"\0")
+
+    def _run(self) -> None:
+        while not self._closing:
+            for key, events in self._selector.select():
+                if key.fileobj is self._ear:
+                    self._ear.recv(_READ_AT_ONCE)
+                elif key.fileobj is self._listener:
+                    self._accept()
+                else:
+                    self._serve(key.data, events)
+            for client in list(self._clients.values()):
+                if client.waiting and not client.underway:
+                    self._serve(client, selectors.EVENT_WRITE)
+        for client in list(self._clients.values()):
+            self._drop(client)
+        self._selector.close()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # gone again already
+            connection, _ = self._listener.accept()
+            if len(self._clients) >= _MOST_CLIENTS:
+                connection.close()
+                return
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            client = _Client(connection)
+            self._selector.register(connection, selectors.EVENT_READ, client)
+            with self._lock:
+                self._clients[connection] = client
+
+    def _serve(self, client: _Client, events: int) -> None:
+        """Read what is not listened to, and send what the connection takes."""
+        if client.connection not in self._clients:
+            return
+        try:
+            if events & selectors.EVENT_READ and not client.connection.recv(_READ_AT_ONCE):
+                self._drop(client)
+                return
+            if events & selectors.EVENT_WRITE:
+                self._write(client)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(client)
+            return
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.underway else 0)
+        self._selector.modify(client.connection, wanted, client)
+
+    def _write(self, client: _Client) -> None:
+        """Raises BlockingIOError when the connection takes no more."""
+        while True:
+            if not client.underway:
+                with self._lock:
+                    if not client.waiting:
+                        return
+                    name = next(iter(client.waiting))
+                    client.underway = memoryview(client.waiting.pop(name))
+            sent = client.connection.send(client.underway)
+            client.underway = client.underway[sent:]
+
+    def _drop(self, client: _Client) -> None:
+        with self._lock:
+            del self._clients[client.connection]
+        self._selector.unregister(client.connection)
+        client.connection.close()

@@ -1,1 +1,0 @@
-"""OpenIGTLink: messages, client and server."""

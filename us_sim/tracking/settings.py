@@ -1,0 +1,499 @@
+"""Settings of the tracker sources and filters, as a scene names them.
+
+The settings of the camera source in a scene: the body to look for, and when to believe it.
+
+>>> import math
+>>> from us_sim.tracking.settings import CameraSettings
+>>> settings = CameraSettings(dictionary="6X6_250", size="30 mm", marker=7)
+>>> settings.size, round(math.degrees(settings.view_angle_limit))
+(0.03, 75)
+>>> CameraSettings(minimum_markers=0)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: camera.minimum_markers: 0 is outside 1 to 1000
+
+The settings of the filters of a tracker's poses, and of the gate that refuses some.
+
+>>> from us_sim.tracking.settings import OneEuroSettings
+>>> OneEuroSettings(minimum_cutoff="2 Hz").minimum_cutoff
+2.0
+>>> OneEuroSettings(derivative_cutoff=0)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: filter.derivative_cutoff: 0 Hz is outside 0.001 to 1000 Hz
+
+The settings of a haptic arm in a scene: how it moves the probe, and the limits of its wrench.
+
+>>> from us_sim.tracking.settings import HapticSettings
+>>> HapticSettings(scale=2, ramp="500 ms").ramp
+0.5
+>>> HapticSettings(model_reach=3)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: haptic.model_reach: 3 m is outside 0.0001 to 1 m; did you mean '3 cm'?
+
+The settings of a 6-DOF mouse in a scene: how its cap's deflection moves the probe.
+
+>>> from us_sim.tracking.settings import SixDofMouseSettings
+>>> settings = SixDofMouseSettings(mode="position", reach=["30 mm", "-30 mm", "-30 mm"])
+>>> settings.reach, settings.axes
+((0.03, -0.03, -0.03), (0, 1, 2, 3, 4, 5))
+>>> SixDofMouseSettings(dead_band=2)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: six_dof_mouse.dead_band: 2 is outside 0 to 0.9
+
+The settings of an OpenIGTLink server in a scene: its address, and the frame of its poses.
+
+>>> from us_sim.tracking.settings import OpenIGTLinkSettings
+>>> OpenIGTLinkSettings(host="tracker.local", world="ras").port
+18944
+>>> OpenIGTLinkSettings(port=70000)
+Traceback (most recent call last):
+...
+us_sim.errors.TrackingError: openigtlink.port: 70000 is outside 1 to 65535
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from us_sim.errors import TrackingError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+BOARDS_OF_MARKERS = ("charuco", "grid")
+"""Kinds of flat boards that carry markers."""
+
+
+DICTIONARIES = (
+    *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "ARUCO_ORIGINAL",
+    "ARUCO_MIP_36h12",
+    *(f"APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
+)
+"""The marker dictionaries, by OpenCV's names without ``DICT_``."""
+
+MARKER_SIZE = Quantity("length", 1e-3, 0.25)
+
+
+@dataclass(frozen=True)
+class CameraSettings(Settings):
+    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    section = "camera"
+    error = TrackingError
+
+    body: str = setting(
+        default="",
+        file=True,
+        description="file of the rigid body of markers; empty for one marker",
+    )
+    marker: int = setting(
+        Quantity("number", 0, 65535), default=0, description="number of the one marker"
+    )
+    size: float = setting(
+        MARKER_SIZE, default=0.04, description="edge of the one marker's black square"
+    )
+    dictionary: str = setting(
+        default="4X4_50",
+        choices=DICTIONARIES,
+        description="dictionary of the marker, or of a body's file that names none",
+    )
+    minimum_markers: int = setting(
+        Quantity("number", 1, 1000),
+        default=1,
+        description="markers that must be seen for a pose to be taken",
+    )
+    reprojection_limit: float = setting(
+        Quantity("image distance", 0.1, 50.0),
+        default=2.0,
+        description="root mean square between the corners seen and those of the pose",
+    )
+    view_angle_limit: float = setting(
+        Quantity("angle", 0.1, 1.5),
+        default=math.radians(75.0),
+        description="angle between a marker's normal and the line of sight, beyond which it is "
+        "not used",
+    )
+    corner_deviation: float = setting(
+        Quantity("image distance", 0.01, 10.0),
+        default=0.1,
+        description="standard deviation of a corner, the least that the covariance of "
+        "the pose is made with",
+    )
+    latency: float = setting(
+        Quantity("time", -1.0, 1.0),
+        default=0.0,
+        description="time from the middle of the exposure to the image's stamp",
+    )
+
+
+def columns_and_rows(size: str) -> tuple[int, int]:
+    """The numbers in a board's size, which a person writes as ``5x7``.
+
+    Raises:
+        TrackingError: it is written otherwise.
+    """
+    columns, _, rows = size.lower().partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise TrackingError(f"--size {size}: write columns and rows, e.g. 5x7")
+    return int(columns), int(rows)
+
+
+_CUTOFF = Quantity("frequency", 1e-3, 1e3)
+
+
+@dataclass(frozen=True)
+class OneEuroSettings(Settings):
+    """The settings of the One-Euro filter; each is a key of ``tracker.filter``.
+
+    The defaults suit a hand-held probe: at rest the filter takes away most of what trembles above
+    1.5 Hz, and in a sweep of 0.1 m/s it lags by 8 ms.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    section = "filter"
+    error = TrackingError
+    live = True
+
+    minimum_cutoff: float = setting(
+        _CUTOFF, default=1.5, description="cutoff of the position at rest"
+    )
+    speed_coefficient: float = setting(
+        Quantity("cutoff per speed", 0.0, 1e5),
+        default=180.0,
+        description="how much the position's cutoff rises with speed",
+    )
+    rotation_minimum_cutoff: float = setting(
+        _CUTOFF, default=1.5, description="cutoff of the rotation at rest"
+    )
+    rotation_speed_coefficient: float = setting(
+        Quantity("cutoff per angular speed", 0.0, 1e5),
+        default=20.0,
+        description="how much the rotation's cutoff rises with angular speed",
+    )
+    derivative_cutoff: float = setting(_CUTOFF, default=1.0, description="cutoff of the speeds")
+
+
+@dataclass(frozen=True)
+class KalmanSettings(Settings):
+    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    section = "filter"
+    error = TrackingError
+    live = True
+
+    acceleration: float = setting(
+        Quantity("acceleration noise", 1e-6, 1e4),
+        default=0.05,
+        description="standard deviation of the change of the speed within a second; within a time "
+        "t it is the root of t times as much",
+    )
+    angular_acceleration: float = setting(
+        Quantity("angular acceleration noise", 1e-6, 1e5),
+        default=0.5,
+        description="the same of the angular speed",
+    )
+    position_deviation: float = setting(
+        Quantity("length", 1e-9, 0.1),
+        default=3e-4,
+        description="standard deviation of each coordinate of a pose that comes without covariance",
+    )
+    rotation_deviation: float = setting(
+        Quantity("angle", 1e-9, 1.0),
+        default=5e-3,
+        description="standard deviation about each axis of a pose that comes without covariance",
+    )
+
+
+@dataclass(frozen=True)
+class GateSettings(Settings):
+    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    section = "gate"
+    error = TrackingError
+
+    maximum_speed: float = setting(
+        Quantity("speed", 1e-3, 100.0), default=2.0, description="largest speed of the probe's face"
+    )
+    maximum_angular_speed: float = setting(
+        Quantity("angular speed", 1e-2, 1e3),
+        default=15.0,
+        description="largest angular speed of the probe",
+    )
+    jump: float = setting(
+        Quantity("length", 0.0, 1.0),
+        default=5e-3,
+        description="distance between two poses that is allowed beside what the speed allows: a "
+        "pose's noise",
+    )
+    rotation_jump: float = setting(
+        Quantity("angle", 0.0, math.pi),
+        default=math.radians(5),
+        description="turn between two poses that is allowed beside what the angular speed allows",
+    )
+    confidence: float = setting(
+        Quantity("number", 0.5, 1 - 1e-12),
+        default=0.999999,
+        description="fraction of right poses with a covariance that are believed",
+    )
+    accept_after: int = setting(
+        Quantity("number", 2, 10_000),
+        default=5,
+        description="so many refused poses in a row that agree with each other are the new place",
+    )
+
+
+@dataclass(frozen=True)
+class HapticSettings(Settings):
+    """The settings of a haptic arm; each is a key of a scene's ``tracker.haptic:``.
+
+    The defaults suit a small desktop arm that gives 3 N at most and no torque.
+
+    Raises:
+        TrackingError: a value is out of range, with its name and the range.
+    """
+
+    section = "haptic"
+    error = TrackingError
+
+    scale: float = setting(
+        Quantity("number", 0.01, 100.0),
+        default=1.0,
+        description="how far the probe moves for a movement of the handle",
+    )
+    force_scale: float = setting(
+        Quantity("number", 0.0, 100.0),
+        default=1.0,
+        description="how hard the handle is pushed for a force on the probe",
+    )
+    force_limit: float = setting(
+        Quantity("force", 0.0, 50.0), default=3.0, description="largest force on the handle"
+    )
+    torque_limit: float = setting(
+        Quantity("torque", 0.0, 5.0),
+        default=0.0,
+        description="largest torque on the handle; 0 for an arm that gives none",
+    )
+    rate: float = setting(
+        Quantity("frequency", 50.0, 4000.0),
+        default=1000.0,
+        description="how often a wrench is sent",
+    )
+    ramp: float = setting(
+        Quantity("time", 0.01, 30.0),
+        default=1.0,
+        description="time in which the force grows from nothing, at the start and after any doubt",
+    )
+    hand_over: float = setting(
+        Quantity("time", 1e-3, 1.0),
+        default=0.03,
+        description="time for the change from one model of the contact to the next",
+    )
+    pose_timeout: float = setting(
+        Quantity("time", 2e-3, 1.0),
+        default=0.05,
+        description="time without a pose after which the wrench is zero",
+    )
+    model_timeout: float = setting(
+        Quantity("time", 5e-3, 5.0),
+        default=0.3,
+        description="age of the model of the contact from which on the wrench is zero",
+    )
+    jump: float = setting(
+        Quantity("length", 1e-4, 1.0),
+        default=0.01,
+        description="movement of the handle between two poses, beyond which the wrench is zero",
+    )
+    rotation_jump: float = setting(
+        Quantity("angle", 1e-3, 3.0),
+        default=0.3,
+        description="turn of the handle between two poses, beyond which the wrench is zero",
+    )
+    model_reach: float = setting(
+        Quantity("length", 1e-4, 1.0),
+        default=0.02,
+        description="distance of the probe from where the contact is known, beyond which the "
+        "wrench is zero",
+    )
+    model_rotation_reach: float = setting(
+        Quantity("angle", 1e-3, 3.0),
+        default=0.5,
+        description="turn of the probe from where the contact is known, beyond which the wrench "
+        "is zero",
+    )
+
+
+MOUSE_MODES = ("rate", "position")
+MOTION_FRAMES = ("probe", "patient")
+
+_PLACE = Quantity("length", -10.0, 10.0)
+_BUTTON = Quantity("number", -1, 63)
+
+
+@dataclass(frozen=True)
+class SixDofMouseSettings(Settings):
+    """The settings of the 6-DOF mouse; each is a key of a scene's ``tracker.six_dof_mouse:``.
+
+    A full deflection is 1. The signs of the defaults turn the axes of REP 103, in which mice
+    report (x forward, y left, z up), about x: so the probe goes down when the cap is pushed down.
+
+    Raises:
+        TrackingError: a value is out of range, or two do not go together.
+    """
+
+    section = "six_dof_mouse"
+    error = TrackingError
+
+    mode: str = setting(
+        default="rate",
+        choices=MOUSE_MODES,
+        description="rate: the deflection is the probe's velocity; position: its displacement "
+        "from where the clutch was let go",
+    )
+    frame: str = setting(
+        default="probe", choices=MOTION_FRAMES, description="whose axes the probe moves along"
+    )
+    axes: tuple[int, int, int, int, int, int] = setting(
+        Quantity("number", 0, 63),
+        default=(0, 1, 2, 3, 4, 5),
+        description="which axes of the joystick move along x, y, z and turn about x, y, z",
+    )
+    speed: tuple[float, float, float] = setting(
+        Quantity("speed", -1.0, 1.0),
+        default=(0.05, -0.05, -0.05),
+        description="velocity at full deflection along x, y, z, in rate mode",
+    )
+    angular_speed: tuple[float, float, float] = setting(
+        Quantity("angular speed", -10.0, 10.0),
+        default=(0.6, -0.6, -0.6),
+        description="angular velocity at full deflection about x, y, z, in rate mode",
+    )
+    reach: tuple[float, float, float] = setting(
+        Quantity("length", -1.0, 1.0),
+        default=(0.03, -0.03, -0.03),
+        description="displacement at full deflection along x, y, z, in position mode",
+    )
+    angular_reach: tuple[float, float, float] = setting(
+        Quantity("angle", -math.pi, math.pi),
+        default=(0.5, -0.5, -0.5),
+        description="turn at full deflection about x, y, z, in position mode",
+    )
+    dead_band: float = setting(
+        Quantity("number", 0.0, 0.9),
+        default=0.05,
+        description="deflection up to which an axis counts as at rest",
+    )
+    clutch_button: int = setting(
+        _BUTTON, default=0, description="button that holds the probe where it is; -1 for none"
+    )
+    reset_button: int = setting(
+        _BUTTON, default=1, description="button that brings the probe home; -1 for none"
+    )
+    home: tuple[float, float, float] = setting(
+        _PLACE, default=(0.0, 0.0, -0.01), description="where the probe begins, in patient"
+    )
+    home_orientation: tuple[float, float, float, float] = setting(
+        Quantity("number", -1.0, 1.0),
+        default=(0.0, 0.0, 0.0, 1.0),
+        description="quaternion x, y, z, w of the probe there",
+    )
+    workspace_low: tuple[float, float, float] = setting(
+        _PLACE,
+        default=(-0.2, -0.2, -0.1),
+        description="least x, y, z of the probe in patient",
+    )
+    workspace_high: tuple[float, float, float] = setting(
+        _PLACE,
+        default=(0.2, 0.2, 0.1),
+        description="largest x, y, z of the probe in patient",
+    )
+    longest_gap: float = setting(
+        Quantity("time", 1e-3, 10.0),
+        default=0.1,
+        description="time between two messages over which the velocity is still believed",
+    )
+
+    def check(self) -> None:
+        """Six axes, an orientation, two buttons, and a home in the workspace."""
+        if len(set(self.axes)) != len(self.axes):
+            raise self.refused("axes", f"{self.axes} must be six different whole numbers, from 0")
+        if math.hypot(*self.home_orientation) < 1e-6:
+            raise self.refused(
+                "home_orientation", "is zero, so it is no orientation: give [0, 0, 0, 1] for none"
+            )
+        if self.clutch_button == self.reset_button >= 0:
+            raise self.refused(
+                "reset_button",
+                f"{self.reset_button} is the clutch already: name another button, or -1 for none",
+            )
+        bounds = zip(self.workspace_low, self.home, self.workspace_high, strict=True)
+        if not all(low <= place <= high for low, place, high in bounds):
+            raise self.refused(
+                "home",
+                f"{self.home} is outside the workspace from {self.workspace_low} to "
+                f"{self.workspace_high}: move it, or widen the workspace",
+            )
+
+
+WORLDS = ("tracker", "lps", "ras")
+CLOCKS = ("server", "arrival")
+
+
+@dataclass(frozen=True)
+class OpenIGTLinkSettings(Settings):
+    """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
+
+    Which of the server's devices is the probe is the scene's ``tracker.body``.
+
+    Raises:
+        TrackingError: a value is out of range.
+    """
+
+    section = "openigtlink"
+    error = TrackingError
+
+    host: str = setting(default="localhost", description="name or address of the server")
+    port: int = setting(Quantity("number", 1, 65535), default=18944, description="TCP port")
+    world: str = setting(
+        default="tracker",
+        choices=WORLDS,
+        description="what the poses are in: the tracker's own frame, or an image's LPS or RAS; "
+        "RAS, which 3D Slicer sends, is turned into LPS, in which volumes are read",
+    )
+    clock: str = setting(
+        default="server",
+        choices=CLOCKS,
+        description="server: the messages' own stamps; arrival: when they come, for a server "
+        "whose clock is not this computer's",
+    )
+    tracking_data: bool = setting(
+        default=False,
+        description="ask for TDATA, for servers that send nothing unasked",
+    )
+    interval: float = setting(
+        Quantity("time", 1e-3, 10.0),
+        default=0.01,
+        description="time between two TDATA, if asked for",
+    )
+
+    def check(self) -> None:
+        """A server has a name."""
+        if not self.host.strip():
+            raise self.refused("host", "is empty: name the server, or localhost")

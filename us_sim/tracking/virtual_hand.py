@@ -1,0 +1,526 @@
+"""The surface on which a probe is put: the patient's skin at rest.
+
+>>> import numpy as np
+>>> from us_sim.tracking.virtual_hand import RestSurface
+>>> skin = RestSurface.plane(0.1)
+>>> foot = skin.closest(np.array([0.01, 0.02, -0.03]))
+>>> foot.point, foot.normal
+(array([0.01, 0.02, 0.  ]), array([ 0.,  0., -1.]))
+
+How something gets from where it is to where it is wanted: at once, smoothly, not too fast.
+
+A lead goes straight to the goal: as fast as it may, and within the last ``speed * time_constant``
+ever slower, by exp(-t / time_constant). What follows the lead lags by the same time constant. So
+near the goal it is the critically damped system of second order, which is the fastest linear one
+that does not overshoot; from afar it goes with the largest speed. Both phases are solved exactly,
+so the path does not depend on the steps in which time passes.
+
+A movement of minimum jerk (Flash and Hogan 1985) is closer to what an arm does by itself, yet it
+begins with the cube of time: planned anew whenever the mouse moves it would hardly begin at all.
+
+>>> import numpy as np
+>>> from us_sim.tracking.virtual_hand import Approach
+>>> approach = Approach(np.zeros(1), speed=0.25, time_constant=0.02)
+>>> approach.goal = np.array([0.05])
+>>> [round(1e3 * float(approach.advance(0.05)[0]), 2) for _ in range(6)]  # mm
+[7.91, 20.03, 32.5, 44.48, 49.17, 49.9]
+
+The hand's movement from one stance to the next: a jump of the mouse does not stab the tissue.
+
+>>> from us_sim.tracking.virtual_hand import Motion
+>>> from us_sim.tracking.virtual_hand import Stance
+>>> motion = Motion(Stance())
+>>> motion.aim(Stance(press=0.01))
+>>> pressed = [round(1e3 * motion.advance(0.04).press, 2) for _ in range(4)]  # mm
+>>> pressed, motion.is_at_rest
+([3.41, 7.98, 9.57, 9.92], False)
+
+How a hand holds the probe on the skin, and the pose that follows.
+
+The motions are those of the American Institute of Ultrasound in Medicine ("Transducer
+Manipulation", Journal of Ultrasound in Medicine 18, 1999, 169-175), in frame ``probe``: +x along
+the array, +y the elevation, +z into the tissue.
+
+- sliding: the point on the skin moves, along x or along y;
+- compressing: the probe moves along the skin's normal;
+- rotating: about the normal;
+- fanning (or tilting): about x, so the image plane swings through the tissue;
+- rocking: about y, within the image plane.
+
+>>> import math
+>>> from us_sim.tracking.virtual_hand import RestSurface
+>>> from us_sim.tracking.virtual_hand import Stance
+>>> skin = RestSurface.plane(0.1)
+>>> pressed = Stance([0.02, 0.0, 0.0], press=0.005, fan=math.radians(10))
+>>> (1e3 * pressed.pose(skin).position).round(6).tolist()  # mm
+[20.0, 0.0, 5.0]
+>>> again = Stance.of(pressed.pose(skin), skin)
+>>> round(1e3 * again.press, 6), round(math.degrees(again.fan), 6)
+(5.0, 10.0)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError, PoseError
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import product, rotation_exp
+
+_STEP = 1e-3
+"""m: a way over the surface is walked in steps of this, each along the tangent where it begins."""
+_TURNS, _NEAR = 30, 1e-9
+"""How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
+_FACING_UP = 0.3
+"""Cosine between -z and the normals of a closed surface's upper side, which is more than this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """Where something stands on the surface."""
+
+    point: NDArray[np.float64]  # (3,) m, on the surface, frame patient
+    normal: NDArray[np.float64]  # (3,) unit length, out of the body, without jumps along the skin
+
+
+class RestSurface:
+    """Triangles whose normals are made smooth, since a probe on facets would jerk at their edges.
+
+    The normal at a point is interpolated between those of its triangle's corners (Phong 1975), and
+    a corner's is the mean of its triangles', weighted by their areas.
+
+    Args:
+        vertices: (N, 3) m, frame ``patient``.
+        triangles: (T, 3) indices into them, anticlockwise as seen from outside the body.
+
+    Raises:
+        MeshError: no triangle has an area, a vertex is not finite, or an index is of no vertex.
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> None:
+        vertices = np.asarray(vertices, dtype=np.float64)
+        triangles = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
+        if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+            raise MeshError(
+                f"the skin's triangles name vertices {triangles.min()} to {triangles.max()}, but "
+                f"there are only {len(vertices)}"
+            )
+        corners = vertices[triangles]
+        if not np.isfinite(corners).all():
+            raise MeshError("a vertex of the skin is not finite, so no probe can stand on it")
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        proper = np.linalg.norm(across, axis=1) > 0.0
+        if not proper.any():
+            raise MeshError("the skin has no triangle with an area, so no probe can stand on it")
+        sums = np.zeros_like(vertices)
+        np.add.at(sums, triangles, across[:, None, :])
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        normals = np.divide(sums, lengths, out=sums, where=lengths > 0.0)
+        self._corners = corners[proper]  # (T, 3, 3) m
+        self._normals = normals[triangles[proper]]  # (T, 3, 3)
+        self._flat = across[proper] / np.linalg.norm(across[proper], axis=1, keepdims=True)
+        self._centres = self._corners.mean(axis=1)
+        self._radii = np.linalg.norm(self._corners - self._centres[:, None], axis=2).max(axis=1)
+        self.lower: NDArray[np.float64] = self._corners.min(axis=(0, 1))
+        self.upper: NDArray[np.float64] = self._corners.max(axis=(0, 1))
+        """(3,) m, the corners of the box around it."""
+
+    @classmethod
+    def plane(cls, half: float) -> RestSurface:
+        """The square of z = 0 within ``half`` m around the origin, with the body at z > 0."""
+        vertices = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+        return cls(np.insert(vertices, 2, 0.0, axis=1), np.array([[0, 2, 1], [0, 3, 2]]))
+
+    @classmethod
+    def upper_side(
+        cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
+    ) -> RestSurface:
+        """The part of a closed surface on which a probe can be put: what faces -z.
+
+        Args:
+            vertices: (N, 3) m, frame ``patient``.
+            triangles: (T, 3) indices into them, anticlockwise as seen from outside the body.
+
+        Raises:
+            MeshError: as the class itself; nothing of it faces -z.
+        """
+        a, b, c = (np.asarray(vertices, dtype=np.float64)[triangles[:, k]] for k in range(3))
+        across = np.cross(b - a, c - a)
+        faces_up = -across[:, 2] > _FACING_UP * np.linalg.norm(across, axis=1)
+        return cls(vertices, triangles[faces_up])
+
+    def closest(self, point: NDArray[np.float64]) -> Foot:
+        """The surface's closest point to one (3,) m."""
+        offsets = self._centres - point
+        distances = np.sqrt(np.einsum("tx,tx->t", offsets, offsets))
+        least = distances - self._radii
+        near = np.flatnonzero(least <= distances.min())
+        order = near[np.argsort(least[near])]
+        target, found = point.tolist(), (math.inf, 0, (1.0, 0.0, 0.0))
+        # Few are looked at: a point on the surface is within the spheres of some eight triangles.
+        for triangle, bound in zip(order.tolist(), least[order].tolist(), strict=True):
+            if bound > 0.0 and bound * bound > found[0]:
+                break
+            a, b, c = self._corners[triangle].tolist()
+            weights = _closest_weights(a, b, c, target)
+            square = sum(
+                (weights[0] * a[k] + weights[1] * b[k] + weights[2] * c[k] - target[k]) ** 2
+                for k in range(3)
+            )
+            found = min(found, (square, triangle, weights))
+        return self._foot(found[1], np.array(found[2]))
+
+    def above(self, x: float, y: float) -> Foot:
+        """The first point of the surface on the way along +z through x, y (m).
+
+        Where that way misses the surface it is the point closest to x, y on the surface's top.
+        """
+        a, b, c = (self._corners[:, k, :2] for k in range(3))
+        point = np.array([x, y])
+        areas = np.stack([_area(b, c, point), _area(c, a, point), _area(a, b, point)], axis=1)
+        total = areas.sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weights = areas / total[:, None]
+        met = np.flatnonzero((weights >= -1e-9).all(axis=1) & (total != 0.0))
+        if not len(met):
+            return self.closest(np.array([x, y, self.lower[2]]))
+        heights = np.einsum("tc,tc->t", weights[met], self._corners[met, :, 2])
+        first = int(np.argmin(heights))
+        return self._foot(int(met[first]), weights[met[first]])
+
+    def under(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
+        """The foot on whose normal a position (3,) m lies, and how far inwards (m) it is from it.
+
+        Near the edge of a surface that is not closed there may be none: then it is the closest.
+        """
+        point = position
+        for _ in range(_TURNS):
+            foot = self.closest(point)
+            offset = position - foot.point
+            inwards = -float(offset @ foot.normal)
+            aside = offset + inwards * foot.normal
+            if float(np.abs(aside).max()) < _NEAR:
+                return foot, inwards
+            point = foot.point + aside
+        foot = self.closest(position)
+        return foot, -float((position - foot.point) @ foot.normal)
+
+    def walk(self, foot: Foot, way: NDArray[np.float64]) -> Foot:
+        """Where one comes to along a way (3,) m over the surface, straight on.
+
+        The way's direction is turned with the surface; at an edge one stays.
+        """
+        length = float(np.linalg.norm(way))
+        steps = max(1, int(np.ceil(length / _STEP)))
+        direction = np.asarray(way, dtype=np.float64)
+        for _ in range(steps):
+            tangent = direction - (direction @ foot.normal) * foot.normal
+            size = float(np.linalg.norm(tangent))
+            if size < 1e-12:
+                break
+            direction = tangent / size
+            foot = self.closest(foot.point + (length / steps) * direction)
+        return foot
+
+    def _foot(self, triangle: int, weights: NDArray[np.float64]) -> Foot:
+        normal = weights @ self._normals[triangle]
+        length = float(np.linalg.norm(normal))
+        # Where triangles fold onto each other their normals may cancel.
+        normal = normal / length if length > 1e-9 else self._flat[triangle]
+        return Foot(weights @ self._corners[triangle], normal)
+
+
+def _area(
+    a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(T,) twice the signed areas of the triangles a, b (T, 2) and a point (2,), m²."""
+    along, to = b - a, point - a
+    return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])
+
+
+def _closest_weights(
+    a: list[float], b: list[float], c: list[float], point: list[float]
+) -> tuple[float, float, float]:
+    """Barycentric weights of the closest point of a triangle to a point, m.
+
+    By the region in which the point lies (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+    """
+    ab, ac = _from(a, b), _from(a, c)
+    to = _from(a, point)
+    d1, d2 = _dot(ab, to), _dot(ac, to)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return 1.0, 0.0, 0.0
+    to = _from(b, point)
+    d3, d4 = _dot(ab, to), _dot(ac, to)
+    if d3 >= 0.0 and d4 <= d3:
+        return 0.0, 1.0, 0.0
+    to = _from(c, point)
+    d5, d6 = _dot(ab, to), _dot(ac, to)
+    if d6 >= 0.0 and d5 <= d6:
+        return 0.0, 0.0, 1.0
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return 1.0 - v, v, 0.0
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return 1.0 - w, 0.0, w
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 >= d3 and d5 >= d6:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return 0.0, 1.0 - w, w
+    total = va + vb + vc
+    return va / total, vb / total, vc / total
+
+
+def _from(start: list[float], end: list[float]) -> tuple[float, float, float]:
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
+
+
+def _dot(first: tuple[float, float, float], second: tuple[float, float, float]) -> float:
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+class Approach:
+    """One quantity of a movement, of any number of coordinates.
+
+    Its speed is never above ``speed``, its acceleration never above
+    ``2 * speed / time_constant``, and half of that from rest. It stays within the triangle of
+    where it is, where its lead is and the goal: from rest, on the straight line to the goal.
+
+    Args:
+        place: (K,) where it rests.
+        speed: the largest, in the unit of the place per s.
+        time_constant: s.
+    """
+
+    def __init__(self, place: NDArray[np.float64], speed: float, time_constant: float) -> None:
+        self._speed, self._time_constant = speed, time_constant
+        self.rest_at(place)
+
+    def rest_at(self, place: NDArray[np.float64]) -> None:
+        """Be somewhere, without movement."""
+        self.place = np.array(place, dtype=np.float64)
+        self._lead = self.place.copy()
+        self.goal: NDArray[np.float64] = self.place.copy()
+
+    def distance(self) -> float:
+        """How far it, or its lead, still is from the goal."""
+        return max(_norm(self.goal - self._lead), _norm(self.goal - self.place))
+
+    def advance(self, seconds: float) -> NDArray[np.float64]:
+        """(K,) the place, so many seconds later."""
+        way = self.goal - self._lead
+        distance, tau = _norm(way), self._time_constant
+        fast = max(distance / self._speed - tau, 0.0)  # s until the lead slows down
+        if fast > 0.0:
+            passed = min(seconds, fast)
+            velocity = way * (self._speed / distance)
+            lag = self.place - self._lead + tau * velocity
+            self._lead = self._lead + passed * velocity
+            self.place = self._lead - tau * velocity + math.exp(-passed / tau) * lag
+            seconds -= passed
+        if seconds > 0.0:
+            way, decay = self.goal - self._lead, math.exp(-seconds / tau)
+            self.place = self.goal + decay * (self.place - self.goal - (seconds / tau) * way)
+            self._lead = self.goal - decay * way
+        return self.place
+
+
+def _norm(vector: NDArray[np.float64]) -> float:
+    return math.sqrt(float(vector @ vector))
+
+
+_AT_REST, _ALIGNED = 2e-6, 1e-4
+"""m and rad from the goal: it is reached, for a pixel is some 80 µm."""
+
+
+@dataclass(frozen=True)
+class HandSpeed:
+    """What a hand does at most: the quick end of what sonographers do, far below a thrust."""
+
+    slide: float = 0.25  # m/s, of the line from the one point of the skin to the other
+    press: float = 0.15  # m/s
+    turn: float = math.pi  # rad/s, of rotation, fan and rock together, against the skin
+    time_constant: float = 0.02  # s; following a slow mouse, the probe is twice that behind
+
+
+class Motion:
+    """Takes the probe to the stance that was asked for last.
+
+    Sliding, pressing and turning each go at their own pace, see `Approach`. The way from one
+    point of the skin to another is a straight line; the probe stands on the skin closest to it,
+    so it goes over the skin of an arm and not through it.
+    """
+
+    def __init__(self, stance: Stance, speed: HandSpeed | None = None) -> None:
+        speed = speed or HandSpeed()
+        point, press, turn = _parts(stance)
+        self._slide = Approach(point, speed.slide, speed.time_constant)
+        self._press = Approach(press, speed.press, speed.time_constant)
+        self._turn = Approach(turn, speed.turn, speed.time_constant)
+
+    @property
+    def stance(self) -> Stance:
+        """Where it is now."""
+        return _stance(self._slide.place, self._press.place, self._turn.place)
+
+    @property
+    def goal(self) -> Stance:
+        """Where it goes."""
+        return _stance(self._slide.goal, self._press.goal, self._turn.goal)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether it is where it goes."""
+        metres = max(self._slide.distance(), self._press.distance())
+        return metres < _AT_REST and self._turn.distance() < _ALIGNED
+
+    def rest_at(self, stance: Stance) -> None:
+        """Be there, without any movement, as when the probe is taken from somebody else."""
+        for approach, part in zip(self._approaches, _parts(stance), strict=True):
+            approach.rest_at(part)
+
+    def aim(self, stance: Stance) -> None:
+        """Go there from now on, turning the shorter way."""
+        self._slide.goal, self._press.goal, turn = _parts(stance)
+        turn[0] = self._turn.place[0] + half_turn(turn[0] - self._turn.place[0])
+        self._turn.goal = turn
+
+    def advance(self, seconds: float) -> Stance:
+        """The stance so many seconds later."""
+        for approach in self._approaches:
+            approach.advance(seconds)
+        return self.stance
+
+    @property
+    def _approaches(self) -> tuple[Approach, Approach, Approach]:
+        return self._slide, self._press, self._turn
+
+
+def _parts(stance: Stance) -> tuple[NDArray[np.float64], ...]:
+    """The point (3,) m, the press (1,) m and the turn (3,) rad."""
+    turn = np.array([stance.rotation, stance.fan, stance.rock])
+    return stance.point.copy(), np.array([stance.press]), turn
+
+
+def _stance(
+    point: NDArray[np.float64], press: NDArray[np.float64], turn: NDArray[np.float64]
+) -> Stance:
+    rotation, fan, rock = turn.tolist()
+    return Stance(point, float(press[0]), half_turn(rotation), fan, rock)
+
+
+DEEPEST = 0.02
+"""m that a probe is pressed at most: a vein closes at half of it, and deeper hurts."""
+HIGHEST = 0.05
+"""m that it is lifted off at most."""
+STEEPEST = math.radians(60)
+"""rad that it is fanned or rocked at most: more, and its grip would lie on the skin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stance:
+    """The probe on the skin at rest.
+
+    Fan and rock are about the middle of the probe's face, which stays where it is.
+
+    Raises:
+        PoseError: a number is not finite.
+    """
+
+    point: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    # (3,) m, frame patient; what counts is the point of the skin at rest that is closest to it
+    press: float = 0.0  # m inwards along the skin's normal; negative is above it
+    rotation: float = 0.0  # rad about the normal, from where x is turned as little as can be
+    fan: float = 0.0  # rad about the probe's x
+    rock: float = 0.0  # rad about the probe's y
+
+    def __post_init__(self) -> None:
+        point = np.array(self.point, dtype=np.float64)
+        numbers = [*point.ravel(), self.press, self.rotation, self.fan, self.rock]
+        if point.shape != (3,) or not np.isfinite(numbers).all():
+            raise PoseError(f"the hand's numbers {numbers} are not finite, or not seven")
+        point.flags.writeable = False
+        object.__setattr__(self, "point", point)
+
+    @classmethod
+    def of(cls, pose: Pose, surface: RestSurface) -> Stance:
+        """The stance of a probe that is somewhere already: the way back from `pose`."""
+        foot, press = surface.under(pose.position)
+        x, y, z, w = _upright(foot.normal)
+        turned = Pose(np.zeros(3), product(np.array([-x, -y, -z, w]), pose.orientation)).rotation
+        # Rz(rotation) Rx(fan) Ry(rock), taken apart (Diebel 2006, sequence 3-1-2).
+        fan = math.asin(float(np.clip(turned[2, 1], -1.0, 1.0)))
+        if math.hypot(turned[0, 1], turned[1, 1]) < 1e-9:  # fanned by a quarter turn
+            return cls(foot.point, press, math.atan2(turned[1, 0], turned[0, 0]), fan, 0.0)
+        rotation = math.atan2(-turned[0, 1], turned[1, 1])
+        return cls(foot.point, press, rotation, fan, math.atan2(-turned[2, 0], turned[2, 2]))
+
+    @classmethod
+    def home(cls, surface: RestSurface, press: float) -> Stance:
+        """Upright above the origin of ``patient``, or on the middle of a surface that is not there.
+
+        Args:
+            surface: to stand on.
+            press: m.
+        """
+        middle = 0.5 * (surface.lower + surface.upper)
+        inside = (surface.lower[:2] <= 0.0).all() and (surface.upper[:2] >= 0.0).all()
+        x, y = (0.0, 0.0) if inside else middle[:2].tolist()
+        return cls(surface.above(x, y).point, press)
+
+    def pose(self, surface: RestSurface) -> Pose:
+        """The probe in ``patient``, held so."""
+        foot = surface.closest(self.point)
+        orientation = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
+        orientation = product(orientation, rotation_exp(_about(0, self.fan)))
+        orientation = product(orientation, rotation_exp(_about(1, self.rock)))
+        return Pose(foot.point - self.press * foot.normal, orientation)
+
+    def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
+        """Moved over the skin along the probe's own x and y, m, as it is rotated."""
+        foot = surface.closest(self.point)
+        turned = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
+        way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
+        return replace(self, point=surface.walk(foot, way).point)
+
+    def within_reach(self) -> Stance:
+        """Pressed and turned no further than a hand may."""
+        return replace(
+            self,
+            press=min(max(self.press, -HIGHEST), DEEPEST),
+            rotation=half_turn(self.rotation),
+            fan=min(max(self.fan, -STEEPEST), STEEPEST),
+            rock=min(max(self.rock, -STEEPEST), STEEPEST),
+        )
+
+
+def half_turn(angle: float) -> float:
+    """The same angle (rad) within half a turn to either side."""
+    return math.remainder(angle, 2.0 * math.pi)
+
+
+def _about(axis: int, angle: float) -> NDArray[np.float64]:
+    """(3,) rad, the rotation vector of a turn about one axis."""
+    vector = np.zeros(3)
+    vector[axis] = angle
+    return vector
+
+
+def _upright(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) quaternion of the smallest turn that brings +z to the inside of a normal (3,).
+
+    So x stays along the patient's x as far as the skin lets it. On skin that faces exactly down
+    every such turn is half a one: it is then about y.
+    """
+    x, y, z = (-normal).tolist()
+    if z < -1.0 + 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    quaternion = np.array([-y, x, 0.0, 1.0 + z])
+    return np.asarray(quaternion / np.linalg.norm(quaternion))

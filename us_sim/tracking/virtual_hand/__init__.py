@@ -1,1 +1,0 @@
-"""A hand that moves the probe over the skin without any device: what mouse, keys and touch ask."""
