@@ -34,7 +34,6 @@ from us_sim.evaluation.slice.cases import speckle as block_volume
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
@@ -50,6 +49,8 @@ from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
 from us_sim.volume.volume import Volume
 
 PROBES: dict[str, Probe] = {
