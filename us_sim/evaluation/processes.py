@@ -213,7 +213,7 @@ def _run_nodes(nodes: str) -> None:
     import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
     import rclpy
 
-    from us_sim.run.in_process import node_in_process
+    from us_sim.run.lockstep import node_in_process
 
     ended = threading.Event()
     rclpy.init(args=[])

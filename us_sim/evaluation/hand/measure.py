@@ -50,7 +50,7 @@ from us_sim.scene.reading import find_scene, load_scene
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.frame_time import frame_limit, usable_cores
+from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 

@@ -47,10 +47,9 @@ from us_sim.slicing.acoustics.media import crossing_loss
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR, ROUGHNESS
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
-from us_sim.slicing.formation.imaging import ECHO_RANGE
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.settings import ECHO_RANGE
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 

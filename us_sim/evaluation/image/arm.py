@@ -27,12 +27,11 @@ from us_sim.kernels import njit
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
-from us_sim.slicing.acoustics.beam_grid import aperture
-from us_sim.slicing.acoustics.media import constants_by_label, crossing_loss
+from us_sim.slicing.acoustics.media import aperture, constants_by_label, crossing_loss
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 

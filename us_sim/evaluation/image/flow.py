@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.image.flow import DEPTH, FLOW, TubeScan, squeezed
 from us_sim.evaluation.image.measure import PROBES, Artefact, Point
 from us_sim.evaluation.report import ReportFolder, Target, key_beside, new_figure, plain, save
 from us_sim.geometry.pose import Pose
@@ -28,26 +29,15 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood, Window
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.flow.settings import FlowSettings
-from us_sim.slicing.flow.spectrum import Spectrum
+from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum
 from us_sim.slicing.flow.vessel import Vessel
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.beam_places import beam_angles, fractions_and_depths
+from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import ColourSettings, FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.volume import Volume
-from us_sim.evaluation.figure import key_beside, new_figure, plain, save
-from us_sim.evaluation.image.artefact import Artefact
-from us_sim.evaluation.image.layers import PROBES
-from us_sim.evaluation.image.points import Point
-from us_sim.evaluation.image.vessel_tube import DEPTH, FLOW, TubeScan, squeezed
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.target import Target
-from us_sim.slicing.flow.doppler import ColourDoppler
-from us_sim.slicing.settings import ColourSettings
 
 _TILTS = (5.0, 10.0, 20.0, 30.0, 40.0)  # degrees
 _SQUEEZED = (1.0, 0.6)  # heights of the lumen over that at rest

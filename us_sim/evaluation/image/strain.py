@@ -37,20 +37,16 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.colours import strain_scale
-from us_sim.slicing.strain.estimate import Estimate, estimate_strain
-from us_sim.slicing.strain.settings import Strain
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.settings import Strain
+from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
+from us_sim.slicing.strain_estimate import Estimate, estimate_strain
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import average_over_labels, label_fractions
 from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
-from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
-from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
 from us_sim.volume.volume import Volume
 
 PROBES: dict[str, Probe] = {

@@ -30,27 +30,19 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
+from us_sim.evaluation.latency.measure import Point, cases, run_case
 from us_sim.evaluation.processes import UsageOverTime, listening, start_program, usage_of
 from us_sim.evaluation.report import Row
 from us_sim.evaluation.timing import Tell
 from us_sim.recording.reader import read_bag
-from us_sim.run.graph import (
+from us_sim.run.lockstep import render
+from us_sim.run.processes import (
     NodeProcess,
     ProcessGroup,
     player_settings,
     recorder_of,
     simulation_nodes,
 )
-from us_sim.run.lockstep import render
-from us_sim.evaluation.latency.cases import cases
-from us_sim.evaluation.latency.points import Point
-from us_sim.evaluation.latency.report import table, write_report
-from us_sim.evaluation.latency.run_case import run_case
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures
-from us_sim.evaluation.timed_cases import timed_cases
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 

@@ -45,9 +45,8 @@ from us_sim.evaluation.report import Row, markdown_table, write_rows
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer
-from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.probe.probe import ConvexProbe, Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import Sweep, read_sweep

@@ -33,7 +33,7 @@ from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
 from us_sim.evaluation.tissue.finite_elements import LinearEquations
 from us_sim.evaluation.tissue.reference import Reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting, TissueMethod
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel

@@ -35,9 +35,9 @@ from us_sim.tracking.camera.markers import dictionary, square
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
-from us_sim.tracking.camera.settings import CameraSettings
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
+from us_sim.tracking.settings import CameraSettings
 
 _FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
 _CHI_SQUARE_95 = 12.5916  # of six degrees of freedom

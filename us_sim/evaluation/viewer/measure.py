@@ -38,18 +38,9 @@ from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, started_by
 from us_sim.evaluation.report import Row
 from us_sim.evaluation.timing import Tell
+from us_sim.evaluation.viewer.measure import Point, cases, run_case
 from us_sim.share import find_bag
 from us_sim.viewer.packet import Packet
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures
-from us_sim.evaluation.timed_cases import timed_cases
-from us_sim.evaluation.viewer.cases import cases
-from us_sim.evaluation.viewer.points import Point
-from us_sim.evaluation.viewer.report import table, write_report
-from us_sim.evaluation.viewer.run_case import run_case
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
-from us_sim.scene.reading import load_scene
 
 
 @dataclass(frozen=True)

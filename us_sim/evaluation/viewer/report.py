@@ -30,8 +30,8 @@ from us_sim.evaluation.report import (
 )
 from us_sim.evaluation.timing import timed_cases
 from us_sim.evaluation.viewer.measure import Point, cases, run_case
-from us_sim.run.graph import keep_on_this_host
 from us_sim.run.live import prepare_volume
+from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.reading import load_scene
 
 _HEAD = (
