@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.image.flow import DEPTH, FLOW, TubeScan, squeezed
 from us_sim.evaluation.image.measure import PROBES, Artefact, Point
 from us_sim.evaluation.report import ReportFolder, Target, key_beside, new_figure, plain, save
 from us_sim.geometry.pose import Pose

@@ -30,19 +30,13 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.latency.measure import Point, cases, run_case
 from us_sim.evaluation.processes import UsageOverTime, listening, start_program, usage_of
 from us_sim.evaluation.report import Row
 from us_sim.evaluation.timing import Tell
 from us_sim.recording.reader import read_bag
 from us_sim.run.lockstep import render
-from us_sim.run.processes import (
-    NodeProcess,
-    ProcessGroup,
-    player_settings,
-    recorder_of,
-    simulation_nodes,
-)
+from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
+from us_sim.run.processes import ProcessGroup
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 

@@ -38,7 +38,6 @@ from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, started_by
 from us_sim.evaluation.report import Row
 from us_sim.evaluation.timing import Tell
-from us_sim.evaluation.viewer.measure import Point, cases, run_case
 from us_sim.share import find_bag
 from us_sim.viewer.packet import Packet
 
