@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from us_sim.recording.qos import QosProfile
+from us_sim.recording.topic import QosProfile
 
 QUEUE = 1000
 """Messages that may wait for the executor."""

@@ -9,7 +9,7 @@ from rclpy.node import Node
 
 from us_sim.nodes.rosbag2_service import offer_service
 from us_sim.nodes.session_settings import LOST
-from us_sim.recording.losses import Loss
+from us_sim.recording.write_behind import Loss
 
 
 class Controlled(Protocol):

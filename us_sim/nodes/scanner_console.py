@@ -12,8 +12,8 @@ from us_sim.nodes.settings import is_live
 from us_sim.scene.building import probe_of
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import Imaging
 
 _TISSUES = "acoustics.tissues."
 

@@ -32,7 +32,7 @@ from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_
 from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.skin.settings import MembraneSettings
-from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.settings import Imaging
 from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 

@@ -26,9 +26,9 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.skin_shapes import SkinShapes
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.slicing.acoustics.settings import Acoustics
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import Imaging
 
 _BEYOND = 1e-3  # m, by which an image may be too deep before that is said
 

@@ -13,10 +13,10 @@ from us_sim.nodes.frame_streams.settable_stream import SettableStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.flow.doppler import ColourDoppler
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import ColourSettings
 
 _OPACITY = 0.9
 

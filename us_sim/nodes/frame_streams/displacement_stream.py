@@ -7,8 +7,8 @@ from sensor_msgs.msg import Image
 
 from us_sim.nodes.conversions import field_message
 from us_sim.nodes.frame_streams.stream import FrameStream
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.frame import Frame
+from us_sim.slicing.strain import displacement
 
 
 class DisplacementStream(FrameStream):

@@ -6,9 +6,9 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.doppler_settings import DopplerSettings
-from us_sim.slicing.flow.following import nearest_vessel
+from us_sim.slicing.flow.doppler import nearest_vessel
 from us_sim.slicing.frame import Frame
+from us_sim.slicing.settings import DopplerSettings
 
 EVERY_S = 0.2
 """Between two looks at where the vessel is; of the frames' time."""

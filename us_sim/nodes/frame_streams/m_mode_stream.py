@@ -14,8 +14,8 @@ from us_sim.nodes.frame_streams.settable_stream import SettableStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.m_mode import MMode
-from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import MModeSettings
 
 
 class MModeStream(SettableStream[MMode]):

@@ -14,10 +14,10 @@ from us_sim.nodes.frame_streams.following import Following
 from us_sim.nodes.frame_streams.settable_stream import SettableStream
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.spectrum import Spectrum
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
+from us_sim.slicing.flow.doppler import Spectrum
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import SpectrumSettings
 
 
 class SpectrumStream(SettableStream[Spectrum]):
