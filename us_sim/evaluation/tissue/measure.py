@@ -30,20 +30,22 @@ from us_sim.evaluation.report import (
 )
 from us_sim.evaluation.timing import RunTimes
 from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
-from us_sim.evaluation.tissue.kept_reference import Reference, kept_reference
-from us_sim.evaluation.tissue.own_equations import converged, solved_independently
-from us_sim.evaluation.tissue.points import Outcome, Point, Timing, compare, held_memory, timed
-from us_sim.evaluation.tissue.report import table, write_report
-from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
-from us_sim.progress import Progress
-from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.evaluation.tissue.finite_elements import LinearEquations
+from us_sim.evaluation.tissue.measure import (
+    Outcome,
+    Point,
+    Timing,
+    compare,
+    converged,
+    held_memory,
+    solved_independently,
+    timed,
+)
 from us_sim.evaluation.tissue.reference import Reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting, TissueMethod
 from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 _PASSES = 3  # along the path; the first is not timed
