@@ -31,16 +31,6 @@ from us_sim.evaluation.report import (
 from us_sim.evaluation.timing import RunTimes
 from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
 from us_sim.evaluation.tissue.finite_elements import LinearEquations
-from us_sim.evaluation.tissue.measure import (
-    Outcome,
-    Point,
-    Timing,
-    compare,
-    converged,
-    held_memory,
-    solved_independently,
-    timed,
-)
 from us_sim.evaluation.tissue.reference import Reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting, TissueMethod
 from us_sim.tissue.contact.probe_gap import push_out
