@@ -54,7 +54,7 @@ class Listener:
         from rclpy.node import Node
         from sensor_msgs.msg import Image
 
-        from us_sim.nodes.sessions.session_monitor import SessionMonitor
+        from us_sim.nodes.session_monitor import SessionMonitor
         from us_sim.nodes.settings import NODES
 
         self._context = Context()

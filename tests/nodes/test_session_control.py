@@ -6,7 +6,7 @@ from rclpy.parameter import Parameter
 from us_sim.errors import SceneError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.sessions.session_control import SessionControl
+from us_sim.nodes.session_control import SessionControl
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.nodes.viewer_session import ViewerSession
 from us_sim.scene.listing import ListedScene

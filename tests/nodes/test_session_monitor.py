@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from us_sim.nodes.sessions.session_monitor import TOLD, SessionMonitor
+from us_sim.nodes.session_monitor import TOLD, SessionMonitor
 
 
 def report(name, **values):

@@ -13,9 +13,9 @@ from us_sim.nodes.image_writer import ImageWriter
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.session_monitor import SessionMonitor
 from us_sim.nodes.session_player import SessionPlayer
 from us_sim.nodes.session_recorder import SessionRecorder
-from us_sim.nodes.sessions.session_monitor import SessionMonitor
 from us_sim.nodes.settings import NODES
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator

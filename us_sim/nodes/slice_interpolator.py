@@ -21,12 +21,12 @@ from us_sim.nodes.conversions import (
     tetrahedra_from,
     vectors_from,
 )
-from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
+from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
 from us_sim.settings.setting import rules_of

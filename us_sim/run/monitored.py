@@ -19,8 +19,8 @@ from us_sim.errors import UsSimError
 from us_sim.run.plan import NodeProcess
 
 if TYPE_CHECKING:
-    from us_sim.nodes.sessions.session_control import SessionControl
-    from us_sim.nodes.sessions.session_monitor import SessionMonitor
+    from us_sim.nodes.session_control import SessionControl
+    from us_sim.nodes.session_monitor import SessionMonitor
 
 
 def domain() -> str:
@@ -106,7 +106,7 @@ class Monitored:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
-        from us_sim.nodes.sessions.session_monitor import SessionMonitor
+        from us_sim.nodes.session_monitor import SessionMonitor
 
         self.names = nodes
         self._context = Context()
@@ -130,7 +130,7 @@ class Monitored:
 
     def control(self) -> SessionControl:
         """The node by which the simulation is controlled, in this process, too."""
-        from us_sim.nodes.sessions.session_control import SessionControl
+        from us_sim.nodes.session_control import SessionControl
 
         if self._control is None:
             self._control = SessionControl(context=self._context, namespace=self._namespace)

@@ -1,4 +1,4 @@
-"""A topic of images made from frames, and the plainest of them: B-mode, labels, displacement, M-mode."""
+"""A topic of images made from frames; B-mode, labels, displacement and M-mode as such."""
 
 from __future__ import annotations
 
