@@ -20,8 +20,7 @@ from us_sim.evaluation.stability.cases import StabilityCase, model_of
 from us_sim.evaluation.stability.meshes import mesh_named
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import FlaredProbe, push_out
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material

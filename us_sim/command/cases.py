@@ -26,8 +26,7 @@ def add_cases(commands: Any) -> None:
 
 def _cases(args: argparse.Namespace) -> int:
     from us_sim.errors import UsSimError
-    from us_sim.volume.cases.listing import listed, table
-    from us_sim.volume.cases.roots import case_roots, cases_in
+    from us_sim.volume.cases.case import case_roots, cases_in, listed, table
 
     if args.picture is not None and args.picture.suffix.lower() != ".png":
         raise UsSimError(f"--picture {args.picture}: must be a file that ends in .png")

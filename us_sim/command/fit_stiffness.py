@@ -96,8 +96,8 @@ def _write_into_case(
     scene: Scene, session: Path, found: StiffnessFit, settings: StiffnessSettings
 ) -> None:
     """The fitted moduli, with how they were found."""
-    from us_sim.volume.cases.moduli import write_moduli_into
     from us_sim.volume.cases.provenance import Source, Step
+    from us_sim.volume.cases.writing import write_moduli_into
 
     assert scene.volume.case is not None
     fitted = {

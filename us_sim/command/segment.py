@@ -19,7 +19,7 @@ def add_segment(commands: Any) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.volume.segmentation.request import SegmentRequest
+    from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 
     add_setting_options(parser, SegmentRequest)
@@ -29,7 +29,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _segment(args: argparse.Namespace) -> int:
     from us_sim.volume.segmentation.case_segmentation import segment_as_asked
-    from us_sim.volume.segmentation.request import SegmentRequest
+    from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 
     asked = read_settings(args, SegmentRequest)

@@ -23,7 +23,7 @@ from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.label_outlines import label_outlines
 from us_sim.slicing.frame import Frame
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:

@@ -36,7 +36,7 @@ _ON = 1e-12  # m; what is as near to an outline lies on it
 def push_directions(collider: Collider, pose: Pose, points: Array, spacing: float) -> Array:
     """(K, 3) unit directions in which the probe pushes points (K, 3) m on or in it.
 
-    The rule of `us_sim.tissue.contact.penetration.push_out`, written down again.
+    The rule of `us_sim.tissue.contact.probe_gap.push_out`, written down again.
     """
     box = collider.offset_box
     rounding = box[3]
@@ -61,7 +61,7 @@ def flared_distance(
 ) -> tuple[Array, Array]:
     """Distance of points (P, 3) m to a probe with leaning flanks, and its outward normals there.
 
-    The shape of `us_sim.tissue.contact.flared_probe.FlaredProbe`, written down again: an outline in
+    The shape of `us_sim.tissue.contact.probe_gap.FlaredProbe`, written down again: an outline in
     the plane of the image, that of its distance and y around it, and the rounding around both.
 
     Returns:

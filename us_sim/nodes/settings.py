@@ -25,7 +25,7 @@ from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 from us_sim.slicing.formation.imaging import Imaging
 from us_sim.viewer.viewer_settings import ViewerSettings
-from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
+from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 OVERLAYS = ("strain", "strain_estimate", "velocity", "none")
 """Colours over the annotated image, by the names of the streams that they are of."""

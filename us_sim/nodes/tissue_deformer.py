@@ -42,9 +42,8 @@ from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.frame_time import frame_limit, shortest, usable_cores
-from us_sim.tissue.solvers.preparation import Failed, Preparation
-from us_sim.tissue.solvers.switching import Plan, Prepared, SwitchableTissue
+from us_sim.tissue.solvers.frame_budget import frame_limit, shortest, usable_cores
+from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
 OWN = "tissue_deformer"

@@ -27,7 +27,7 @@ from us_sim.recording.recorded_poses import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.writer import BagWriter
-from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
+from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
 from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, SLICER_TRANSFORMS
 
 __all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]

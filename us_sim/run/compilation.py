@@ -138,8 +138,7 @@ def _track_marker() -> None:
 def _reconstruct() -> None:
     """A sweep's images in both ways, and gathered for medians."""
     from us_sim.volume.reconstruction.grid import grid_around
-    from us_sim.volume.reconstruction.hole_filling import fill_holes
-    from us_sim.volume.reconstruction.insertion import Collection, Insertion
+    from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
 
     grid = grid_around(np.array([[0.0, 0.0, 0.0], [0.002, 0.002, 0.002]]), 0.001)
     image, used = np.ones((2, 2), np.uint8), np.ones((2, 2), np.bool_)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SceneError, UsSimError
 from us_sim.scene.scene import Scene
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
 if TYPE_CHECKING:

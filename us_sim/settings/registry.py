@@ -37,13 +37,13 @@ SEGMENTATIONS = Choice(
     "segmentation method",
     key="method",
     error=VolumeError,
-    growing=f"{_SEGMENTATION}.growing:SeededGrowing",
-    confidence=f"{_SEGMENTATION}.growing:ConfidenceConnected",
-    threshold=f"{_SEGMENTATION}.growing:Threshold",
-    watershed=f"{_SEGMENTATION}.watershed:Watershed",
-    vesselness=f"{_SEGMENTATION}.vesselness:Vesselness",
+    growing=f"{_SEGMENTATION}.methods:SeededGrowing",
+    confidence=f"{_SEGMENTATION}.methods:ConfidenceConnected",
+    threshold=f"{_SEGMENTATION}.methods:Threshold",
+    watershed=f"{_SEGMENTATION}.methods:Watershed",
+    vesselness=f"{_SEGMENTATION}.methods:Vesselness",
     dark_vessels=f"{_SEGMENTATION}.dark_vessels:DarkVessels",
-    covered=f"{_SEGMENTATION}.covered:Covered",
+    covered=f"{_SEGMENTATION}.methods:Covered",
 )
 
 PROBES = Choice(

@@ -22,8 +22,8 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
 from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.solvers.msds import SpringSettings
 from us_sim.tissue.solvers.solver import create_solver
-from us_sim.tissue.solvers.spring_tissue import SpringSettings
 
 COLUMNS = (
     "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"

@@ -23,7 +23,7 @@ from us_sim.evaluation.settling import frames_until
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.solvers.frame_time import frame_limit, usable_cores
+from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver
 
 ENOUGH = 0.9

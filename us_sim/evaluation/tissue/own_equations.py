@@ -10,7 +10,7 @@ from us_sim.evaluation.tissue.cases import Scene
 from us_sim.evaluation.tissue.linear_equations import LinearEquations
 from us_sim.evaluation.tissue.points import Outcome
 from us_sim.evaluation.tissue_methods import Setting, TissueMethod
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel

@@ -1,6 +1,6 @@
 """How long a frame of the tissue may take, so that the poses of a tracker are kept up with.
 
->>> from us_sim.tissue.solvers.frame_time import frame_limit
+>>> from us_sim.tissue.solvers.frame_budget import frame_limit
 >>> f"{1e3 * frame_limit(sending=0.0005, cores=2):.1f} ms"
 '14.0 ms'
 """

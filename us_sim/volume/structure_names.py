@@ -3,11 +3,7 @@
 A segmentation's names are free text, and some hold a patient's. Of those that come from a file only
 names made of known words are kept; those that a person writes here are checked for their form.
 
->>> from us_sim.volume.structure_terms import is_anatomical, problem_with
->>> is_anatomical("left portal vein 2"), is_anatomical("Doe Jane liver")
-(True, False)
->>> problem_with("lesion of 12/03/1961")
-'must begin with a letter or digit, and hold letters, digits, blanks, - and _ only'
+Colours of structures by their names, as anatomical atlases paint them.
 """
 
 from __future__ import annotations
@@ -124,3 +120,34 @@ def problem_with(name: str) -> str | None:
             "has a number of three digits or more, or several, which may be a date or an identity"
         )
     return None
+
+
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
+
+_COLOURS: dict[str, Colour] = {
+    "artery": (0.85, 0.15, 0.15),
+    "aorta": (0.85, 0.15, 0.15),
+    "vein": (0.25, 0.4, 0.85),
+    "cava": (0.25, 0.4, 0.85),
+    "portal": (0.25, 0.4, 0.85),
+    "vessel": (0.5, 0.3, 0.8),
+    "vessels": (0.5, 0.3, 0.8),
+    "bone": (0.93, 0.9, 0.8),
+    "rib": (0.93, 0.9, 0.8),
+    "nerve": (0.95, 0.85, 0.3),
+    "fat": (0.95, 0.85, 0.6),
+    "muscle": (0.75, 0.35, 0.3),
+    "skin": (0.85, 0.7, 0.6),
+    "liver": (0.6, 0.3, 0.2),
+    "kidney": (0.7, 0.4, 0.3),
+    "gallbladder": (0.4, 0.6, 0.3),
+    "diaphragm": (0.7, 0.5, 0.5),
+}
+_ANY_OTHER: Colour = (0.7, 0.6, 0.55)
+
+
+def anatomical_colour(name: str) -> Colour:
+    """Red, green and blue for a structure; of several known words in its name the last one."""
+    words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _COLOURS]
+    return _COLOURS[words[-1]] if words else _ANY_OTHER
