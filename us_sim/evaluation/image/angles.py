@@ -16,9 +16,9 @@ from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR, ROUGHNESS
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
-from us_sim.slicing.formation.imaging import ECHO_RANGE
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.settings import ECHO_RANGE
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 

@@ -21,7 +21,7 @@ from us_sim.scene.building import probe_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.settings import Imaging
 
 _TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)
 _BONE = np.array([12e-3, 0.0, 38e-3])  # m, about which the probe turns, so that it stays in view

@@ -16,7 +16,7 @@ from us_sim.evaluation.target import Target
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import Probe
 
 _FREQUENCY = {"linear": 7e6, "convex": 3.5e6, "sector": 3e6}  # Hz

@@ -18,7 +18,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.media import crossing_loss
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import LinearProbe
 
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)

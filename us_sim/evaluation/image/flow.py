@@ -15,8 +15,8 @@ from us_sim.evaluation.image.points import Point
 from us_sim.evaluation.image.vessel_tube import DEPTH, FLOW, TubeScan, squeezed
 from us_sim.evaluation.report_folder import ReportFolder
 from us_sim.evaluation.target import Target
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.colour_settings import ColourSettings
+from us_sim.slicing.flow.doppler import ColourDoppler
+from us_sim.slicing.settings import ColourSettings
 
 _TILTS = (5.0, 10.0, 20.0, 30.0, 40.0)  # degrees
 _SQUEEZED = (1.0, 0.6)  # heights of the lumen over that at rest

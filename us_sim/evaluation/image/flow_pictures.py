@@ -19,8 +19,7 @@ from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.spectrum import Spectrum
+from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum
 from us_sim.slicing.frame import Frame
 from us_sim.tissue.solvers.solver import create_solver
 

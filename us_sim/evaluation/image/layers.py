@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import TissueAcoustics
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
 from us_sim.volume.volume import Volume
 
 

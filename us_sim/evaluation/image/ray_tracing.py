@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
-from us_sim.slicing.acoustics.beam_grid import aperture
-from us_sim.slicing.acoustics.media import constants_by_label, crossing_loss
+from us_sim.slicing.acoustics.media import aperture, constants_by_label, crossing_loss
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume

@@ -19,7 +19,7 @@ from us_sim.scene.building import probe_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.settings import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 
 _NODES = (32, 16, 16)  # 34,875 tetrahedra

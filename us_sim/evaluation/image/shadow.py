@@ -24,9 +24,8 @@ from us_sim.evaluation.target import Target
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
 
 _PROBES: dict[str, tuple[Probe, float]] = {
     "linear": (LinearProbe(aperture=0.04, depth=0.04), 8e6),

@@ -29,14 +29,11 @@ from us_sim.evaluation.slice.cases import speckle as block_volume
 from us_sim.evaluation.target import Target
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.colours import strain_scale
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
 from us_sim.volume.volume import Volume
 
 PROBES: dict[str, Probe] = {

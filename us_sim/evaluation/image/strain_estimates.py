@@ -15,9 +15,9 @@ from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.estimate import Estimate, estimate_strain
-from us_sim.slicing.strain.settings import Strain
+from us_sim.slicing.settings import Strain
+from us_sim.slicing.strain import AxialStrain
+from us_sim.slicing.strain_estimate import Estimate, estimate_strain
 from us_sim.volume.volume import Volume
 
 _PROBE = LinearProbe(aperture=0.06, depth=0.08)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Blood, Window
-from us_sim.slicing.flow.settings import FlowSettings
 from us_sim.slicing.flow.vessel import Vessel
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.beam_places import beam_angles, fractions_and_depths
+from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 

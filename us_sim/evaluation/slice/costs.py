@@ -14,9 +14,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.formation.coupling import ContactSurface
 from us_sim.slicing.formation.image_formation import ImageFormation
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.settings import Imaging
 from us_sim.volume.volume import Volume
 
 _IMAGES, _QUICK_IMAGES = 60, 15

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import ConvexProbe
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from us_sim.evaluation.slice.recorded_pairs import (
     RecordedPairs,
 )
 from us_sim.evaluation.slice.recorded_pictures import draw_recorded
-from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import ConvexProbe
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import read_sweep
 

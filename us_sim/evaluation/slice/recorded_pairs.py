@@ -23,8 +23,8 @@ from us_sim.evaluation.slice.recorded_fan import RecordedFan
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer
-from us_sim.slicing.probe.fan_probe import ConvexProbe
 from us_sim.slicing.probe.plane import SlicePlane
+from us_sim.slicing.probe.probe import ConvexProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume

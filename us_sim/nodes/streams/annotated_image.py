@@ -21,7 +21,7 @@ from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.stream import FrameStream
 from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
-from us_sim.slicing.drawing.label_border import onto_border
+from us_sim.slicing.drawing.label_outlines import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe

@@ -17,13 +17,15 @@ from us_sim.nodes.streams.stream import FrameStream
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.colours import FollowingEnd, strain_scale
-from us_sim.slicing.strain.compression import compression
-from us_sim.slicing.strain.earlier import Earlier
-from us_sim.slicing.strain.estimate import Estimate, estimate_strain, require_short_windows
-from us_sim.slicing.strain.settings import Strain
-from us_sim.slicing.strain.warm_up import warm_up
+from us_sim.slicing.settings import Strain
+from us_sim.slicing.strain import AxialStrain, FollowingEnd, compression, strain_scale
+from us_sim.slicing.strain_estimate import (
+    Earlier,
+    Estimate,
+    estimate_strain,
+    require_short_windows,
+    warm_up,
+)
 
 
 def strain_streams(node: SceneNode) -> list[FrameStream]:
