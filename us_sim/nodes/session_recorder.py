@@ -27,8 +27,12 @@ from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_service
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.losses import Loss, news
 from us_sim.recording.pre_roll import PreRoll
+from us_sim.nodes.recorded_topic import RecordedTopic
+from us_sim.nodes.recorder_services import RecorderEvents, offer_services
+from us_sim.nodes.session_attachments import session_attachments
+from us_sim.nodes.session_settings import SessionRecorderSettings
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Message, WriteBehind
+from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, news
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 

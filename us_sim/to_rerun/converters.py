@@ -51,8 +51,8 @@ from us_sim.nodes.conversions import (
     vectors_from,
     wrench_from,
 )
-from us_sim.recording.attached import extract
 from us_sim.recording.reader import Bag
+from us_sim.recording.repair import extract
 from us_sim.scene.building import volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.structures import structures_of

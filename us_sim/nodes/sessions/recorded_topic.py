@@ -16,6 +16,7 @@ from rclpy.subscription import Subscription
 from us_sim.errors import BagError
 from us_sim.recording.qos import QosProfile
 from us_sim.recording.schemas import schema_text
+from us_sim.recording.topic import QosProfile
 
 QUEUE = 1000
 """Messages that may wait for the executor."""

@@ -10,6 +10,9 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
 from us_sim.recording.losses import Loss
+from us_sim.nodes.rosbag2_service import offer_service
+from us_sim.nodes.session_settings import LOST
+from us_sim.recording.write_behind import Loss
 
 
 def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
