@@ -22,7 +22,6 @@ from std_msgs.msg import String
 from us_sim.errors import BagError
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
-from us_sim.recording.attached import extract
 from us_sim.recording.mcap_output import McapOutput
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag

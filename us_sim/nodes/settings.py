@@ -23,7 +23,6 @@ from us_sim.settings.spelling import unknown
 from us_sim.settings.yaml_text import YamlError, load_yaml
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.settings import Imaging
 from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume

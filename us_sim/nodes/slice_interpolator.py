@@ -26,16 +26,13 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
+from us_sim.nodes.slice_interpolator import SkinShapes
 from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.nodes.skin_shapes import SkinShapes
-from us_sim.scene.building import scanner_of, volume_of
-from us_sim.slicing.acoustics.settings import Acoustics
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import Imaging

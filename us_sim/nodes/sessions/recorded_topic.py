@@ -14,7 +14,6 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile
 from us_sim.recording.schemas import schema_text
 from us_sim.recording.topic import QosProfile
 

@@ -18,15 +18,10 @@ from us_sim.nodes.streams.stream import FrameStream, SettableStream
 from us_sim.scene.blood import blood_of
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.flow.doppler_settings import DopplerSettings
-from us_sim.slicing.flow.following import nearest_vessel
-from us_sim.slicing.flow.spectrum import Spectrum
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
-from us_sim.slicing.flow.warm_up import warm_up
+from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum, nearest_vessel, warm_up
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import ColourSettings, DopplerSettings, SpectrumSettings
 from us_sim.volume.volume import Volume
 
 EVERY_S = 0.2

@@ -15,12 +15,12 @@ from us_sim.nodes.conversions import colour_image_message, field_message, image_
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.settings.setting import Settings
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.m_mode import MMode
-from us_sim.slicing.m_mode_settings import MModeSettings
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import MModeSettings
+from us_sim.slicing.strain import displacement
 
 
 class FrameStream(ABC):
