@@ -26,7 +26,6 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
-from us_sim.nodes.slice_interpolator import SkinShapes
 from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from us_sim.nodes.sessions.rosbag2_services import offer_service
 from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
 from us_sim.recording.write_behind import Loss
 
