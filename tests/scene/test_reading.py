@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from us_sim.errors import SceneError, UsSimError
-from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP
+from us_sim.evaluation.slice.recorded import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.reading import find_scene, load_scene, parse_scene

@@ -109,20 +109,20 @@ _EVALUATION = "us_sim.evaluation"
 EVALUATIONS = Choice(
     "evaluation",
     key="subject",
-    tissue=Option(f"{_EVALUATION}.tissue.measure:evaluate_tissue", _NOTHING),
-    stability=Option(f"{_EVALUATION}.stability.measure:evaluate_stability", _NOTHING),
+    tissue=Option(f"{_EVALUATION}.tissue.report:evaluate_tissue", _NOTHING),
+    stability=Option(f"{_EVALUATION}.stability.report:evaluate_stability", _NOTHING),
     slice=Option(
-        f"{_EVALUATION}.slice.measure:evaluate_slice",
-        f"{_EVALUATION}.slice.recorded_sweep:RecordedSweep",
+        f"{_EVALUATION}.slice.report:evaluate_slice",
+        f"{_EVALUATION}.settings:RecordedSweep",
     ),
     hand=Option(
-        f"{_EVALUATION}.hand.measure:evaluate_hand",
-        f"{_EVALUATION}.hand.settings:HandSettings",
+        f"{_EVALUATION}.hand.report:evaluate_hand",
+        f"{_EVALUATION}.settings:HandSettings",
     ),
-    tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
-    image=Option(f"{_EVALUATION}.image.measure:evaluate_image", _NOTHING),
-    latency=Option(f"{_EVALUATION}.latency.measure:evaluate_latency", _NOTHING),
-    viewer=Option(f"{_EVALUATION}.viewer.measure:evaluate_viewer", _NOTHING),
+    tracking=Option(f"{_EVALUATION}.tracking.report:evaluate_tracking", _NOTHING),
+    image=Option(f"{_EVALUATION}.image.report:evaluate_image", _NOTHING),
+    latency=Option(f"{_EVALUATION}.latency.report:evaluate_latency", _NOTHING),
+    viewer=Option(f"{_EVALUATION}.viewer.report:evaluate_viewer", _NOTHING),
 )
 
 _CALIBRATION = "us_sim.command.calibration"

@@ -1,4 +1,7 @@
-"""A recorded sweep that images are compared with: each field is an option of the command."""
+"""What of the evaluation may be chosen: each field is an option of the command.
+
+A recorded sweep that images are compared with: each field is an option of the command.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from us_sim.errors import SettingsError
+from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+
+
+@dataclass(frozen=True)
+class HandSettings(Settings):
+    """Motions other than those of the reports."""
+
+    seed: int = setting(Quantity("number", 0, 2**31), "of all motions", default=1)
 
 
 @dataclass(frozen=True)
