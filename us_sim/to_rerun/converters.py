@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rerun.encodings import AbsoluteTimeRange
 
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
-from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.nodes.conversions import (
     affine_from,
     colour_pixels_from,
@@ -30,8 +30,8 @@ from us_sim.nodes.conversions import (
     vectors_from,
     wrench_from,
 )
-from us_sim.recording.attached import extract
 from us_sim.recording.reader import Bag
+from us_sim.recording.repair import extract
 from us_sim.scene.building import volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.structures import structures_of
