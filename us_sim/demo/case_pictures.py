@@ -48,7 +48,6 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
 
 
 def _draw(axes: Any, scene: Scene, name: str) -> None:
-    """What the probe sees at the start, with the outlines of structures."""
     touching = dataclasses.replace(scene.imaging, contact=False)
     scene = dataclasses.replace(scene, imaging=touching)
     volume = volume_of(scene)

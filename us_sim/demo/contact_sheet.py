@@ -234,13 +234,11 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
 
 
 def _flowing(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.uint8]]:
-    """Pictures of flow with whole titles."""
     beside = f"plane tilted {TILT:g}° along the vessels"
     return {f"flow, {title}; {beside}": picture for title, picture in pictures.items()}
 
 
 def _moments(session: Session) -> list[tuple[str, int]]:
-    """Six stamps of images that tell the story of a press, be it one of many."""
     stamps = [stamp for stamp in session.images if stamp in session.poses]
     if not stamps:
         raise BagError("the session holds no image with a pose, so there is nothing to show")
@@ -299,7 +297,6 @@ def _outline(
 
 
 def _colour(scene: Scene, name: str) -> Colour:
-    """Of a label: its structure's where it is one."""
     for structure, given in scene.structures.items():
         if (given.label or structure) == name:
             return colour_of(scene, structure)

@@ -218,7 +218,6 @@ class BMode:
         return BeamAcoustics(self._volume, probe, acoustics)
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
-        """The surface that the face can touch: the tissue's, or a box around a volume without."""
         if self._surface is None:
             from us_sim.slicing.formation.coupling import ContactSurface
 

@@ -71,7 +71,8 @@ class Frame:
             return self.slice(self.plane)
         slices = [self.slice(plane) for plane in self.formation.planes(self.pose, self.plane)]
         heard = None if self.acoustics is None else partial(self.acoustics.heard, frame=self)
-        return self.formation.form(slices, *(self.contact or (None, None)), heard)
+        coupling, gap = self.contact or (None, None)
+        return self.formation.form(slices, coupling, gap, heard)
 
     @cached_property
     def contact(self) -> Contact | None:

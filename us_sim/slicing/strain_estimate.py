@@ -202,7 +202,6 @@ def _warp(image, moved, lag, warped):
 
 
 def _correlation(one: Window, other: Window, size: tuple[int, int]) -> Field:
-    """Of two images in each window."""
     product = cv2.boxFilter(one[0] * other[0], -1, size, borderType=cv2.BORDER_REFLECT_101)
     return np.asarray((product - one[1] * other[1]) / (one[2] * other[2]))
 
@@ -214,7 +213,6 @@ def _tip(before: Field, middle: Field, after: Field, most: float) -> Field:
 
 
 def _moments(image: Field, size: tuple[int, int]) -> tuple[Field, Field]:
-    """Mean and standard deviation of each window; the latter infinite where it is flat."""
     border = cv2.BORDER_REFLECT_101
     mean = cv2.boxFilter(image, -1, size, borderType=border)
     variance = cv2.sqrBoxFilter(image, -1, size, borderType=border) - mean * mean
@@ -298,12 +296,10 @@ def require_short_windows(probe: Probe, settings: Strain) -> None:
 
 
 def _odd(count: float) -> int:
-    """The odd whole number nearest to a count, 3 at least."""
     return max(3, 2 * round((count - 1.0) / 2.0) + 1)
 
 
 def _line_spacing(probe: Probe) -> float:
-    """m between beams half way down, on average."""
     if probe.lines < 2:
         return probe.width
     middle = probe.beam_starts + 0.5 * probe.depth * probe.beam_directions
@@ -311,7 +307,6 @@ def _line_spacing(probe: Probe) -> float:
 
 
 def _along_beams(image: NDArray[np.uint8], probe: Probe) -> NDArray[np.float32]:
-    """(samples, lines) of an image (rows, columns)."""
     columns, rows = probe.beam_pixels
     return np.asarray(
         cv2.remap(

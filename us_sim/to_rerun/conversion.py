@@ -147,8 +147,6 @@ def to_rerun(session: Path, file: Path, progress: Callable[[float, str], None]) 
 
 
 class _Conversion:
-    """Which messages of a bag are logged by whom."""
-
     def __init__(self, bag: Bag, tell: Callable[[float, str], None]) -> None:
         from us_sim.to_rerun.converters import (
             Clouds,
@@ -190,7 +188,6 @@ class _Conversion:
         self._there = there
 
     def _carry_structures(self, there: dict[str, BagTopic]) -> None:
-        """Make the structures from the scene where they were not recorded."""
         from us_sim.to_rerun.converters import REST, TETRAHEDRA, Structures
 
         if "/tissue/structures" in there or not {REST, TETRAHEDRA} <= there.keys():

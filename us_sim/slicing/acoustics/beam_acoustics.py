@@ -184,7 +184,6 @@ class BeamAcoustics:
         return gain
 
     def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
-        """Where pixels lie in the mesh, and the mesh; without one all are rigid."""
         if frame.nodes is not None:
             return frame.locate_some(LOCATED), frame.nodes
         plane, (row_step, step) = frame.plane, LOCATED

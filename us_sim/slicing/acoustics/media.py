@@ -238,13 +238,11 @@ class BeamGrid:
 
 
 def _nearest_shown(probe: Probe) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Row and column of the pixel nearest to each that a beam reaches, all in steps of two."""
     row, column = _nearest(~np.isnan(probe.pixel_beams[0, ::2, ::2]))
     return row, column
 
 
 def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(2, rows, columns) row and column of the marked pixel that is nearest to each."""
     from scipy.ndimage import distance_transform_edt  # which only a fan needs
 
     nearest: NDArray[np.int32] = distance_transform_edt(

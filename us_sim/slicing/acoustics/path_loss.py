@@ -265,7 +265,6 @@ def _blocked_at(where, hard, loss, s):
 
 @njit(inline="always", error_model="numpy")
 def _fixed(value):
-    """A coordinate as a fixed-point number, also where it is far from any voxel."""
     held = min(max(value, -_FARTHEST), _FARTHEST)
     return np.int64(held * _PER_VOXEL)
 
@@ -351,7 +350,6 @@ _FINER = 4  # steps a sample, of beams that look for an edge
 
 
 def _amplitudes() -> np.ndarray:
-    """(…,) float32 amplitude at each sixteenth of a dB of loss, to 100 dB."""
     return (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.float32)
 
 

@@ -300,7 +300,6 @@ def surface_normals_of(volume: Volume) -> SurfaceNormals:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _beside_another(labels, shape, i, j, k):
-    """Whether one of a voxel's six neighbours has another label."""
     to_i = shape[1] * shape[2]
     to_j = shape[2]
     at = i * to_i + j * to_j + k
@@ -376,7 +375,6 @@ def _fill_normals(labels, shape, weights, distances, blocks, normals):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gradient(labels, shape, weights, distances, i, j, k, out):
-    """Sets the unit normal in 127ths, and the surface's distance."""
     own = labels[(i * shape[1] + j) * shape[2] + k]
     x = y = z = total = np.float32(0.0)
     for a in range(-_REACH, _REACH + 1):

@@ -176,7 +176,6 @@ def _cross(place, order, polygon):
 
 @njit(inline="always", error_model="numpy")
 def _is_on_image(place, polygon, sides, columns, rows):
-    """Whether the box around a tetrahedron's cut, or its nodes on the plane, meets the image."""
     left = np.inf
     right = -np.inf
     top = np.inf
@@ -252,7 +251,6 @@ def face_cut(place, a, b, c, points):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_face(place, f, columns, rows, cuts, pieces, count):
-    """Adds the outline of a tetrahedron's face, if the image meets it, to those of a cut."""
     points = cuts.outlines[pieces]
     number = face_cut(place, FACES[f, 0], FACES[f, 1], FACES[f, 2], points)
     if number == 0 or not _is_on_image(place, points, number, columns, rows):
@@ -515,7 +513,6 @@ def up_to(value, least, most):
 
 @njit(inline="always", error_model="numpy")
 def _add(q, first, end, row, runs, kinds, spans, used):
-    """Adds a span of cut ``q``, as far as the row shows something."""
     line = np.uint64(row)
     for k in range(kinds):
         a = max(first, np.int64(runs[line, k, 0]))

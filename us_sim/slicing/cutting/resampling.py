@@ -61,7 +61,6 @@ def parallel_rows(
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """The threads for all images, which are only started when they are used."""
     return ThreadPoolExecutor(threads, thread_name_prefix="rows")
 
 

@@ -87,7 +87,6 @@ def cells(bounds, columns, rows, regions):
 
 @njit(inline="always", error_model="numpy")
 def _cell(pixel, size, count):
-    """The cell along one axis that holds a pixel coordinate, the outermost for those beyond."""
     return np.int64(min(max(pixel, 0.0) / size, count - 1.0))
 
 
@@ -164,7 +163,6 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
 
 @njit(inline="always", error_model="numpy")
 def _is_inside(barycentric, e, column, row):
-    """Whether a pixel lies in a tetrahedron, its faces included."""
     b = barycentric[e]
     return (
         b[0, 0] + b[0, 1] * column + b[0, 2] * row >= INSIDE
@@ -313,5 +311,4 @@ class RowSubdivision(Slicer):
         return Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
-        """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
         parallel_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))

@@ -136,7 +136,6 @@ class ScanConversion(Slicer):
     def _spans_of(
         self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[int, Outline, NDArray[np.int32], NDArray[np.int64]]:
-        """How many cuts there are, the mesh at rest, and the runs and spans of the image."""
         if self._drawn is not None and self._drawn[0] is nodes and self._drawn[1] is plane:
             return *self._drawn[2:], self._shown(plane), self._spans
         count, pieces, outline, _ = self._cut(nodes, plane)
@@ -191,7 +190,6 @@ class ScanConversion(Slicer):
     def _convert(
         self, count: int, pieces: int, runs: NDArray[np.int32], first_row: int, end_row: int
     ) -> NDArray[np.int64]:
-        """The spans of a run of rows."""
         cuts, spans = self._cuts, self._spans
         while True:
             most = convert_cuts(

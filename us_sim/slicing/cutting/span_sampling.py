@@ -234,7 +234,6 @@ def _write_clipped(m, shape, row, first, end, x, y, z):
 
 @njit(inline="always", error_model="numpy")
 def _held(index, count):
-    """A coordinate from the first to just below the last voxel's centre."""
     last = max(count - 1, 0) * _ONE - 1.0
     return np.int32(max(0.0, min(index * _ONE, last)))
 
@@ -289,7 +288,6 @@ def _between(least, most, start, slope, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _least(x):
-    """The least of some numbers, or 0."""
     least = np.int32(0)
     for k in range(len(x)):
         least = min(least, x[k])
@@ -361,8 +359,6 @@ _INDEX = ir.IntType(64)
 
 
 def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
-    """A ramp's signature and the instructions that write it."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array, index, *numbers = arguments
         data = context.make_array(signature.args[0])(context, builder, array).data
@@ -385,8 +381,6 @@ def _load_pairs(
     _: Any, voxels: Any, near: Any, first: Any, to_y: Any, to_x: Any, p00: Any, p01: Any,
     p10: Any, p11: Any,
 ) -> Any:  # fmt: skip
-    """The signature of the loads of four corners and their instructions."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def data(argument: int) -> Any:
             array = context.make_array(signature.args[argument])
@@ -420,7 +414,6 @@ def _load_pairs(
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
-    """A vector with the same number in every lane."""
     empty = ir.Constant(_VECTOR, ir.Undefined)
     one = builder.insert_element(empty, number, ir.Constant(_NUMBER, 0))
     return builder.shuffle_vector(one, empty, ir.Constant(_VECTOR, [0] * LANES))

@@ -153,7 +153,6 @@ def _settle(elements, maps, field, start, level, points):
 
 
 def _share_of(volume: Volume, label: int) -> _Share:
-    """Found when it is first asked for."""
     shares = _found.setdefault(volume, {})
     if label not in shares:
         assert volume.labels is not None

@@ -77,7 +77,6 @@ def lettering(text: str, height: int, colour: Colour) -> Label:
 
 
 def _letters(text: str, height: int) -> NDArray[np.float32]:
-    """The fraction of each pixel that the letters cover, cropped to them."""
     large = _FINER * height
     letters = _cropped(text, large, _scale(large))
     rows, columns = (-(-side // _FINER) for side in letters.shape)
@@ -95,7 +94,6 @@ def _scale(large: int) -> float:
 
 
 def _cropped(text: str, large: int, scale: float) -> NDArray[np.uint8]:
-    """White on black, in letters about ``large`` px high."""
     canvas = np.zeros((3 * large, 2 * large * (len(text) + 1)), np.uint8)
     stroke = max(1, round(large / 7))
     font = cv2.FONT_HERSHEY_SIMPLEX

@@ -160,7 +160,6 @@ def _find_velocity(
 
 @njit(inline="always", error_model="numpy")
 def _blended(grid, i, j, k, u, v, w):
-    """Trilinear value in a cell of a grid."""
     c0 = (grid[i, j, k] * (1.0 - w) + grid[i, j, k + 1] * w) * (1.0 - v) + (
         grid[i, j + 1, k] * (1.0 - w) + grid[i, j + 1, k + 1] * w
     ) * v

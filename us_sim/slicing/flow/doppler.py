@@ -198,7 +198,6 @@ class ColourDoppler:
         return np.clip(np.rint((start + 0.5) * probe.lines - 0.5), 0, probe.lines - 1).astype(int)
 
     def _lay_out(self) -> None:
-        """Find the pixels of the box."""
         fraction, depth = fractions_and_depths(self._probe)
         start = fraction - self._lean(depth)
         with np.errstate(invalid="ignore"):

@@ -364,7 +364,6 @@ def resampled(
 
 
 def _one_piece(lumen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected part, if the others are crumbs."""
     parts, count = label(lumen, structure=np.ones((3, 3, 3)))
     if count == 0:
         raise VolumeError("is nowhere in the volume")
@@ -377,7 +376,6 @@ def _one_piece(lumen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _graph(
     lumen: NDArray[np.bool_], voxels: NDArray[np.int64], step: NDArray[np.float64]
 ) -> coo_matrix:
-    """Distances (m) between neighbouring voxels, as a sparse matrix."""
     number = np.full(np.array(lumen.shape) + 2, -1, dtype=np.int64)
     number[1:-1, 1:-1, 1:-1][lumen] = np.arange(len(voxels))
     ones, others, lengths = [], [], []

@@ -129,7 +129,6 @@ def _remapped(image: NDArray[np.uint8], maps: Any, *, replicate: bool) -> NDArra
 
 
 def _length(points: NDArray[np.float64]) -> float:
-    """Length of the line through points (n, 2), m, with half a step beyond its ends."""
     count = len(points)
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return float(steps.sum()) * count / max(count - 1, 1)
