@@ -292,7 +292,7 @@ def add_play(commands: Any) -> None:
 
 
 def _add_play_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.nodes.session_settings import SessionPlayerSettings
+    from us_sim.nodes.settings import SessionPlayerSettings
 
     parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
     parser.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
@@ -303,7 +303,7 @@ def _add_play_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _play(args: argparse.Namespace) -> int:
-    from us_sim.nodes.session_settings import SessionPlayerSettings
+    from us_sim.nodes.settings import SessionPlayerSettings
     from us_sim.run.live import play
 
     player = read_settings(args, SessionPlayerSettings, _OF_THE_PLAYER)

@@ -161,7 +161,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     from rclpy.signals import SignalHandlerOptions
 
     from us_sim.nodes.arrivals import Arrivals
-    from us_sim.nodes.realtime import go_along, go_first
+    from us_sim.nodes.process import go_along, go_first
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)

@@ -1,4 +1,4 @@
-"""The services by which rosbag2's recorder is controlled, and the events that it publishes."""
+"""Services and events of rosbag2's recorder and player, where its interfaces are installed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,73 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
-from us_sim.nodes.rosbag2_service import offer_service
-from us_sim.nodes.session_settings import LOST
+from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
 from us_sim.recording.write_behind import Loss
+
+
+def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
+    """Offer a service as a node of rosbag2 does; False where its type is not known here.
+
+    Args:
+        node: that offers it.
+        service: its type in ``rosbag2_interfaces``, without the package.
+        name: below the node's own.
+        act: does what the request asks for, and fills the response.
+    """
+    try:
+        from rosbag2_interfaces import srv
+    except ImportError:
+        return False
+
+    def answer(request: Any, response: Any) -> Any:
+        act(request, response)
+        return response
+
+    if not hasattr(srv, service):
+        return False
+    node.create_service(getattr(srv, service), f"~/{name}", answer)
+    return True
+
+
+def offer_player_services(
+    node: Node,
+    settings: Callable[[], PathPlayerSettings | SessionPlayerSettings],
+    first: int,
+    length: int,
+) -> None:
+    """Offer them where ``rosbag2_interfaces`` is installed.
+
+    Args:
+        node: that plays, with the parameters ``rate``, ``paused`` and ``time``.
+        settings: gives them as they are now.
+        first: ns since 1970, when what is played was recorded: `seek` counts as its stamps do.
+        length: ns.
+    """
+
+    def set_to(name: str, value: object) -> bool:
+        result = node.set_parameters_atomically([Parameter(name, value=value)])
+        return bool(result.successful)
+
+    def seek(request: Any, response: Any) -> None:
+        position = 1_000_000_000 * request.time.sec + request.time.nanosec - first
+        inside = 0 <= position <= length
+        response.success = inside and set_to("time", 1e-9 * position)
+
+    def set_rate(request: Any, response: Any) -> None:
+        response.success = set_to("rate", request.rate)
+
+    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> None:
+        offer_service(node, service, name, act)
+
+    offer("Pause", "pause", lambda *_: set_to("paused", True))
+    offer("Resume", "resume", lambda *_: set_to("paused", False))
+    offer("TogglePaused", "toggle_paused", lambda *_: set_to("paused", not settings().paused))
+    offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", settings().paused))
+    offer("GetRate", "get_rate", lambda _, answer: setattr(answer, "rate", settings().rate))
+    offer("SetRate", "set_rate", set_rate)
+    offer("Seek", "seek", seek)
 
 
 class Controlled(Protocol):

@@ -1,18 +1,14 @@
-"""Topics made from the frames of a scanner, each a file, for those who subscribe.
+"""Topics of images made from the frames of a scanner, for those who subscribe.
 
 Only those are there that a scene and its volume can provide.
 """
 
 from __future__ import annotations
 
-from us_sim.nodes.frame_streams.b_mode_stream import BModeStream
-from us_sim.nodes.frame_streams.m_mode_stream import MModeStream
-from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.streams.stream import BModeStream, FrameStream, MModeStream
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
-
-__all__ = ["FrameStream", "frame_streams"]
 
 
 def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameStream]:
@@ -23,16 +19,16 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
     """
     further: list[FrameStream] = []
     if volume.labels is not None:
-        from us_sim.nodes.frame_streams.label_stream import LabelStream
+        from us_sim.nodes.streams.stream import LabelStream
 
         further.append(LabelStream(node))
     if node.scene.tissue is not None:
-        from us_sim.nodes.frame_streams.displacement_stream import DisplacementStream
-        from us_sim.nodes.frame_streams.strain_streams import strain_streams
+        from us_sim.nodes.streams.strain import strain_streams
+        from us_sim.nodes.streams.stream import DisplacementStream
 
         further += [DisplacementStream(node), *strain_streams(node)]
     if node.scene.flows:
-        from us_sim.nodes.frame_streams.doppler_streams import doppler_streams
+        from us_sim.nodes.streams.doppler import doppler_streams
 
         further += doppler_streams(node, volume)
     further.append(MModeStream(node))

@@ -11,9 +11,9 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import ProbeError
 from us_sim.nodes.conversions import field_message
-from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.streams.stream import FrameStream
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from us_sim.errors import BagError, UsSimError
-from us_sim.nodes.session_settings import SessionRecorderSettings
+from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.repair import versions
 from us_sim.recording.storage import bag_files
 from us_sim.scene.reading import parse_scene, scene_document, with_path, with_volume
