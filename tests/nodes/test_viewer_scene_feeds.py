@@ -15,11 +15,11 @@ from std_msgs.msg import Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import (
 from us_sim.geometry.transducer import transducer_mesh
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     cloud_message,
     mesh_message,
     structure_markers,
