@@ -18,8 +18,6 @@ from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import (
-from us_sim.geometry.transducer import transducer_mesh
-from us_sim.nodes.messages import (
     cloud_message,
     mesh_message,
     structure_markers,

@@ -21,8 +21,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.messages import (
-from us_sim.geometry.transducer import transducer_mesh
-from us_sim.nodes.messages import (
     nanoseconds_of,
     pose_from,
     pose_message,
