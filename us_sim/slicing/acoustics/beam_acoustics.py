@@ -37,20 +37,13 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
 from us_sim.volume.volume import Volume
 
-SPEED_OF_SOUND = 1540.0
-"""m/s, that scanners take for all soft tissue."""
-
+SPEED_OF_SOUND = 1540.0  # m/s, that scanners take for all soft tissue
 _PULSE = 2.0  # wavelengths, the length of a surface's echo
 _CROSSINGS = 16  # of each beam there is room for
 
 
 class BeamAcoustics:
     """Loss, shadows, surfaces and fibres, as one probe's beams meet them in one volume.
-
-    Args:
-        volume: its labels say what is where.
-        probe: its geometry, and the frequencies that it has.
-        acoustics: the settings.
 
     Raises:
         ProbeError: a volume without labels, a label without constants, constants of a label that

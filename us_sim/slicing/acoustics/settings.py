@@ -13,8 +13,7 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-AROUND = "tissue"
-"""The name of what is in no structure."""
+AROUND = "tissue"  # the name of what is in no structure
 
 # Szabo, Diagnostic Ultrasound Imaging: Inside Out (2nd ed., 2014), Appendix B, table B.1.
 _BLOOD = (0.14, 1.679e6)

@@ -27,8 +27,7 @@ from us_sim.slicing.settings import FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-_ALONG = 0.25
-"""Least cosine between the direction that is set and the vessel's own."""
+_ALONG = 0.25  # least cosine between the direction that is set and the vessel's own
 
 
 class Vessel:
@@ -38,10 +37,8 @@ class Vessel:
     the square of the radial coordinate there at rest, which `map` knows.
 
     Args:
-        name: of it, for sentences.
         volume: in frame ``patient``, with labels.
         label: of the vessel's lumen.
-        settings: of the flow.
 
     Raises:
         SceneError: the label is no tube, or the flow's direction is across it.
@@ -154,7 +151,6 @@ class Circulation:
     """Flow along a vessel as its lumen narrows and opens, averaged over the pulse.
 
     Args:
-        settings: of the flow.
         rest_areas: (S,) m², of the lumen at rest, at places evenly spaced along it.
         spacing: m, between them.
         before: the same vessel with other settings, whose reservoir this one takes over.
@@ -217,9 +213,7 @@ class Circulation:
 _BELLS = ((0.13, 0.045, 1.0), (0.33, 0.06, -0.32), (0.52, 0.09, 0.10))
 """Middle and standard deviation, in beats, and height of the arterial pulse's three waves."""
 
-_CARDIAC = 0.25
-"""Fraction of the swing of a vein's flow that is the heart's; the rest is breathing."""
-
+_CARDIAC = 0.25  # fraction of the swing of a vein's flow that is the heart's; the rest is breathing
 _FINE = 4096  # places at which the pulse's shape is measured
 
 

@@ -445,8 +445,7 @@ class SectorProbe(Probe):
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-OUTLINE_POINTS = 33
-"""Of each of the two arcs that an outline has."""
+OUTLINE_POINTS = 33  # of each of the two arcs that an outline has
 
 
 def image_outline(probe: Probe, points: int = OUTLINE_POINTS) -> NDArray[np.float64]:
