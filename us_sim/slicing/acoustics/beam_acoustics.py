@@ -229,7 +229,10 @@ _GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
 
 
 class Noise:
-    """Images of noise that is ``level`` dB at the face, and rises by ``rise`` dB/m."""
+    """Electronic noise of Rayleigh distribution, ``level`` dB at the face, rising by ``rise`` dB/m.
+
+    It is another one from pose to pose, and the same whenever a pose is the same.
+    """
 
     def __init__(self, probe: Probe, level: float, rise: float) -> None:
         distance = probe.pixel_beams[1]
@@ -260,7 +263,7 @@ class Noise:
 
 
 class Fibres:
-    """The directions of fibres at rest, carried by a mesh.
+    """The directions of fibres at rest, carried by a mesh: t = F t0 of the deformation gradient F.
 
     Args:
         directions: (D, 3) unit vectors in ``patient``.

@@ -97,7 +97,8 @@ _TABLE: dict[str, tuple[float, float]] = {
 def table_constants(name: str) -> tuple[float, float] | None:
     """Attenuation (dB/cm/MHz) and impedance (Rayl) of what a label's name says.
 
-    Of several known words in a name the last one counts; None where there is none.
+    Of several known words in a name the last one counts; None where there is none. Attenuation is
+    taken as proportional to the frequency: the source's coefficient at 1 MHz.
     """
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _TABLE]
     return _TABLE[words[-1]] if words else None

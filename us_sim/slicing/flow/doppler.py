@@ -52,7 +52,10 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def uniform(seed, place):
-    """A number above 0, and at most 1, for two numbers of type uint64."""
+    """A number above 0, and at most 1, for two numbers of type uint64: the same in every run.
+
+    By the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+    """
     x = (seed * _STEP) ^ (place + _STEP)
     for _ in range(2):
         x = (x ^ (x >> np.uint64(30))) * _FIRST

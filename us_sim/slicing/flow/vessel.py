@@ -148,7 +148,16 @@ def open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.flo
 
 
 class Circulation:
-    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse.
+    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse: a Windkessel.
+
+        q = p / (D + R),    T dp/dt = (P - p) - S q
+
+    Blood comes from capillaries at pressure P through a resistance S into an elastic reservoir at
+    pressure p, and flows on through the vessel's own resistance R, and D downstream (N. Westerhof,
+    J.-W. Lankhaar, B. E. Westerhof, Med. Biol. Eng. Comput. 47, 2009). R is Poiseuille's, the sum
+    of 8 π μ ds / a² of the open area a; T is the time constant of filling. An artery has p = P.
+    Inertia and turbulence are left out. A vessel is closed at 0.27 of its area at rest, as elastic
+    tubes are (Flaherty, Keller, Rubinow, SIAM J. Appl. Math. 23, 1972).
 
     Args:
         rest_areas: (S,) m², of the lumen at rest, at places evenly spaced along it.
@@ -219,6 +228,11 @@ _FINE = 4096  # places at which the pulse's shape is measured
 
 class Waveform:
     """Flow over its mean, as a function of time; its mean over a beat and a breath is 1.
+
+    An artery of a limb at rest has a triphasic pulse (McDicken and Hoskins, in Hoskins, Martin and
+    Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010, chapter 9): three bells,
+    scaled to the peak and mean that are set. Flow in a vein swings with breathing, and a little
+    with the heart (Baekgaard and Strandberg, Phlebolymphology, 2016).
 
     Args:
         settings: of the vessel's flow.
