@@ -1,4 +1,4 @@
-"""Springs and volume term against theory: Algorithm 1, fitted springs, energies and their slopes."""
+"""Springs and volume term against theory: Algorithm 1, fitted springs, energies, slopes."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Least squares against SciPy's, its ends, and intervals that hold the truth as often as they say."""
+"""Least squares against SciPy, its ends, and intervals that hold the truth as often as said."""
 
 import numpy as np
 import pytest
