@@ -13,9 +13,7 @@ from us_sim.evaluation.viewer.points import Point
 from us_sim.evaluation.viewer.run_case import run_case  # noqa: F401 - it must be importable
 from us_sim.evaluation.viewer.taker import Taker
 from us_sim.evaluation.viewer.targets import targets
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 DELAY_S = 0.05
 

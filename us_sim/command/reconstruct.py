@@ -47,8 +47,8 @@ def _reconstruct(args: argparse.Namespace) -> int:
     if args.undo_pressure is not None:
 
         def rest_of(sweep: Sweep, part: ImagePart) -> Rest:
+            from us_sim.scene.placement import rest_placement
             from us_sim.scene.reading import load_scene
-            from us_sim.scene.rest_placement import rest_placement
 
             scene = load_scene(args.undo_pressure)
             return rest_placement(scene, sweep, part)

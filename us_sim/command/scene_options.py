@@ -13,7 +13,7 @@ from us_sim.run.supervision_settings import SupervisionSettings
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
 _OF_THE_VIEWER = ("host", "port", "recordings")
 
@@ -88,7 +88,7 @@ def supervision(args: argparse.Namespace) -> SupervisionSettings:
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
     """Where the page is served."""
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
@@ -105,7 +105,7 @@ def viewer(args: argparse.Namespace) -> ViewerSettings:
     Raises:
         UsSimError: a value will not do.
     """
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 

@@ -17,9 +17,8 @@ from us_sim.demo.session import LumenAreas, Session
 from us_sim.demo.strain_pictures import strain_pictures
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import probe_of
+from us_sim.scene.building import colour_of, probe_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.label_border import onto_border
 from us_sim.slicing.drawing.label_outlines import label_outlines
 from us_sim.slicing.frame import Frame

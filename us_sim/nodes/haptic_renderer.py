@@ -23,7 +23,7 @@ from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.tracker_building import haptic_rendering_of, source_settings
+from us_sim.scene.building import haptic_rendering_of, source_settings
 
 LOOKS, REPORTS = 5.0, 1.0
 """Times a second that it is seen who listens, and that diagnostics are told how regular it is.

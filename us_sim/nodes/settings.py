@@ -30,10 +30,10 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
 from us_sim.settings.spelling import unknown
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.formation.imaging import Imaging
-from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
 
 _MARKERS = Quantity("frequency", 0.1, 1000.0)

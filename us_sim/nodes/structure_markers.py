@@ -15,8 +15,7 @@ from us_sim.nodes.conversions import nanoseconds_of, structure_markers
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings
-from us_sim.scene.building import volume_of
-from us_sim.scene.structures import Structure, structures_of
+from us_sim.scene.building import Structure, structures_of, volume_of
 from us_sim.settings.spelling import counted
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 

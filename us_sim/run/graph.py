@@ -24,8 +24,8 @@ from us_sim.run.forking import ForkServer
 from us_sim.run.running_node import COMPLAINT, STANDING_BY, STOP_S, NodeProcess, RunningNode
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
+from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.share import full_path
-from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
 
 __all__ = [
     "NodeProcess",

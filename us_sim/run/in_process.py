@@ -8,6 +8,7 @@ from typing import Any
 
 from us_sim.errors import UsSimError
 from us_sim.run.parameter_texts import require_texts
+from us_sim.run.running_node import module_of
 
 
 def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -> Any:
@@ -22,7 +23,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
 
     require_texts(parameters)
     kind = "".join(word.capitalize() for word in name.split("_"))
-    make = getattr(importlib.import_module(f"us_sim.nodes.{name}"), kind)
+    make = getattr(importlib.import_module(module_of(name)), kind)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
     try:
         return make(context=context, parameter_overrides=overrides)

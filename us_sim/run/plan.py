@@ -20,7 +20,7 @@ from us_sim.run.graph import (
 from us_sim.run.request import Request
 from us_sim.scene.building import path_of
 from us_sim.share import full_path
-from us_sim.viewer.listening import require_free
+from us_sim.viewer.server import require_free
 
 PLAYERS = ("path_player", "session_player")
 _WHAT_COUNTS = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from us_sim.run.graph import RECORDER, VIEWER, Parameters
 from us_sim.scene.scene import Scene
-from us_sim.viewer.viewer_settings import ViewerSettings
+from us_sim.settings.viewer import ViewerSettings
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo

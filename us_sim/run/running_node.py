@@ -25,6 +25,11 @@ STOP_S = 0.8
 STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 
 
+def module_of(node: str) -> str:
+    """The module that runs a node."""
+    return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
+
+
 @dataclass(frozen=True)
 class NodeProcess:
     """One node and its parameters."""
@@ -40,7 +45,7 @@ class NodeProcess:
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
-        return [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", *self.arguments()]
+        return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
 
     def arguments(self) -> list[str]:
         """Those of the command line, by which it gets its parameters."""

@@ -15,9 +15,8 @@ import rerun
 from us_sim.nodes.conversions import tetrahedra_from, vectors_from
 from us_sim.recording.attached import extract
 from us_sim.recording.reader import Bag
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import structures_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.to_rerun.rerun_file import RerunFile
 

@@ -11,7 +11,7 @@ from typing import Any
 from nicegui import ui
 
 from us_sim.viewer.parameters import Kind
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {

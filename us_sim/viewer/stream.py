@@ -1,18 +1,152 @@
-"""The websocket of one page: packets of the streams it watches, and its commands."""
+"""One message to the page: a header of JSON, and bytes.
+
+>>> from us_sim.viewer.stream import Packet
+>>> packet = Packet("image", 7, {"rows": 1, "columns": 4}, bytes([0, 85, 170, 255]))
+>>> len(packet.encoded) % 4, Packet.decoded(packet.encoded) == packet
+(0, True)
+
+The newest of a stream, made only while somebody watches.
+
+>>> from us_sim.viewer.stream import Feed
+>>> from us_sim.viewer.stream import Packet
+>>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
+>>> told = []
+>>> feed.watch(lambda: told.append(feed.sequence))
+watched
+>>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"first"))
+>>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"second"))
+>>> told, feed.newest().payload
+([1, 2], b'second')
+
+The websocket of one page: packets of the streams it watches, and its commands.
+
+The simulator as the page sees it: what streams, and what can be asked of it.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import itertools
 import json
-from collections.abc import Callable
+import struct
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+_LENGTH = struct.Struct("<I")
+_ALIGNMENT = 8
+"""Bytes: where the payload begins is a multiple, so that the page can look at it as numbers."""
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.simulator import Simulator
+
+@dataclass(frozen=True)
+class Packet:
+    """What one message of a stream holds."""
+
+    kind: str  # the stream's name
+    sequence: int  # counts the messages of the stream
+    header: Mapping[str, Any]  # JSON-like, without numbers that are none
+    payload: bytes
+
+    @cached_property
+    def encoded(self) -> bytes:
+        """As sent: length of the header (32 bits, little endian), header, payload."""
+        header = {"kind": self.kind, "sequence": self.sequence, **self.header}
+        text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-(_LENGTH.size + len(text)) % _ALIGNMENT)
+        return b"".join((_LENGTH.pack(len(text)), text, self.payload))
+
+    @classmethod
+    def decoded(cls, data: bytes) -> Packet:
+        """The packet of :attr:`encoded`."""
+        (length,) = _LENGTH.unpack_from(data)
+        header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
+        kind, sequence = header.pop("kind"), header.pop("sequence")
+        return cls(kind, sequence, header, data[_LENGTH.size + length :])
+
+
+Pack = Callable[[int], Packet | None]
+"""Makes the packet of a number; None where what came cannot be used."""
+Notify = Callable[[], None]
+
+
+class Feed:
+    """One stream: the graph offers, pages watch and take, each in a thread of its own.
+
+    Args:
+        kind: the stream's name, which its packets bear.
+        on_watch: called with True when the first begins to watch and with False when the last has
+            left, in the thread of whoever does.
+        rate: Hz; a page is sent so many at most. None is each of them, in place of the newest of
+            several: of things that are told once.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        on_watch: Callable[[bool], object] = lambda _: None,
+        rate: float | None = 30.0,
+    ) -> None:
+        self.kind, self.rate = kind, rate
+        self._on_watch = on_watch
+        self._watchers: list[Notify] = []
+        self._lock = threading.Lock()
+        self._packing = threading.Lock()
+        self._pack: Pack | None = None
+        self._packed: tuple[int, Packet | None] = (0, None)
+        self._sequence = 0
+
+    @property
+    def sequence(self) -> int:
+        """The number of the newest; 0 before the first."""
+        return self._sequence
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether anybody watches."""
+        return bool(self._watchers)
+
+    def watch(self, notify: Notify) -> None:
+        """Have ``notify`` called, from any thread, whenever there is a newer one."""
+        with self._lock:
+            self._watchers.append(notify)
+            first = len(self._watchers) == 1
+        if first:
+            self._on_watch(True)
+
+    def unwatch(self, notify: Notify) -> None:
+        """No longer."""
+        with self._lock:
+            self._watchers.remove(notify)
+            last = not self._watchers
+        if last:
+            self._on_watch(False)
+
+    def offer(self, pack: Pack) -> None:
+        """There is a newer one, which ``pack`` makes if anybody takes it."""
+        with self._lock:
+            self._sequence += 1
+            self._pack = pack
+            watchers = list(self._watchers)
+        for notify in watchers:
+            notify()
+
+    def forget(self) -> None:
+        """What was offered holds no longer, as when the scene is another."""
+        with self._lock:
+            self._pack = None
+
+    def newest(self) -> Packet | None:
+        """The newest packet, made once for all pages; None where there is none that can be used."""
+        with self._packing:
+            with self._lock:
+                sequence, pack = self._sequence, self._pack
+            if pack is None:
+                return None
+            if self._packed[0] != sequence:
+                self._packed = sequence, pack(sequence)
+            return self._packed[1]
+
 
 _LONGEST = 65536
 """Characters of a page's message."""
@@ -112,44 +246,3 @@ class PageStream:
     def close(self) -> None:
         """The page has gone."""
         self.watch([])
-
-
-async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
-    """Stay with one page until it goes."""
-    await websocket.accept()
-    loop = asyncio.get_running_loop()
-    awake = asyncio.Event()
-
-    def wake() -> None:
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(awake.set)
-
-    page = PageStream(simulator, wake)
-    sending = asyncio.ensure_future(_send(websocket, page, awake))
-    try:
-        while True:
-            wrong = page.take(await websocket.receive_text())
-            if wrong:
-                await websocket.send_text(json.dumps({"problem": wrong}))
-    except (WebSocketDisconnect, RuntimeError, KeyError):
-        pass  # it has gone, or sends bytes, which no page does
-    finally:
-        sending.cancel()
-        page.close()
-        for command in simulator.leaving:
-            command(page.number)
-
-
-async def _send(websocket: WebSocket, page: PageStream, awake: asyncio.Event) -> None:
-    loop = asyncio.get_running_loop()
-    later: float | None = None
-    while True:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(awake.wait(), later)
-        awake.clear()
-        packets, later = page.due(loop.time())
-        try:
-            for packet in packets:
-                await websocket.send_bytes(packet)
-        except (WebSocketDisconnect, RuntimeError):
-            return

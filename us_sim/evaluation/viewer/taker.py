@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.stream import Packet
 
 STREAMED = (
     "image",

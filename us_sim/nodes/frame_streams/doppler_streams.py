@@ -10,7 +10,7 @@ from us_sim.nodes.frame_streams.stream import FrameStream
 from us_sim.nodes.frame_streams.velocity_stream import VelocityStream
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.blood import blood_of
+from us_sim.scene.building import blood_of
 from us_sim.slicing.flow.warm_up import warm_up
 from us_sim.volume.volume import Volume
 

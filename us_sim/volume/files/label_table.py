@@ -17,7 +17,7 @@ from pathlib import Path
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.volume.anatomical_colours import Colour
 
 _SLICER = re.compile(r"(\d{1,9})\s+(\S+)\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})")

@@ -1,34 +1,185 @@
-"""Moves the probe as pages ask for it, unless somebody else does."""
+"""Where the probe is, whoever moves it, also for who begins to listen when nobody does any more.
+
+What the viewer knows of the surface on which the probe can be put.
+
+Moves the probe as pages ask for it, unless somebody else does.
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import ArrayLike
+from shape_msgs.msg import Mesh
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pose_message
+from us_sim.nodes.conversions import mesh_from, pose_from, pose_from_text, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.probe_lead import LEAD_TOPIC, Lead, probe_lead
-from us_sim.nodes.probe_whereabouts import ProbeWhereabouts
-from us_sim.nodes.qos import STREAM, overridable
-from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.nodes.viewer_surface import ViewerSurface
-from us_sim.tracking.measurement import PATIENT
+from us_sim.nodes.probe_lead import LEAD_TOPIC
+from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
-from us_sim.viewer.asked_poses import AskedPoses
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.hand_command import HOME_PRESS, HandCommand, is_source
-from us_sim.viewer.hand_state import hand_state
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.hand_command import HOME_PRESS, AskedPoses, HandCommand, hand_state, is_source
+from us_sim.viewer.session import SessionState
+from us_sim.viewer.stream import Feed, Packet, Simulator
+
+PLAYERS = ("path_player", "session_player")
+"""Nodes that `session_control` starts and ends."""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """Who leads, and whether a page's hand may."""
+
+    who: str  # a node, "tracker" for the scene's own, "hand", or "nobody"
+    obstacle: str = ""  # why the hand may not move the probe, for a person; "" if it may
+    can_take: bool = False  # whether a page can end what moves it
+
+
+def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> Lead:
+    """Who moves the probe, by who publishes and hears ``tracker/pose``.
+
+    Args:
+        node: whose hand would move it.
+        session: what is replayed.
+        is_publishing: whether that hand publishes already.
+    """
+    name = node.resolve_topic_name(LEAD_TOPIC)
+    others = [info.node_name for info in node.get_publishers_info_by_topic(name)]
+    if is_publishing and node.get_name() in others:
+        others.remove(node.get_name())
+    if others and others[0] in PLAYERS and session.replay:
+        what = "moves the probe"
+        if session.replay_state == "finished":
+            what = "has ended"
+            what += " and holds the probe" if others[0] == PLAYERS[0] else ""
+        obstacle = f"the replay of {PurePath(session.replay).name} {what}"
+        return Lead(others[0], obstacle, can_take=True)
+    if others:
+        return Lead(others[0], f"{others[0]} moves the probe: end it to take the probe yourself")
+    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    if "probe_tracker" in hearers:
+        return Lead("hand")
+    if node.count_publishers(node.resolve_topic_name("probe/pose")):
+        return Lead(
+            "tracker",
+            "the probe follows the scene's own tracker: start without --tracker, or with --param "
+            "probe_tracker.source=pose, to take it yourself",
+        )
+    return Lead("nobody", "no simulator with a probe runs yet")
+
+
+class ProbeWhereabouts:
+    """Each pose of ``probe/pose``, and the last one, which is in the latched ``probe/status``.
+
+    Args:
+        node: that listens.
+        moved: called with each pose that comes, in frame ``patient``.
+        rested: called when no more poses come, with the last and its stamp in ns; with None while
+            there never was one.
+        goes_on: called when poses come.
+    """
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        moved: Callable[[Pose], None],
+        rested: Callable[[Pose | None, int], None],
+        goes_on: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._moved, self._rested, self._goes_on = moved, rested, goes_on
+        self._heard = [
+            node.create_subscription(PoseStamped, "probe/pose", self._follow, STREAM),
+            node.create_subscription(DiagnosticStatus, "probe/status", self._find, LATCHED),
+        ]
+
+    @property
+    def is_told(self) -> bool:
+        """Whether there is somebody who says it."""
+        return self._node.count_publishers(self._node.resolve_topic_name("probe/status")) > 0
+
+    def close(self) -> None:
+        """Listen no more."""
+        for subscription in self._heard:
+            self._node.destroy_subscription(subscription)
+        self._heard = []
+
+    def _follow(self, message: PoseStamped) -> None:
+        self._moved(pose_from(message, "patient"))
+
+    def _find(self, status: DiagnosticStatus) -> None:
+        said = {each.key: each.value for each in status.values}
+        if "pose" in said:
+            stamp = said.get("stamp", "")
+            self._rested(pose_from_text(said["pose"]), int(stamp) if stamp.isdecimal() else 0)
+        elif status.message == TrackingState.WAITING.value:
+            self._rested(None, 0)
+        else:
+            self._goes_on()
+
+
+_PLANE = 0.1
+"""m around the origin, of the plane where nothing has a surface."""
+
+
+class ViewerSurface:
+    """The skin at rest; where the scene has none the tissue's upper side, else the plane z = 0.
+
+    Args:
+        node: that hears ``skin/mesh``.
+        rest: the tissue's mesh.
+        changed: called when there is another surface.
+    """
+
+    def __init__(self, node: GuardedNode, rest: RestMesh, changed: Callable[[], None]) -> None:
+        self._node, self._rest, self._changed = node, rest, changed
+        self._skin: RestSurface | None = None
+        self._tissue: RestSurface | None = None
+        self._plane = RestSurface.plane(_PLANE)
+        self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
+        rest.watch(self._make_tissue)
+        node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
+
+    @property
+    def best(self) -> RestSurface | None:
+        """The surface; None while one is still awaited."""
+        if self._skin is not None and (self._tissue is None or self._is_offered("skin/mesh")):
+            return self._skin
+        if self._tissue is not None:
+            return self._tissue
+        is_awaited = self._is_offered("skin/mesh") or self._is_offered("tissue/rest")
+        return None if is_awaited else self._plane
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._node.destroy_subscription(self._heard)
+        self._rest.watch(self._make_tissue, is_wanted=False)
+
+    def _is_offered(self, topic: str) -> bool:
+        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
+
+    def _take_skin(self, message: Mesh) -> None:
+        self._skin = RestSurface(*mesh_from(message))
+        self._changed()
+
+    def _make_tissue(self) -> None:
+        """The tissue's upper side, of the mesh that is there now."""
+        if self._rest.mesh is not None:
+            self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
+            self._changed()
+
 
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more

@@ -14,21 +14,23 @@ from us_sim.nodes.health import Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.process import run_node
-from us_sim.nodes.remote_parameters import RemoteParameters
-from us_sim.nodes.status_listener import StatusListener
-from us_sim.nodes.viewer_feeds.image_feed import image_feeds
-from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
-from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
-from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
-from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
-from us_sim.nodes.viewer_hand import ViewerHand
-from us_sim.nodes.viewer_session import CONTROL, ViewerSession
+from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.viewer.access import is_loopback
+from us_sim.viewer.feeds import (
+    ProbeFeeds,
+    RestMesh,
+    SkinFeeds,
+    StructuresFeed,
+    TissueFeeds,
+    image_feeds,
+)
+from us_sim.viewer.hand import ViewerHand
 from us_sim.viewer.parameters import Parameter, in_words
+from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.server import WebServer
-from us_sim.viewer.simulator import Simulator
-from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
+from us_sim.viewer.session import CONTROL, ViewerSession
+from us_sim.viewer.status import StatusListener
+from us_sim.viewer.stream import Simulator
 
 IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` that pages are told with each image."""

@@ -1,19 +1,111 @@
-"""The parameters of one other node: read once, followed, and set."""
+"""Parameters of other nodes: their descriptors and values, read and written.
+
+The nodes of this package say more in a descriptor than ROS has fields for, as a JSON object in
+``additional_constraints``, see `us_sim.nodes.parameters`. Others may write there what they like.
+
+The parameters of one other node: read once, followed, and set.
+
+The parameters of the nodes that pages look at: found, read, followed and set.
+"""
 
 from __future__ import annotations
 
+import json
 import time
-from collections import Counter
-from collections.abc import Callable
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from rcl_interfaces.msg import ParameterEvent
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent, ParameterType, ParameterValue
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from us_sim.nodes.conversions.parameters import parameter_from, parameter_message, raw_from
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.viewer.parameters import NodeParameters, Parameter, State
+from us_sim.settings.quantity import units_of
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+
+_TYPES: dict[Kind, tuple[int, str]] = {
+    Kind.TRUTH: (ParameterType.PARAMETER_BOOL, "bool_value"),
+    Kind.WHOLE: (ParameterType.PARAMETER_INTEGER, "integer_value"),
+    Kind.NUMBER: (ParameterType.PARAMETER_DOUBLE, "double_value"),
+    Kind.TEXT: (ParameterType.PARAMETER_STRING, "string_value"),
+    Kind.WHOLES: (ParameterType.PARAMETER_INTEGER_ARRAY, "integer_array_value"),
+    Kind.NUMBERS: (ParameterType.PARAMETER_DOUBLE_ARRAY, "double_array_value"),
+    Kind.TEXTS: (ParameterType.PARAMETER_STRING_ARRAY, "string_array_value"),
+}
+_KINDS = {number: (kind, field) for kind, (number, field) in _TYPES.items()}
+
+
+def parameter_from(
+    node: str, name: str, descriptor: ParameterDescriptor, value: ParameterValue
+) -> Parameter:
+    """What a page shows of a parameter.
+
+    Args:
+        node: whose it is.
+        name: of the parameter.
+        descriptor, value: what the node says of it.
+    """
+    kind, raw = raw_from(value)
+    told = _extras(descriptor)
+    unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
+    choices = told.get("choices")
+    meanings = {str(k): str(v) for k, v in choices.items()} if isinstance(choices, dict) else {}
+    limits = _limits(descriptor)
+    if reads not in units_of(unit):
+        reads = unit
+    return Parameter(
+        node,
+        name,
+        kind,
+        raw,
+        unit=reads,
+        size=units_of(unit).get(reads, 1.0),
+        limits=limits,
+        choices=tuple(meanings),
+        meanings={name: text for name, text in meanings.items() if text},
+        may_be_nothing="none" in told,
+        description=str(descriptor.description),
+        is_live=not descriptor.read_only and kind is not Kind.OTHER,
+    )
+
+
+def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
+    """The JSON object in the constraints; nothing where another's node has something else there."""
+    try:
+        told = json.loads(str(descriptor.additional_constraints))
+    except (ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def raw_from(value: ParameterValue) -> tuple[Kind, Any]:
+    """The kind and the value in SI units; lists are tuples."""
+    if value.type not in _KINDS:
+        return Kind.OTHER, None
+    kind, field = _KINDS[value.type]
+    raw = getattr(value, field)
+    return kind, tuple(raw) if kind.is_list else raw
+
+
+def parameter_message(parameter: Parameter, raw: Any) -> ParameterMessage:
+    """What asks the parameter's node to set it to a value in SI units."""
+    number, field = _TYPES[parameter.kind]
+    if parameter.kind is Kind.NUMBERS:
+        raw = array("d", raw)
+    elif parameter.kind.is_list:
+        raw = list(raw)
+    value = ParameterValue(type=number, **{field: raw})
+    return ParameterMessage(name=parameter.name, value=value)
+
+
+def _limits(descriptor: ParameterDescriptor) -> tuple[float, float] | None:
+    ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+    return (float(ranges[0].from_value), float(ranges[0].to_value)) if ranges else None
+
 
 ANSWER_S = 10.0
 """How long an answer is waited for: a node that makes images anew may need seconds."""
@@ -201,3 +293,106 @@ class RemoteNode:
 def _answer(future: Any) -> Any:
     """The response, or None where there is none."""
     return None if future.cancelled() or future.exception() is not None else future.result()
+
+
+EVENTS = "/parameter_events"
+EVERY_EVENT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+"""As rclpy publishes them."""
+LOOK_S = 0.5
+"""How often the graph is looked at for nodes that come, go, or are started again."""
+
+
+class RemoteParameters:
+    """Keeps the board up to date while pages look, and does nothing while none does.
+
+    A node is told from one of the same name that was started later by who publishes its
+    parameter events, as the middleware numbers publishers.
+
+    Args:
+        node: that asks.
+        post: has work done in the thread that spins ``node``; returns a future.
+        doors: by the names of nodes, what sets their parameters in place of them.
+    """
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        post: Callable[[Callable[[], Any]], Any],
+        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
+    ) -> None:
+        self._doors = doors or {}
+        self._node, self._post = node, post
+        self._space = node.get_namespace().rstrip("/")
+        self._nodes: dict[str, RemoteNode] = {}
+        self._timer: Any = None
+        self._events: Any = None
+        self._told: dict[str, NodeParameters] = {}
+        self.board = ParameterBoard(lambda: post(self._look), self._send)
+
+    def close(self) -> None:
+        """No answer is waited for any more."""
+        for remote in self._nodes.values():
+            remote.close()
+
+    def _look(self) -> None:
+        watched = self.board.watched
+        if not watched:
+            self._rest()
+            return
+        if self._timer is None:
+            self._events = self._node.create_subscription(
+                ParameterEvent, EVENTS, self._follow, EVERY_EVENT
+            )
+            self._timer = self._node.create_timer(LOOK_S, self._look)
+        there = self._identities()
+        for name in watched:
+            if name not in self._nodes:
+                self._nodes[name] = RemoteNode(self._node, name, self._tell)
+            self._nodes[name].look(there.get(f"{self._space}/{name}", frozenset()))
+
+    def _rest(self) -> None:
+        """Nobody looks: what is known may change unseen."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._node.destroy_subscription(self._events)
+            self._timer = self._events = None
+        for remote in self._nodes.values():
+            remote.forget()
+
+    def _identities(self) -> dict[str, frozenset[Any]]:
+        """What tells the nodes of the graph from others, by their full names."""
+        found: dict[str, set[Any]] = defaultdict(set)
+        for name, space in self._node.get_node_names_and_namespaces():
+            found[f"{space.rstrip('/')}/{name}"].add(name)
+        for each in self._node.get_publishers_info_by_topic(EVENTS):
+            name = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
+            if name in found:
+                found[name].add(tuple(each.endpoint_gid))
+        return {name: frozenset(identity) for name, identity in found.items()}
+
+    def _follow(self, event: ParameterEvent) -> None:
+        space, _, name = event.node.rpartition("/")
+        if space == self._space and name in self._nodes and name in self.board.watched:
+            self._nodes[name].follow(event)
+
+    def _tell(self, known: NodeParameters) -> None:
+        """Pages are told of what is new only."""
+        if self._told.get(known.node) != known:
+            self._told[known.node] = known
+            self.board.tell(known)
+
+    def _send(self, parameter: Parameter, raw: Any) -> Future[str]:
+        if parameter.node in self._doors:
+            return self._doors[parameter.node](**{parameter.name: raw})
+        told: Future[str] = Future()
+
+        def ask() -> None:
+            remote = self._nodes.get(parameter.node)
+            if remote is None:
+                told.set_result(f"{parameter.node} is not looked at any more")
+            else:
+                remote.set(parameter, raw, told)
+
+        if self._post(ask).cancelled():
+            told.set_result("the viewer ends")
+        return told

@@ -1,23 +1,55 @@
-"""YAML that a person or a stranger wrote: as much as a file of ours can need, each key once.
+"""Reading the text files that a person names.
 
->>> from us_sim.settings.yaml_text import load_yaml
+>>> from us_sim.settings.text_files import read_text
+>>> read_text("/dev/zero")
+Traceback (most recent call last):
+    ...
+OSError: [Errno 27] more than 64 MiB, and no text is so long: '/dev/zero'
+
+YAML that a person or a stranger wrote: as much as a file of ours can need, each key once.
+
+>>> from us_sim.settings.text_files import load_yaml
 >>> load_yaml("probe: {depth: 4 cm}")
 {'probe': {'depth': '4 cm'}}
 >>> load_yaml("depth: 4 cm\\ndepth: 5 cm")
 Traceback (most recent call last):
-us_sim.settings.yaml_text.YamlError: line 2: key `depth` is there twice, first in line 1: keep one
+us_sim.settings.text_files.YamlError: line 2: key `depth` is there twice, first in line 1: keep one
 >>> load_yaml("a: &a [1, *a]")
 Traceback (most recent call last):
-us_sim.settings.yaml_text.YamlError: line 1: is not YAML that can be read: `*a` is within itself
+us_sim.settings.text_files.YamlError: line 1: is not YAML that can be read: `*a` is within itself
 """
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from us_sim.errors import UsSimError
+
+_LARGEST = 64 << 20
+
+
+def read_text(path: Path | str, encoding: str = "utf-8", errors: str = "strict") -> str:
+    """The text of a file, or of a pipe, that is not endless.
+
+    Raises:
+        OSError: it cannot be read, or has more than 64 MiB.
+        UnicodeDecodeError: it is no text of that encoding.
+    """
+    return read_bytes(path).decode(encoding, errors)
+
+
+def read_bytes(path: Path | str) -> bytes:
+    """Likewise, of a text whose encoding is said in it."""
+    with Path(path).open("rb") as file:
+        data = file.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise OSError(errno.EFBIG, "more than 64 MiB, and no text is so long", str(path))
+    return data
+
 
 LARGEST_YAML = 1 << 20
 """Characters of a text that is read."""

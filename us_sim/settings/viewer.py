@@ -1,6 +1,6 @@
 """What can be set of the viewer.
 
->>> from us_sim.viewer.viewer_settings import ViewerSettings
+>>> from us_sim.settings.viewer import ViewerSettings
 >>> ViewerSettings().host
 '127.0.0.1'
 """
