@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,16 +54,14 @@ from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Feed, Packet
-from us_sim.viewer.surfaces import CarriedSurfaces, (
+from us_sim.viewer.surfaces import (
+    CarriedSurfaces,
     ColouredSurface,
     EquivalentStrain,
     RestSurface,
     transducer_packet,
     welded,
 )
-
-if TYPE_CHECKING:
-
 
 Make = Callable[[Any, int], Packet]
 MakeOrWait = Callable[[Any, int], Packet | None]

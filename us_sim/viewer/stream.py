@@ -1,14 +1,9 @@
-"""One message to the page: a header of JSON, and bytes.
+"""Streams to the pages: packets, feeds that make them while watched, and the side of one page.
 
->>> from us_sim.viewer.stream import Packet
+>>> from us_sim.viewer.stream import Feed, Packet
 >>> packet = Packet("image", 7, {"rows": 1, "columns": 4}, bytes([0, 85, 170, 255]))
 >>> len(packet.encoded) % 4, Packet.decoded(packet.encoded) == packet
 (0, True)
-
-The newest of a stream, made only while somebody watches.
-
->>> from us_sim.viewer.stream import Feed
->>> from us_sim.viewer.stream import Packet
 >>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
 >>> told = []
 >>> feed.watch(lambda: told.append(feed.sequence))
@@ -17,10 +12,6 @@ watched
 >>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"second"))
 >>> told, feed.newest().payload
 ([1, 2], b'second')
-
-The websocket of one page: packets of the streams it watches, and its commands.
-
-The simulator as the page sees it: what streams, and what can be asked of it.
 """
 
 from __future__ import annotations
@@ -30,22 +21,29 @@ import json
 import struct
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from us_sim.viewer.parameters import ParameterBoard
+from us_sim.viewer.session import SessionBoard
+from us_sim.viewer.status import StatusBoard
+
 _LENGTH = struct.Struct("<I")
 _ALIGNMENT = 8
-"""Bytes: where the payload begins is a multiple, so that the page can look at it as numbers."""
+"""Bytes: the payload begins at a multiple, so that the page can read it as numbers."""
+_LONGEST = 65536
+"""Characters of a page's message."""
+_numbers = itertools.count(1)
 
 
 @dataclass(frozen=True)
 class Packet:
-    """What one message of a stream holds."""
+    """A message to the page: a header of JSON, and bytes."""
 
     kind: str  # the stream's name
     sequence: int  # counts the messages of the stream
-    header: Mapping[str, Any]  # JSON-like, without numbers that are none
+    header: Mapping[str, Any]  # JSON-like, of finite numbers
     payload: bytes
 
     @cached_property
@@ -66,19 +64,17 @@ class Packet:
 
 
 Pack = Callable[[int], Packet | None]
-"""Makes the packet of a number; None where what came cannot be used."""
-Notify = Callable[[], None]
+"""Makes the packet of a number; None where the message cannot be used."""
 
 
 class Feed:
-    """One stream: the graph offers, pages watch and take, each in a thread of its own.
+    """The newest of one stream: the graph offers, pages watch and take, each in its own thread.
 
     Args:
         kind: the stream's name, which its packets bear.
-        on_watch: called with True when the first begins to watch and with False when the last has
-            left, in the thread of whoever does.
-        rate: Hz; a page is sent so many at most. None is each of them, in place of the newest of
-            several: of things that are told once.
+        on_watch: called with True when the first page begins to watch and with False when the last
+            has left, in the thread of that page.
+        rate: Hz, at most, for each page; None sends every packet, of things that are told once.
     """
 
     def __init__(
@@ -88,34 +84,29 @@ class Feed:
         rate: float | None = 30.0,
     ) -> None:
         self.kind, self.rate = kind, rate
+        self.sequence = 0  # the number of the newest; 0 before the first
         self._on_watch = on_watch
-        self._watchers: list[Notify] = []
+        self._watchers: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._packing = threading.Lock()
         self._pack: Pack | None = None
         self._packed: tuple[int, Packet | None] = (0, None)
-        self._sequence = 0
-
-    @property
-    def sequence(self) -> int:
-        """The number of the newest; 0 before the first."""
-        return self._sequence
 
     @property
     def is_watched(self) -> bool:
-        """Whether anybody watches."""
+        """Whether any page watches."""
         return bool(self._watchers)
 
-    def watch(self, notify: Notify) -> None:
-        """Have ``notify`` called, from any thread, whenever there is a newer one."""
+    def watch(self, notify: Callable[[], None]) -> None:
+        """Have ``notify`` called, from any thread, whenever there is a newer packet."""
         with self._lock:
             self._watchers.append(notify)
             first = len(self._watchers) == 1
         if first:
             self._on_watch(True)
 
-    def unwatch(self, notify: Notify) -> None:
-        """No longer."""
+    def unwatch(self, notify: Callable[[], None]) -> None:
+        """Stop the calls of ``notify``."""
         with self._lock:
             self._watchers.remove(notify)
             last = not self._watchers
@@ -123,24 +114,24 @@ class Feed:
             self._on_watch(False)
 
     def offer(self, pack: Pack) -> None:
-        """There is a newer one, which ``pack`` makes if anybody takes it."""
+        """Announce a newer packet, which ``pack`` makes if any page takes it."""
         with self._lock:
-            self._sequence += 1
+            self.sequence += 1
             self._pack = pack
             watchers = list(self._watchers)
         for notify in watchers:
             notify()
 
     def forget(self) -> None:
-        """What was offered holds no longer, as when the scene is another."""
+        """Drop the newest packet, as when another scene is loaded."""
         with self._lock:
             self._pack = None
 
     def newest(self) -> Packet | None:
-        """The newest packet, made once for all pages; None where there is none that can be used."""
+        """The newest packet, made once for all pages; None where there is none to be used."""
         with self._packing:
             with self._lock:
-                sequence, pack = self._sequence, self._pack
+                sequence, pack = self.sequence, self._pack
             if pack is None:
                 return None
             if self._packed[0] != sequence:
@@ -148,13 +139,37 @@ class Feed:
             return self._packed[1]
 
 
-_LONGEST = 65536
-"""Characters of a page's message."""
-_numbers = itertools.count(1)
+@dataclass
+class Simulator:
+    """The simulator as pages see it; filled by the node ``viewer``, or by a test."""
+
+    feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
+    commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
+    """By the key of a page's message: takes the value and the page's number, returns an error."""
+    nodes: ParameterBoard = field(default_factory=ParameterBoard)
+    status: StatusBoard = field(default_factory=StatusBoard)
+    session: SessionBoard = field(default_factory=SessionBoard)
+    leaving: list[Callable[[int], object]] = field(default_factory=list)
+    """Called with a page's number when it has gone."""
+
+    @property
+    def is_changing_by_itself(self) -> bool:
+        """Whether a page watches blood or a strip of time, which go on while the probe rests."""
+
+        def watched(kind: str) -> bool:
+            return kind in self.feeds and self.feeds[kind].is_watched
+
+        overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
+        colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
+        return colours or watched("m_mode") or watched("spectrum")
+
+    def add(self, *feeds: Feed) -> None:
+        """Let pages watch these."""
+        self.feeds |= {feed.kind: feed for feed in feeds}
 
 
 class PageStream:
-    """What one page watches, and what of it is due.
+    """The streams that one page watches, and the packets that are due.
 
     A page says what it watches and then, for each stream, when it has drawn what came: so the
     newest is sent as soon as the page is ready, and a slow page gets fewer, not older ones.
@@ -173,7 +188,7 @@ class PageStream:
         self._earliest: dict[str, float] = {}  # s, when the next may be sent
 
     def take(self, text: str) -> str | None:
-        """Do what the page says; what is wrong with it, for a person, or None."""
+        """Obey a page's message; an error for a person, or None."""
         try:
             message = json.loads(text) if len(text) <= _LONGEST else None
         except (ValueError, RecursionError):
@@ -212,13 +227,10 @@ class PageStream:
         self._wake()
 
     def due(self, now: float) -> tuple[list[bytes], float | None]:
-        """What is to be sent now, encoded.
+        """The encoded packets to be sent now, and s until one that waits may be; None without.
 
         Args:
-            now: s, of a clock that is never set back.
-
-        Returns:
-            It, and s until more may be due that is there already; None where nothing is.
+            now: s, of a monotonic clock.
         """
         packets, later = [], None
         for kind, feed in self._watched.items():
@@ -232,17 +244,8 @@ class PageStream:
             self._sent[kind] = feed.sequence if packet is None else packet.sequence
             if packet is not None:
                 self._ready.discard(kind)
-                self._earliest[kind] = self._next_time(kind, now)
+                if feed.rate:  # on the beat of the rate, and not sooner after a rest
+                    beat = self._earliest.get(kind, now) + 1.0 / feed.rate
+                    self._earliest[kind] = max(beat, now)
                 packets.append(packet.encoded)
         return packets, later
-
-    def _next_time(self, kind: str, now: float) -> float:
-        """When the next one may be sent: on the beat of the rate, and not sooner after a rest."""
-        rate = self._watched[kind].rate
-        if not rate:
-            return now
-        return max(self._earliest.get(kind, now) + 1.0 / rate, now)
-
-    def close(self) -> None:
-        """The page has gone."""
-        self.watch([])
