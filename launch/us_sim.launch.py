@@ -18,14 +18,11 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
-from us_sim.run.domain_lock import alone_on_domain
-from us_sim.run.graph import HUNG_STOP_S, INTERRUPTED, RECORDER, ending
-from us_sim.run.monitored import Monitored
-from us_sim.run.plan import plan_of
-from us_sim.run.request import Request
-from us_sim.run.restarts import Restarts, going_on
-from us_sim.run.supervision_settings import SupervisionSettings
-from us_sim.run.watch import Watch
+from us_sim.run.monitored import Monitored, alone_on_domain
+from us_sim.run.plan import RECORDER, Request, plan_of
+from us_sim.run.processes import HUNG_STOP_S, INTERRUPTED, ending
+from us_sim.run.supervision import going_on
+from us_sim.run.watch import Restarts, SupervisionSettings, Watch
 from us_sim.scene.reading import load_scene
 from us_sim.settings.setting import rules_of
 from us_sim.settings.viewer import ViewerSettings

@@ -11,7 +11,7 @@ import pytest
 from us_sim.command.main import main
 from us_sim.progress import Progress
 from us_sim.recording.writer import BagWriter
-from us_sim.run.graph import ProcessGroup
+from us_sim.run.processes import ProcessGroup
 from us_sim.run.supervision import say
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 
@@ -120,7 +120,9 @@ def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
     assert len(error) < 6_000
 
 
-@pytest.mark.parametrize("module", ["argparse", "us_sim.command.run", "us_sim.recording.reader"])
+@pytest.mark.parametrize(
+    "module", ["argparse", "us_sim.command.simulation", "us_sim.recording.reader"]
+)
 def test_ctrl_c_while_something_is_imported_is_one_sentence(module, tmp_path):
     """The signal comes at the import of a module, as early as the command has any."""
     program = (

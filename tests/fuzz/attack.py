@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np
 
 from tests.fuzz.good_input import good_input
-from us_sim.evaluation.latency.usage import usage_of
+from us_sim.evaluation.processes import usage_of
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.settings import NODES
 from us_sim.progress import Progress
-from us_sim.run.graph import NodeProcess, ProcessGroup, keep_on_this_host, simulation_nodes
+from us_sim.run.plan import NodeProcess, simulation_nodes
+from us_sim.run.processes import ProcessGroup, keep_on_this_host
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import kinds_of

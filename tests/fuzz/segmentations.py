@@ -9,8 +9,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from tests.fuzz.target import target
-from us_sim.volume.files.label_table import read_label_table
-from us_sim.volume.files.labels import read_labels
+from us_sim.volume.files.labels import read_label_table, read_labels
 from us_sim.volume.segmentation.settings import read_seeds
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.volume import Volume

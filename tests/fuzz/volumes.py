@@ -14,7 +14,7 @@ import SimpleITK as sitk
 
 from tests.fuzz.target import target
 from us_sim.recording.path import read_path
-from us_sim.volume.deidentification.header_names import other_names
+from us_sim.volume.deidentification.kept_values import other_names
 from us_sim.volume.files.readers import grey_voxels, open_image, read_volume
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.sequences.sweep import read_sweep

@@ -13,7 +13,8 @@ from many_restarts import nodes_of
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.run.graph import NodeProcess, ProcessGroup
+from us_sim.run.plan import NodeProcess
+from us_sim.run.processes import ProcessGroup
 
 IMAGES = "/ultrasound/image"
 ENDED = {
@@ -120,7 +121,7 @@ class Deaf(NodeProcess):
 
 
 def test_a_recorder_that_does_not_end_is_killed_and_that_is_told(monkeypatch):
-    monkeypatch.setattr("us_sim.run.graph.RECORDER_STOP_S", 0.2)
+    monkeypatch.setattr("us_sim.run.processes.RECORDER_STOP_S", 0.2)
     group = ProcessGroup()
     group.start([Deaf("session_recorder")])
     deadline = time.monotonic() + 30

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import NODES, checked_parameters, is_live, parameters_of
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.run.running_node import module_of
+from us_sim.run.plan import module_of
 from us_sim.scene.reading import load_scene
 from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of

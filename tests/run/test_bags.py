@@ -3,7 +3,7 @@
 import pytest
 
 from us_sim.recording.writer import BagWriter
-from us_sim.run.bags import bags_in_reach
+from us_sim.run.background import bags_in_reach
 
 
 @pytest.mark.parametrize("recordings", ["work/rec", "rec"])

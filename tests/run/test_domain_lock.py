@@ -7,13 +7,13 @@ import sys
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.run import domain_lock
-from us_sim.run.domain_lock import alone_on_domain
+from us_sim.run import monitored as domain_lock
+from us_sim.run.monitored import alone_on_domain
 
 BEGIN = """
 import sys
 from us_sim.errors import UsSimError
-from us_sim.run.domain_lock import alone_on_domain
+from us_sim.run.monitored import alone_on_domain
 print("here", flush=True)
 sys.stdin.readline()
 try:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from us_sim.run.following import _status
+from us_sim.run.live import _status
 from us_sim.run.plan import Plan
 
 

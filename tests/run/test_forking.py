@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from awaiting import until
 
-from us_sim.run.forking import ForkServer
-from us_sim.run.graph import NodeProcess, ProcessGroup
+from us_sim.run.fork_server import ForkServer
+from us_sim.run.plan import NodeProcess
+from us_sim.run.processes import ProcessGroup
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only")
 

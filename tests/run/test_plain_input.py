@@ -7,7 +7,8 @@ import threading
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.run.graph import NodeProcess, ProcessGroup
+from us_sim.run.plan import NodeProcess
+from us_sim.run.processes import ProcessGroup
 
 
 @pytest.mark.parametrize("value", ["\udcff.mcap", ["a", "\udcff"]])

@@ -5,7 +5,7 @@ import pytest
 
 from us_sim.errors import SceneError
 from us_sim.run.live import demo
-from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.watch import SupervisionSettings
 from us_sim.share import find_bag
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume

@@ -3,9 +3,9 @@
 import pytest
 
 from us_sim.errors import SettingsError
-from us_sim.run.graph import NodeProcess
-from us_sim.run.restarts import Restarts, going_on
-from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.plan import NodeProcess
+from us_sim.run.supervision import going_on
+from us_sim.run.watch import Restarts, SupervisionSettings
 
 
 def refusals(times, **settings):

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from us_sim.errors import SettingsError, UsSimError
-from us_sim.nodes.session_settings import SessionControlSettings
-from us_sim.run.plan import plan_of
-from us_sim.run.recordings import Recordings
-from us_sim.run.request import Request
+from us_sim.nodes.settings import SessionControlSettings
+from us_sim.run.losses import Recordings
+from us_sim.run.plan import Request, plan_of
 from us_sim.run.simulation import Simulation
 from us_sim.scene.reading import load_scene
 from us_sim.share import shared_path

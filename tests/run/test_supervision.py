@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.run.graph import INTERRUPTED, NodeProcess
-from us_sim.run.plan import Plan, goes_on, plan_of
-from us_sim.run.request import Request
+from us_sim.run.plan import NodeProcess, Plan, Request, goes_on, plan_of
+from us_sim.run.processes import INTERRUPTED
 from us_sim.run.supervision import Supervisor
-from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
 from us_sim.share import find_bag
 

@@ -6,7 +6,7 @@ import pytest
 
 from us_sim.errors import UsSimError
 from us_sim.run import live
-from us_sim.run.supervision_settings import SupervisionSettings
+from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
 

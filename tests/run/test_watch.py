@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from us_sim.run.process_state import ProcessState, process_state
+from us_sim.run.fork_server import ProcessState, process_state
 from us_sim.run.watch import Watch
 
 NODE, PID = "tissue_deformer", 7

@@ -14,8 +14,7 @@ from PIL import Image
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.transducer_mesh import transducer_mesh
 from us_sim.skin.surface import plane_surface
-from us_sim.slicing.probe.outline import image_outline
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import LinearProbe, image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.stream import Feed, Packet, Simulator
 from us_sim.viewer.surfaces import CarriedSurfaces, ColouredSurface, RestSurface, transducer_packet

@@ -39,15 +39,14 @@ def add_bag(commands: Any) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from us_sim.recording.reader import read_bag
-    from us_sim.recording.report import describe
+    from us_sim.recording.reader import describe, read_bag
 
     print(describe(read_bag(args.file)))
     return 0
 
 
 def _extract(args: argparse.Namespace) -> int:
-    from us_sim.recording.attached import extract
+    from us_sim.recording.repair import extract
 
     for file in extract(args.file, args.out):
         print(file)

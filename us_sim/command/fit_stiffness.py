@@ -8,8 +8,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from us_sim.command.scene_options import scene_name
-from us_sim.command.setting_options import add_setting_options, read_settings
+from us_sim.command.options import add_setting_options, read_settings, scene_name
 from us_sim.errors import BagError, SceneError, StiffnessError
 from us_sim.share import full_path
 from us_sim.tissue.identification.settings import StiffnessSettings
@@ -96,8 +95,8 @@ def _write_into_case(
     scene: Scene, session: Path, found: StiffnessFit, settings: StiffnessSettings
 ) -> None:
     """The fitted moduli, with how they were found."""
-    from us_sim.volume.cases.moduli import write_moduli_into
     from us_sim.volume.cases.provenance import Source, Step
+    from us_sim.volume.cases.writing import write_moduli_into
 
     assert scene.volume.case is not None
     fitted = {

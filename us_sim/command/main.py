@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO, cast
 from us_sim.errors import UsSimError, memory_limit, printable
 
 if TYPE_CHECKING:
-    from us_sim.command.chosen_parser import ChosenParser
+    from us_sim.command.options import ChosenParser
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -85,22 +85,12 @@ def _parser() -> ChosenParser:
     """All commands; imported here, where an interruption is one sentence already."""
     from us_sim import __version__
     from us_sim.command.bag import add_bag
-    from us_sim.command.calibrate import add_calibrate
-    from us_sim.command.cases import add_cases
-    from us_sim.command.chosen_parser import ChosenParser
-    from us_sim.command.compile import add_compile
-    from us_sim.command.demo import add_demo
-    from us_sim.command.evaluate import add_evaluate
     from us_sim.command.fit_stiffness import add_fit_stiffness
-    from us_sim.command.import_files import add_import
-    from us_sim.command.play import add_play
-    from us_sim.command.print_marker import add_print_marker
-    from us_sim.command.reconstruct import add_reconstruct
+    from us_sim.command.measuring import add_calibrate, add_compile, add_evaluate, add_print_marker
+    from us_sim.command.options import ChosenParser
     from us_sim.command.reference import add_reference
-    from us_sim.command.render import add_render
-    from us_sim.command.run import add_run
-    from us_sim.command.segment import add_segment
-    from us_sim.command.view import add_view
+    from us_sim.command.simulation import add_demo, add_play, add_render, add_run, add_view
+    from us_sim.command.volumes import add_cases, add_import, add_reconstruct, add_segment
 
     parser = ChosenParser(
         prog="us-sim", description="Interactive simulation of compression ultrasonography."

@@ -157,7 +157,7 @@ def _nodes() -> Iterator[Section]:
     """The parameters of each node."""
     from us_sim.nodes.settings import NODES, SceneNodeSettings
     from us_sim.skin.settings import MembraneSettings
-    from us_sim.slicing.formation.imaging import Imaging
+    from us_sim.slicing.settings import Imaging
 
     common = "Every node that works on a scene"
     yield Section("scene_nodes", common, _parameters(SceneNodeSettings))

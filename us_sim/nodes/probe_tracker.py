@@ -38,7 +38,7 @@ from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import TrackerInput
 from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
-from us_sim.slicing.probe.outline import image_outline
+from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 

@@ -22,8 +22,8 @@ from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED, overridable
 from us_sim.volume.files.writing import write_volume
-from us_sim.volume.reconstruction.live import LiveReconstruction
-from us_sim.volume.reconstruction.live_settings import LiveBox, LiveVolume
+from us_sim.volume.reconstruction.reconstruction import LiveReconstruction
+from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 SECONDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Images that wait while the volume is saved."""

@@ -20,7 +20,7 @@ from pathlib import Path
 import yaml
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile, qos_from_yaml
+from us_sim.recording.topic import QosProfile, qos_from_yaml
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
 _NEWEST_VERSION = 9

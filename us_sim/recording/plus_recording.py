@@ -40,11 +40,16 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
-from us_sim.volume.sequences.frame_transforms import FrameTransforms, along
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, read_slicer_sequences
-from us_sim.volume.sequences.transform_chain import TransformChain, shortest_chain
-from us_sim.volume.sequences.transform_name import is_image_frame, split_transform_name
+from us_sim.volume.sequences.transforms import (
+    FrameTransforms,
+    TransformChain,
+    along,
+    is_image_frame,
+    shortest_chain,
+    split_transform_name,
+)
 
 _RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
 

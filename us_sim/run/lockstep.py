@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,23 +13,45 @@ from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
-from us_sim.run.graph import (
+from us_sim.run.live import prepare_volume
+from us_sim.run.monitored import refuse_unknown
+from us_sim.run.plan import (
     NodeProcess,
     Parameters,
-    keep_on_this_host,
+    module_of,
     parameters_file,
     player_settings,
     recorder_of,
+    require_texts,
     scene_settings,
     simulation_nodes,
 )
-from us_sim.run.in_process import node_in_process
-from us_sim.run.live import prepare_volume
-from us_sim.run.monitored import refuse_unknown
+from us_sim.run.processes import keep_on_this_host
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
+
+
+def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -> Any:
+    """The node called ``name`` in an initialised context, with parameters by name.
+
+    Raises:
+        UsSimError: a parameter is refused, or what the node itself refuses.
+    """
+    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
+    from rclpy.exceptions import ParameterException
+    from rclpy.parameter import Parameter
+
+    require_texts(parameters)
+    kind = "".join(word.capitalize() for word in name.split("_"))
+    make = getattr(importlib.import_module(module_of(name)), kind)
+    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
+    try:
+        return make(context=context, parameter_overrides=overrides)
+    except ParameterException as error:
+        raise UsSimError(" ".join(str(error).split())) from error
+
 
 QUIET_S = 0.25
 """Silence after which everything that was sent has been taken."""

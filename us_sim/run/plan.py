@@ -1,41 +1,130 @@
-"""What a live run starts: the processes of a scene, and what is played to them."""
+"""The processes of a run: the nodes of a scene with their parameters, a recorder, a player, a page.
+
+A `Request` says what a person wants; `plan_of` makes a `Plan` of processes from it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+import json
+import os
+import secrets
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from us_sim.nodes.settings import checked_parameters
-from us_sim.run.graph import (
-    RECORDER,
-    VIEWER,
-    NodeProcess,
-    parameters_file,
-    player_settings,
-    recorder_of,
-    scene_settings,
-    simulation_nodes,
-    video_settings,
-    viewer_process,
-)
-from us_sim.run.request import Request
+import yaml
+
+from us_sim.errors import UsSimError
+from us_sim.nodes.settings import SessionRecorderSettings, checked_parameters
 from us_sim.scene.building import path_of
+from us_sim.scene.scene import Scene
+from us_sim.settings.setting import rules_of
+from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.share import full_path
 from us_sim.viewer.server import require_free
 
+if TYPE_CHECKING:
+    from us_sim.demo.camera_video import PathVideo
+
+RECORDER, VIEWER = "session_recorder", "viewer"
 PLAYERS = ("path_player", "session_player")
-_WHAT_COUNTS = {
-    RECORDER: ("file",),
-    "path_player": ("path", "topic"),
-    "session_player": ("path",),
-}
-"""Parameters of which a change takes another process; of other nodes it is every parameter."""
-_NOT_PLAYED = ("/diagnostics", "/session/scenes", "/session/thumbnails", "/session/bags")
-"""Topics of a recording on which those publish that are there while it is played."""
+Parameters = dict[str, dict[str, str]]
+"""Parameters given by a person: YAML texts by node and name."""
+
+
+def module_of(node: str) -> str:
+    """The module that runs a node."""
+    return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """One node and its parameters.
+
+    Raises:
+        UsSimError: a parameter is no UTF-8, as a file's name may be.
+    """
+
+    node: str
+    parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
+    given: dict[str, object] = field(default_factory=dict)  # by a person; take precedence
+    secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
+    kept: dict[str, object] = field(default_factory=dict)  # set while it ran; take precedence
+
+    def __post_init__(self) -> None:
+        require_texts(self.all_parameters)
+
+    def command(self) -> list[str]:
+        """The command line that runs it, in ROS 2 and without."""
+        return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
+
+    def arguments(self) -> list[str]:
+        """ROS arguments that set its parameters."""
+        arguments = ["--ros-args"]
+        for name, value in self.all_parameters.items():
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]
+        return arguments
+
+    @property
+    def all_parameters(self) -> dict[str, object]:
+        """Parameters by name, those set last in place of the others."""
+        return self.parameters | self.given | self.kept
+
+
+def require_texts(parameters: Mapping[str, object]) -> None:
+    """Raise UsSimError for a text that is no UTF-8, as a file's name may be.
+
+    >>> require_texts({"file": "Übung 1.mcap", "loop": True, "topics": ["a", "b"]})
+    """
+    for name, value in parameters.items():
+        for each in value if isinstance(value, list | tuple) else [value]:
+            try:
+                str(each).encode()
+            except UnicodeEncodeError:
+                raise UsSimError(
+                    f"{name}: {each!r} is no text in UTF-8, which a parameter of a ROS node must "
+                    f"be: rename the file, or use a locale with UTF-8"
+                ) from None
+
+
+@dataclass(frozen=True)
+class Request:
+    """A scene to run, and what is recorded, played and shown."""
+
+    scene: Scene
+    parameters: Parameters = field(default_factory=dict)  # given by a person, by node
+    record: Path | None = None  # MCAP file to record to
+    path: Path | None = None  # bag to play to the tracker
+    topic: str | None = None  # of the body in it whose poses are played
+    everything: bool = False  # the bag's topics are published in place of the scene's nodes
+    playing: Mapping[str, object] = field(default_factory=dict)  # parameters of the player
+    video: PathVideo | None = None  # to show the scene's camera in place of a path
+    view: ViewerSettings | None = None  # address of the page that shows it; None is no page
+    by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
+    duration: float | None = None  # s, after which all ends
+    kept: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # set as nodes ran
+    is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
+
+    def with_scene(self, scene: Scene) -> Request:
+        """Another scene, in which nothing is recorded or played yet.
+
+        Parameters of the scene's nodes were given for the scene before.
+        """
+        of_any_scene = (VIEWER, RECORDER, "path_player")
+        kept = {node: given for node, given in self.parameters.items() if node in of_any_scene}
+        return replace(self.without_replay(), scene=scene, parameters=kept, record=None)
+
+    def without_replay(self) -> Request:
+        """The same with nothing played."""
+        return replace(self, path=None, topic=None, everything=False, playing={}, is_changed=True)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a live run starts."""
+    """The processes of a live run, and how long it lasts."""
 
     processes: list[NodeProcess]
     poses: int | None = None  # or images, in the path or video that is played to its end
@@ -49,7 +138,7 @@ class Plan:
         return [process.node for process in self.processes]
 
     def with_free_port(self) -> Plan:
-        """The same plan, whose page can be served: seen before anything is made for it.
+        """The same plan, checked before anything is made for it.
 
         Raises:
             UsSimError: the page's address or port cannot be listened at.
@@ -62,18 +151,22 @@ class Plan:
 
 
 def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
-    """Whether a process that runs can stay when another plan wants its node."""
-    if wanted is None or running.node not in _WHAT_COUNTS:
+    """Whether a process can stay when another plan wants its node.
+
+    Those that record and play follow most parameters while they run.
+    """
+    decisive = {RECORDER: ("file",), "path_player": ("path", "topic"), "session_player": ("path",)}
+    if wanted is None or running.node not in decisive:
         return running == wanted
     before, after = running.all_parameters, wanted.all_parameters
-    return all(before.get(name) == after.get(name) for name in _WHAT_COUNTS[running.node])
+    return all(before.get(name) == after.get(name) for name in decisive[running.node])
 
 
 def plan_of(request: Request) -> Plan:
-    """What is started to run a scene.
+    """The processes that run a scene as requested.
 
     Raises:
-        UsSimError: a parameter will not do, or what is to be played cannot be.
+        UsSimError: a parameter will not do, or the file to be played cannot be.
     """
     scene, parameters = request.scene, dict(request.parameters)
 
@@ -85,23 +178,26 @@ def plan_of(request: Request) -> Plan:
         processes.append(viewer_process(request.view, taken(VIEWER)))
     recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
     player = taken("path_player") if request.path is not None or request.is_changed else {}
+    played = "" if request.path is None else str(full_path(request.path))
+    settings: dict[str, object]
     if request.path is not None and request.everything:
-        settings: dict[str, object] = {"path": _absolute(request), "exclude": list(_NOT_PLAYED)}
-        processes.append(NodeProcess("session_player", settings | dict(request.playing)))
+        running = ["/diagnostics", "/session/scenes", "/session/thumbnails", "/session/bags"]
+        settings = {"path": played, "exclude": running, **request.playing}
+        processes.append(NodeProcess("session_player", settings))
         return Plan(processes, duration=request.duration, player="session_player")
     if request.record is not None:
-        settings = {"file": str(full_path(request.record))}
-        settings |= scene_settings(scene)
+        settings = {"file": str(full_path(request.record)), **scene_settings(scene)}
         if request.path is not None:
-            settings["path"] = _absolute(request)
+            settings["path"] = played
         if request.video is not None:
             settings["exclude"] = ["/camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
-    played = request.by_hand or request.path is not None
     processes += [
         replace(process, kept=dict(request.kept.get(process.node, {})))
-        for process in simulation_nodes(scene, parameters, played=played)
+        for process in simulation_nodes(
+            scene, parameters, played=request.by_hand or request.path is not None
+        )
     ]
     for process in processes:
         if process.node == RECORDER:
@@ -109,7 +205,11 @@ def plan_of(request: Request) -> Plan:
     awaited = recorder_of(processes)
     if request.video is not None:
         video = request.video
-        settings = video_settings(scene, video.file, video.camera_info, awaited)
+        settings = {
+            "source": str(video.file),
+            "camera_info": str(video.camera_info),
+            **_awaited(["camera/camera_info", *scene.ready_topics], awaited),
+        }
         processes.append(NodeProcess("camera_driver", settings, driver))
         loops = bool(driver.get("loop"))
         return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
@@ -118,12 +218,94 @@ def plan_of(request: Request) -> Plan:
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
     settings = player_settings(scene, request.path, awaited, path.topic) | dict(request.playing)
     processes.append(NodeProcess("path_player", settings, player))
-    ends = not settings.get("stay")
+    poses = None if settings.get("stay") else len(path)
     loops = bool(processes[-1].all_parameters.get("loop"))
-    return Plan(
-        processes, len(path) if ends else None, request.duration, loops=loops, topic=path.topic
-    )
+    return Plan(processes, poses, request.duration, loops=loops, topic=path.topic)
 
 
-def _absolute(request: Request) -> str:
-    return str(full_path(request.path)) if request.path is not None else ""
+def simulation_nodes(
+    scene: Scene, parameters: Parameters | None = None, *, played: bool = False
+) -> list[NodeProcess]:
+    """The nodes that ``scene`` needs.
+
+    Args:
+        scene: what they work on.
+        parameters: extra ones by node, as YAML texts.
+        played: a path is played on ``tracker/pose``, whatever the scene's tracker is.
+
+    Raises:
+        UsSimError: a parameter is for a node that this scene does not run.
+    """
+    given = dict(parameters or {})
+    common = scene_settings(scene)
+    nodes = [
+        NodeProcess(
+            part.node,
+            common | ({"source": "pose"} if played and part.node == "probe_tracker" else {}),
+            checked_parameters(part.node, scene, given.pop(part.node, {})),
+        )
+        for part in scene.parts()
+        if part.needed
+    ]
+    if given:
+        raise UsSimError(
+            f"--param {next(iter(given))}: this scene does not run such a node; it runs "
+            f"{', '.join(process.node for process in nodes)}"
+        )
+    return nodes
+
+
+def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
+    """The process that shows the simulation in browsers, at an address that it says itself."""
+    settings: dict[str, object] = {"host": view.host, "port": view.port}
+    if view.recordings:
+        settings["recordings"] = view.recordings
+    return NodeProcess(VIEWER, settings, given or {}, secrets={TOKEN: _viewer_token()})
+
+
+@functools.cache
+def _viewer_token() -> str:
+    """One for as long as this program runs, so that pages find a viewer that was started again."""
+    return os.environ.get(TOKEN) or secrets.token_urlsafe(16)
+
+
+def scene_settings(scene: Scene) -> dict[str, object]:
+    """The parameters that tell a node the scene."""
+    settings: dict[str, object] = {"scene": scene.origin}
+    if scene.volume.file:
+        settings["volume"] = scene.volume.file
+    return settings
+
+
+def parameters_file(processes: Sequence[NodeProcess]) -> str:
+    """The parameters of nodes as ROS reads them with ``--params-file``."""
+    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
+    text: str = yaml.safe_dump(document, sort_keys=False)
+    return text
+
+
+def player_settings(
+    scene: Scene, path: Path, recorder: SessionRecorderSettings | None, topic: str = ""
+) -> dict[str, object]:
+    """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
+    return {
+        "path": str(full_path(path)),
+        "topic": topic,
+        **_awaited(["tracker/pose", *scene.ready_topics], recorder),
+    }
+
+
+def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
+    """Parameters that have a player wait for these topics, and for a recorder to record them."""
+    recorded = [topic for topic in topics if recorder and recorder.records(f"/{topic}")]
+    return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
+
+
+def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
+    """The settings of the recorder among them."""
+    for process in processes:
+        if process.node == RECORDER:
+            known = rules_of(SessionRecorderSettings).keys() & process.all_parameters
+            values: Any = {name: process.all_parameters[name] for name in known}
+            return SessionRecorderSettings(**values)
+    return None

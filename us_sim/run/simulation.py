@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
-from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.nodes.settings import SessionControlSettings
 from us_sim.recording.reader import read_bag
-from us_sim.run.background import Background
-from us_sim.run.bags import bags_in_reach
-from us_sim.run.graph import RECORDER, VIEWER
+from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import PLAYERS, Plan, plan_of
-from us_sim.run.request import Request
+from us_sim.run.plan import PLAYERS, RECORDER, VIEWER, Plan, Request, plan_of
 from us_sim.run.supervision import Kept, Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene

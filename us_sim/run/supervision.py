@@ -10,22 +10,11 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from us_sim.errors import printable
-from us_sim.run.graph import (
-    INTERRUPTED,
-    RECORDER,
-    VIEWER,
-    NodeProcess,
-    ProcessGroup,
-    ending,
-    recorder_of,
-)
-from us_sim.run.losses import Loss, Outcome, images_in
+from us_sim.run.losses import Loss, Outcome, Recordings, images_in
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import PLAYERS, Plan, goes_on
-from us_sim.run.recordings import Recordings
-from us_sim.run.restarts import Restarts, going_on
-from us_sim.run.supervision_settings import SupervisionSettings
-from us_sim.run.watch import START_LIMIT_S, Watch
+from us_sim.run.plan import PLAYERS, RECORDER, VIEWER, NodeProcess, Plan, goes_on, recorder_of
+from us_sim.run.processes import INTERRUPTED, ProcessGroup, ending
+from us_sim.run.watch import START_LIMIT_S, Restarts, SupervisionSettings, Watch
 
 SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
 """Nodes that take long to start, and hold no device that a second process could not have."""
@@ -290,3 +279,27 @@ class Supervisor:
 def say(sentence: str) -> None:
     """To the person, above the bar."""
     tqdm.write(f"us-sim: {printable(sentence)}", file=sys.stderr)
+
+
+def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
+    """The process that goes on in place of one that has ended.
+
+    A recorder goes on in a further file, and a viewer at the port where pages look for it. What
+    plays a path or a video goes on where that would be by now, as a tracker's motion would: what it
+    did not send meanwhile is missing.
+
+    Args:
+        process: as it was started at first.
+        report: the last that it gave.
+    """
+    if process.node == RECORDER:
+        more: dict[str, object] = {"if_exists": "further"}
+    elif process.node == VIEWER:
+        port = report.get("port", "")
+        more = {"port": int(port)} if port.isdecimal() and len(port) < 6 else {}
+    else:
+        try:
+            more = {"begun": float(report["begun"])}
+        except (KeyError, ValueError):  # it does not play, or what it said is no number
+            return process
+    return replace(process, given=process.given | more)

@@ -1,4 +1,4 @@
-"""Which nodes have stopped reporting, told apart from those that work or wait for a processor.
+"""Supervision of node processes: which hang, and how often one is started again.
 
 >>> from us_sim.run.watch import Watch
 >>> times = iter(range(100))
@@ -12,10 +12,38 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from us_sim.run.process_state import ProcessState, process_state
+from us_sim.run.fork_server import ProcessState, process_state
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+
+@dataclass(frozen=True)
+class SupervisionSettings(Settings):
+    """What is done for a node that has ended or hangs."""
+
+    restarts: int = setting(
+        Quantity("number", 0, 1_000_000),
+        "start a node that ended or hangs again, at most so often",
+        default=10,
+    )
+    restarts_per_minute: int = setting(
+        Quantity("number", 1, 1_000_000), "and at most so often in a minute", default=3
+    )
+    silence: float = setting(
+        Quantity("time", 2.0, 3600.0),
+        "without a report after which a node hangs; six times as long while it works",
+        default=10.0,
+    )
+    standby: bool = setting(
+        description="keep a second process of each node that takes long to start, which takes over "
+        "at once; needs twice the memory",
+        default=False,
+    )
+
 
 STEP_S = 0.5
 """A longer time between two looks counts as this much: the machine slept, or had no time for us,
@@ -108,3 +136,40 @@ class Watch:
         if silence.silent < limit:
             return ""
         return f"has not reported for {silence.silent:.0f} s"
+
+
+MINUTE_S = 60.0
+
+
+class Restarts:
+    """Counts the restarts of each node.
+
+    Args:
+        settings: how many there may be.
+        clock: s, never set back.
+    """
+
+    def __init__(
+        self, settings: SupervisionSettings, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._settings, self._clock = settings, clock
+        self._times: dict[str, deque[float]] = {}
+        self._counts: dict[str, int] = {}
+
+    def refused(self, node: str) -> str:
+        """Why the node is not started again, for a person; empty, and counted, when it is."""
+        now, settings = self._clock(), self._settings
+        times = self._times.setdefault(node, deque())
+        while times and now - times[0] > MINUTE_S:
+            times.popleft()
+        if self._counts.get(node, 0) >= settings.restarts:
+            return f"is not started again after {_times(settings.restarts)}"
+        if len(times) >= settings.restarts_per_minute:
+            return f"is not started again after {_times(len(times))} within a minute"
+        times.append(now)
+        self._counts[node] = self._counts.get(node, 0) + 1
+        return ""
+
+
+def _times(count: int) -> str:
+    return f"{count} restart{'' if count == 1 else 's'}"

@@ -48,7 +48,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
 from us_sim.tracking.measurement import PATIENT
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider

@@ -110,7 +110,7 @@ def _path(settings: CaseSettings) -> str:
     if press is None:
         depth = settings.probe.array.settings(PROBES).depth
         press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
-    from us_sim.recording.pressing_path import pressing_path
+    from us_sim.recording.press_and_slide import pressing_path
 
     return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
 

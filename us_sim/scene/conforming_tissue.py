@@ -24,8 +24,7 @@ from us_sim.tissue.mesh.conforming import EdgeLengths, conforming_mesh, require_
 from us_sim.tissue.mesh.interface_volume import with_inside_volume
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.decimation import coarsened
-from us_sim.volume.surfaces.structure_surface import structure_surface
+from us_sim.volume.surfaces.structure_surface import coarsened, structure_surface
 from us_sim.volume.volume import Volume
 
 _logger = logging.getLogger(__name__)

@@ -49,7 +49,7 @@ class ListedScene:
 
 def listed_scenes() -> Iterator[ListedScene]:
     """Installed scenes, then the cases of `case_roots`; each name once."""
-    from us_sim.volume.cases.roots import case_roots, cases_in
+    from us_sim.volume.cases.case import case_roots, cases_in
 
     files: dict[str, Path] = {}
     for root in shared_roots():
@@ -93,8 +93,7 @@ def _origin(name: str) -> str:
 
 
 def _listed_case(folder: Path) -> ListedScene:
-    from us_sim.volume.cases.case import read_case
-    from us_sim.volume.cases.listing import listed
+    from us_sim.volume.cases.case import listed, read_case
 
     origin, case = f"{CASE_PREFIX}{folder}", listed(folder)
     if case.problem:

@@ -228,7 +228,7 @@ def _with_named_structures(document: object, origin: str) -> object:
 
 def _find_case(name: str, folders: Sequence[Path] = ()) -> Path:
     """As `find_case`, imported only where a scene names a case: it brings kinds of tissue along."""
-    from us_sim.volume.cases.roots import find_case
+    from us_sim.volume.cases.case import find_case
 
     return find_case(name, folders)
 

@@ -20,12 +20,14 @@ from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
 from us_sim.slicing.acoustics.settings import Acoustics
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.flow.settings import FlowSettings
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.m_mode_settings import MModeSettings
-from us_sim.slicing.strain.settings import Strain
+from us_sim.slicing.settings import (
+    ColourSettings,
+    FlowSettings,
+    Imaging,
+    MModeSettings,
+    SpectrumSettings,
+    Strain,
+)
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.settings import MeshSettings
 from us_sim.tracking.settings import GateSettings

@@ -65,6 +65,10 @@ from us_sim.settings.setting import Settings, setting
 
 BOARDS_OF_MARKERS = ("charuco", "grid")
 """Kinds of flat boards that carry markers."""
+BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
+"""The kinds of boards for calibrating a camera."""
+BOARD_LENGTH = Quantity("length", 0.0, 10.0)
+"""Sides and distances on a board; 0 where the board has none such."""
 
 
 DICTIONARIES = (

@@ -1,12 +1,4 @@
-"""Sizes of labelled structures in an image, as a sonographer would trace them.
-
->>> import numpy as np
->>> from us_sim.volume.measure import label_area
->>> image = np.zeros((50, 40), np.uint8)
->>> image[10:20, 5:25] = 6
->>> round(label_area(image, label=6, pixel_area=0.1e-3 * 0.1e-3) * 1e6, 3)  # mm²
-2.0
-"""
+"""Sizes of labelled structures in an image, as a sonographer would trace them."""
 
 from __future__ import annotations
 

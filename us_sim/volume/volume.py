@@ -1,15 +1,11 @@
 """A volume of grey values placed in frame ``patient``, with labels when it has been segmented.
 
->>> import numpy as np
->>> from us_sim.volume.volume import Volume
->>> placed = np.diag([0.5e-3, 0.5e-3, 1e-3, 1.0])
->>> volume = Volume(np.zeros((40, 20, 30), np.uint8), placed, labels=None, label_names={})
->>> volume.patient_to_index @ [0.01, 0.005, 0.002, 1.0]
-array([20., 10.,  2.,  1.])
+What each voxel of a volume is: numbers, with the names and colours of the structures.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,3 +115,43 @@ def _affine(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         )
     matrix.flags.writeable = False
     return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class LabelMap:
+    """Labels on the grid of some volume; 0 is in no structure.
+
+    Raises:
+        VolumeError: a label of the voxels has no name, or two have the same.
+    """
+
+    labels: NDArray[np.uint8]  # (i, j, k)
+    names: Mapping[int, str]
+    colours: Mapping[int, Colour] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    """What a person should know of how they came about, a sentence each."""
+
+    def __post_init__(self) -> None:
+        names = dict(self.names)
+        for label in np.flatnonzero(self._counts):
+            if label and int(label) not in names:
+                raise VolumeError(f"label {label} has no name: name it")
+        if len(set(names.values())) < len(names):
+            raise VolumeError(f"two structures have the same name, of {', '.join(names.values())}")
+        colours = {n: self.colours.get(n) or anatomical_colour(name) for n, name in names.items()}
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "colours", colours)
+
+    @cached_property
+    def voxels(self) -> dict[str, int]:
+        """The number of voxels of each structure, by name."""
+        return {name: int(self._counts[label]) for label, name in self.names.items()}
+
+    @cached_property
+    def _counts(self) -> NDArray[np.int64]:
+        # A slice at a time, since bincount would make 64-bit numbers of all voxels at once.
+        return np.sum([np.bincount(one.ravel(), minlength=256) for one in self.labels], axis=0)
+
+    def on(self, volume: Volume) -> Volume:
+        """A volume of the same grid with these labels."""
+        return dataclasses.replace(volume, labels=self.labels, label_names=self.names)

@@ -10,7 +10,7 @@ from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangle_parts import part_size
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.penetration import only_forward, push_out, wrench_on_probe
+from us_sim.tissue.contact.probe_gap import only_forward, push_out, wrench_on_probe
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material

@@ -16,7 +16,7 @@ from us_sim.evaluation.independent_residual import IndependentResidual
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import only_forward
+from us_sim.tissue.contact.probe_gap import only_forward
 from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material

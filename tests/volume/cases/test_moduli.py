@@ -4,8 +4,8 @@ import pytest
 
 from us_sim.errors import CaseError, MaterialError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.cases.moduli import write_moduli_into
 from us_sim.volume.cases.provenance import Step
+from us_sim.volume.cases.writing import write_moduli_into
 
 STEP = Step("fitted stiffness to a press", {"confidence": 0.95}, {"poses": 48})
 

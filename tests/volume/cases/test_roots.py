@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from us_sim.errors import CaseError
-from us_sim.volume.cases.roots import case_roots, cases_in, find_case
+from us_sim.volume.cases.case import case_roots, cases_in, find_case
 
 
 @pytest.fixture

@@ -363,7 +363,7 @@ def test_every_name_on_the_positive_list_is_the_standards():
 MEASURED = """
 import resource, sys
 from pathlib import Path
-import us_sim.volume.cases.writing, us_sim.volume.deidentification.dicom_source
+import us_sim.volume.cases.writing, us_sim.volume.deidentification.source
 from us_sim.volume.deidentification.importing import import_files
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 import_files([sys.argv[1]], Path(sys.argv[2]))

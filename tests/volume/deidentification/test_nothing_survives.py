@@ -17,7 +17,7 @@ from us_sim.volume.deidentification.importing import look_at
 from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS
 from us_sim.volume.deidentification.report import report_text
 from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.files.dicom import decoder, grey
+from us_sim.volume.files.dicom import decoder, pixels
 
 BUNDLED = Path(pydicom.__path__[0]) / "data" / "test_files"
 WHOLE = ImportSettings(keep_whole_image=True)
@@ -123,7 +123,7 @@ def all_bundled():
 
 
 def test_of_every_file_that_comes_with_pydicom(tmp_path, own_words, monkeypatch):
-    monkeypatch.setattr(grey, "decoded_frames", decoded_here)
+    monkeypatch.setattr(pixels, "decoded_frames", decoded_here)
     endings = ("o.igs.mha", "o.mha")
     imported, refused, sentences, left = 0, 0, [], []
     for number, path in enumerate(all_bundled()):
@@ -151,7 +151,7 @@ def test_of_every_real_ultrasound_file(
     folder = shared_data / "dicom-us-2d"
     if not folder.is_dir():
         pytest.skip(f"no {folder}")
-    monkeypatch.setattr(grey, "decoded_frames", decoded_here)
+    monkeypatch.setattr(pixels, "decoded_frames", decoded_here)
     path = sorted(folder.glob("*.dcm"))[number]
     out = tmp_path / "out"
     out.mkdir()

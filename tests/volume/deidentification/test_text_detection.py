@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.volume.deidentification.text_detection import find_text
-from us_sim.volume.files.dicom.grey import GreyImages
 from us_sim.volume.files.dicom.header import open_dicom
+from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import read_sweep
 

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from us_sim.errors import VolumeError
 from us_sim.volume.cases.settings import RESERVED
-from us_sim.volume.files.label_grid import on_grid
-from us_sim.volume.files.labels import read_labels
+from us_sim.volume.files.labels import on_grid, read_labels
 from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.writing import write_labels
-from us_sim.volume.structure_terms import is_anatomical, problem_with
+from us_sim.volume.structure_names import is_anatomical, problem_with
 from us_sim.volume.volume import Volume
 
 SHAPE = (8, 7, 6)

@@ -10,7 +10,7 @@ import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files import stored_voxels
+from us_sim.volume.files import stored_image
 from us_sim.volume.files.readers import grey_voxels, open_image, read_placement, read_volume
 
 SHAPE = (4, 5, 6)
@@ -268,7 +268,7 @@ def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
 
 
 def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored_voxels, "free_memory", lambda: 200.0)
+    monkeypatch.setattr(stored_image, "free_memory", lambda: 200.0)
     with pytest.raises(VolumeError, match=r"take 0\.0 GB of memory where 0\.0 GB are free"):
         read_volume(_metaimage(tmp_path / "a.mha"))
 

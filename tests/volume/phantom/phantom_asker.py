@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from us_sim.volume.phantom.phantom import upper_arm
-from us_sim.volume.phantom.phantom_cache import kept_volume
+from us_sim.volume.phantom.phantom import kept_volume, upper_arm
 from us_sim.volume.volume import Volume
 
 

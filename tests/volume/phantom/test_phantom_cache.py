@@ -10,8 +10,7 @@ import pytest
 from phantom_asker import ask
 
 from us_sim.errors import VolumeError
-from us_sim.volume.phantom.phantom import cached_phantom, upper_arm
-from us_sim.volume.phantom.phantom_cache import cache_folder, kept_volume
+from us_sim.volume.phantom.phantom import cache_folder, cached_phantom, kept_volume, upper_arm
 from us_sim.volume.volume import Volume
 
 COARSE = 2e-3

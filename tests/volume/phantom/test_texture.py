@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from us_sim.volume.phantom.texture import SmoothNoise, sheets
-from us_sim.volume.phantom.tube import Tube
+from us_sim.volume.phantom.upper_arm import SmoothNoise, Tube, sheets
 
 BLOCK = np.array([[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]])
 

@@ -11,15 +11,11 @@ from sweep_file import write_sweep
 from us_sim.errors import VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.volume.reconstruction import grid as grids
-from us_sim.volume.reconstruction.grid import axes_of_smallest_box, grid_around
-from us_sim.volume.reconstruction.hole_filling import fill_holes
-from us_sim.volume.reconstruction.image_mask import image_mask
-from us_sim.volume.reconstruction.insertion import Insertion
-from us_sim.volume.reconstruction.leave_one_out import leave_one_out
-from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
+from us_sim.volume.reconstruction.grid import axes_of_smallest_box, grid_around, image_mask
+from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
+from us_sim.volume.reconstruction.reconstruction import leave_one_out, plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import read_sweep
-from us_sim.volume.sequences.time_shift import shifted
+from us_sim.volume.sequences.sweep import read_sweep, shifted
 
 PIXEL = 0.5e-3  # m
 ROWS, COLUMNS, FRAMES = 40, 30, 25

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from sweep_file import write_sweep
 
 from us_sim.volume.reconstruction.calibration_file import read_calibration
-from us_sim.volume.reconstruction.image_mask import image_mask
-from us_sim.volume.reconstruction.scanned_part import Fan, Rectangle, fitted_part
-from us_sim.volume.reconstruction.scanning_probe import scanning_probe
+from us_sim.volume.reconstruction.grid import image_mask
+from us_sim.volume.reconstruction.scanning_probe import Fan, Rectangle, fitted_part, scanning_probe
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of

@@ -8,10 +8,9 @@ import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sequences.frame_transforms import in_metres
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of
-from us_sim.volume.sequences.transform_name import split_transform_name
+from us_sim.volume.sequences.transforms import in_metres, split_transform_name
 
 GREY = np.random.Generator(np.random.PCG64(5)).integers(0, 256, (3, 4, 5), dtype=np.uint8)
 POSES = [f"0.2 0 0 {k} 0 0 -0.2 0 0 0.2 0 30 0 0 0 1" for k in range(3)]

@@ -7,10 +7,13 @@ import pytest
 
 from us_sim.errors import VolumeError
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.decimation import decimated, surface_distance
 from us_sim.volume.surfaces.settings import SurfaceSettings
-from us_sim.volume.surfaces.structure_surface import structure_surface
-from us_sim.volume.surfaces.surface_distance import distances_to
+from us_sim.volume.surfaces.structure_surface import (
+    decimated,
+    distances_to,
+    structure_surface,
+    surface_distance,
+)
 from us_sim.volume.volume import Volume
 
 vtk = pytest.importorskip("vtk")

@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import VolumeError
 from us_sim.volume.phantom.phantom import cached_phantom
+from us_sim.volume.surfaces.label_surface import voxel_surface
 from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.surfaces.structure_surface import structure_surface
-from us_sim.volume.surfaces.voxel_surface import voxel_surface
 from us_sim.volume.volume import Volume
 
 GRID = 0.5e-3 * (np.indices((70, 70, 70)).transpose(1, 2, 3, 0) - (35.1, 34.7, 35.3))

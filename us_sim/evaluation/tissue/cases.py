@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.block import EXTENT, block
+from us_sim.evaluation.block import EXTENT, block, graded_planes
 from us_sim.evaluation.named import Named
-from us_sim.evaluation.tissue.graded_planes import graded_planes
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material

@@ -1,13 +1,11 @@
-"""The parameters of a node: declaring, getting and setting them, and who has a say in it."""
+"""The parameters of a node: declaring, getting and setting them, and the callbacks that check."""
 
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..messages import message_class
-from ._node_graph import NodeGraph
-from ._parameter_ranges import reason_against
-from .clock import ROSClock
+from .endpoints import Publisher
 from .exceptions import (
     InvalidParameterException,
     InvalidParameterTypeException,
@@ -17,8 +15,8 @@ from .exceptions import (
     ParameterNotDeclaredException,
     ParameterUninitializedException,
 )
-from .parameter import PARAMETER_SEPARATOR_STRING, Parameter
-from .publisher import Publisher
+from .parameter import PARAMETER_SEPARATOR_STRING, Parameter, reason_against
+from .time import ROSClock
 
 ParameterDescriptor: Any = message_class("rcl_interfaces/msg/ParameterDescriptor")
 ParameterValue: Any = message_class("rcl_interfaces/msg/ParameterValue")
@@ -30,13 +28,19 @@ ListParametersResult: Any = message_class("rcl_interfaces/msg/ListParametersResu
 _RECURSIVE = 0  # ListParameters.Request.DEPTH_RECURSIVE
 
 
-class NodeParameters(NodeGraph):
+class NodeParameters:
     """A node's parameters by name, which have to be declared before they are used."""
 
     PARAM_REL_TOL = 1e-06
 
     _clock: ROSClock
+    _rcl_name: str
+    _rcl_namespace: str
     _parameter_event_publisher: Publisher | None
+
+    def get_fully_qualified_name(self) -> str:
+        """This node's absolute name."""
+        return f"{self._rcl_namespace.rstrip('/')}/{self._rcl_name}"
 
     def _rcl_keep_parameters(
         self, overrides: dict[str, Parameter], allow_undeclared_parameters: bool

@@ -37,10 +37,8 @@ from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
-from us_sim.tissue.contact.penetration import wrench_on_probe
-from us_sim.tissue.contact.surface_contact import surface_contact
-from us_sim.tissue.contact.surface_points import add_springs, add_turns
+from us_sim.tissue.contact.probe_gap import FlaredProbe, wrench_on_probe
+from us_sim.tissue.contact.surface_points import add_springs, add_turns, surface_contact
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
 from us_sim.tissue.linear_algebra.two_level import (

@@ -28,10 +28,13 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import setting
-from us_sim.tissue.contact.compliant_contact import CompliantContact
-from us_sim.tissue.contact.friction import FrictionalContact
-from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
-from us_sim.tissue.contact.penetration import wrench_on_probe
+from us_sim.tissue.contact.compliant_contact import (
+    COEFFICIENT,
+    CONTACTS,
+    CompliantContact,
+    FrictionalContact,
+)
+from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure

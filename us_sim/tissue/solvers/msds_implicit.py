@@ -29,7 +29,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.penetration import push_out, wrench_on_probe
+from us_sim.tissue.contact.probe_gap import push_out, wrench_on_probe
 from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
@@ -39,17 +39,17 @@ from us_sim.tissue.elasticity.tangling import Tangling
 from us_sim.tissue.elasticity.volume_term import VolumeTerm
 from us_sim.tissue.linear_algebra.scalar_preconditioner import ScalarPreconditioner
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.msds import (
+    SpringSettings,
+    spring_stiffness,
+    spring_tissue,
+    spring_volume,
+)
 from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
     TissueSolver,
     same_pose,
-)
-from us_sim.tissue.solvers.spring_tissue import (
-    SpringSettings,
-    spring_stiffness,
-    spring_tissue,
-    spring_volume,
 )
 
 _REST_TIME = 0.2

@@ -41,9 +41,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CalibrationError, TrackingError
 from us_sim.settings.spelling import counted
-from us_sim.tracking.calibration.settings import BOARD_LENGTH, BOARDS
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.settings import BOARD_LENGTH, BOARDS
 
 _SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
 _Corners = tuple[NDArray[np.float32], NDArray[np.float32]]

@@ -30,10 +30,9 @@ from us_sim.tracking.calibration.time_offset import (
     signal_of_images,
     signal_of_positions,
 )
-from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sequence_file import SEQUENCE_SUFFIXES
+from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
-from us_sim.volume.sequences.transform_name import split_transform_name
+from us_sim.volume.sequences.transforms import split_transform_name
 
 
 def read_motion(path: Path, name: str | None) -> ProbePath:

@@ -34,7 +34,7 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
-from us_sim.volume.sequences.transform_name import split_transform_name
+from us_sim.volume.sequences.transforms import split_transform_name
 
 _KEYS = ("from", "to", "position", "orientation")
 

@@ -4,36 +4,32 @@
 values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/``, ``tissue.npz`` and
 ``provenance.yaml`` may be there. All names are these: a case names no files of its own choice.
 
->>> import tempfile
->>> import numpy as np
->>> from us_sim.volume.cases.case import read_case
->>> from us_sim.volume.cases.settings import CaseSettings
->>> from us_sim.volume.cases.writing import new_case, write_case_settings
->>> from us_sim.volume.files.writing import write_volume
->>> from us_sim.volume.volume import Volume
->>> block = Volume(np.ones((30, 20, 10), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
->>> with tempfile.TemporaryDirectory() as root:
-...     with new_case(f"{root}/block") as folder:
-...         write_volume(folder / "volume.nrrd", block)
-...         write_case_settings(folder, CaseSettings(name="block"))
-...     case = read_case(f"{root}/block")
-...     shape = case.volume().shape
->>> case.settings.name, shape
-('block', (30, 20, 10))
+Where cases are kept, and which there are.
+
+Folders of cases are those in the environment variable US_SIM_CASES, or the folder ``cases`` in the
+user's data folder. A case is named by its folder in one of them, or by its path.
+
+A line about each case: its name, region, probe, size and structures.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import platformdirs
 from numpy.typing import NDArray
 
-from us_sim.errors import CaseError, VolumeError
+from us_sim.errors import CaseError, UsSimError, VolumeError
+from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
+from us_sim.settings.registry import PROBES
+from us_sim.settings.spelling import nearest
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
@@ -208,3 +204,121 @@ def _placement(path: Path) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
             f"{path}: keeps its voxels in another file, which a case must not: save it as one file"
         )
     return read_placement(path), image.shape
+
+
+def case_roots() -> list[Path]:
+    """Folders of cases; the first of them goes before the others where a name is in several."""
+    given = os.environ.get("US_SIM_CASES", "")
+    roots = [Path(os.path.expanduser(part)) for part in given.split(os.pathsep) if part]
+    return roots or [platformdirs.user_data_path("us_sim") / "cases"]
+
+
+def cases_in(root: Path) -> list[Path]:
+    """The folders in a folder that have a ``case.yaml``, by name; itself where it is a case.
+
+    Raises:
+        CaseError: there is no such folder, or it cannot be read.
+    """
+    if is_case(root):
+        return [root]
+    try:
+        inside = sorted(path for path in root.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise CaseError(f"{root}: cannot be read: {error.strerror}") from error
+    return [path for path in inside if is_case(path)]
+
+
+def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Path:
+    """The folder of a case, by its path or by its name in one of `case_roots`.
+
+    Args:
+        name: of the case, or its folder.
+        folders: where a relative path begins; the current folder is the last of them.
+
+    Raises:
+        CaseError: there is none; the sentence says which there are.
+    """
+    path = Path(os.path.expanduser(name))
+    for folder in (*folders, Path.cwd()):
+        if str(name) and is_case(folder / path):
+            return (folder / path).resolve()
+    roots = case_roots()
+    known: dict[str, Path] = {}
+    for root in roots:
+        if root.is_dir():
+            for case in cases_in(root):
+                known.setdefault(case.name, case)
+    if str(name) in known:
+        return known[str(name)].resolve()
+    for folder in (*folders, Path.cwd()):
+        if str(name) and (folder / path).exists():
+            kind = f"folder without a {CASE}" if (folder / path).is_dir() else "file"
+            raise CaseError(f"{name}: is a {kind}, and there is no case of that name")
+    like = nearest(name, known)
+    there = f"cases are {', '.join(known)}" if known else "there is none"
+    raise CaseError(
+        f"there is no case {name}; {there} in {', '.join(map(str, roots))}"
+        + (f"; did you mean {like}?" if like else "")
+    )
+
+
+_TITLES = ("case", "region", "probe", "size", "structures")
+_LONGEST = 60  # characters of a column
+
+
+@dataclass(frozen=True)
+class ListedCase:
+    """What a listing says of a case."""
+
+    folder: Path
+    name: str
+    region: str = ""
+    probe: str = ""
+    size: str = ""
+    structures: str = ""
+    problem: str = ""  # why it cannot be used
+
+
+def listed(folder: Path) -> ListedCase:
+    """What there is to say of the case in a folder, from its texts and headers alone."""
+    try:
+        case = read_case(folder)
+        matrix, shape = case.placement()
+        if case.has_labels:
+            case.check_grids()
+    except UsSimError as error:
+        return ListedCase(folder, folder.name, problem=str(error))
+    voxel = np.linalg.norm(matrix[:3, :3], axis=0) * 1e3
+    extent = " × ".join(f"{length:.0f}" for length in voxel * shape)
+    sides = sorted({f"{side:.2g}" for side in voxel})
+    settings = case.settings
+    return ListedCase(
+        folder,
+        folder.name,
+        settings.region or settings.name,
+        _probe(settings.probe),
+        f"{extent} mm, voxels of {' and '.join(sides)} mm",
+        ", ".join(settings.structures) if case.has_labels else "not segmented",
+    )
+
+
+def table(cases: Sequence[ListedCase]) -> str:
+    """The cases in columns, and under them what is wrong with those that cannot be used."""
+    good = [case for case in cases if not case.problem]
+    rows = [_TITLES, *((c.name, c.region, c.probe, c.size, c.structures) for c in good)]
+    cut = [[text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..." for text in r] for r in rows]
+    widths = [max(map(len, column)) for column in zip(*cut, strict=True)]
+    lines = [
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in (cut if good else [])
+    ]
+    return "\n".join(
+        [*lines, *(f"cannot be used: {case.problem}" for case in cases if case.problem)]
+    )
+
+
+def _probe(probe: ProbeSettings | None) -> str:
+    if probe is None:
+        return ""
+    array: Any = probe.array.settings(PROBES)
+    return f"{probe.geometry}, {array.depth * 1e3:.0f} mm deep"

@@ -9,17 +9,6 @@ towards the probe: the skewness along the beams is least of all directions, or o
 corner of the region; of several corners the probe is at the one where echoes are brightest. A
 region without such a direction is taken for one that a linear array has scanned along the rows of
 its images, the volume's second axis.
-
->>> import numpy as np
->>> from us_sim.volume.cases.proposal import proposed_start
->>> from us_sim.volume.volume import Volume
->>> i, j, k = np.indices((61, 31, 61))
->>> fan = abs(np.hypot(i - 30, k + 20) - 50) < 25  # from 5 mm deep at the apex's side, down
->>> fan &= abs(np.arctan2(i - 30, k + 20)) < np.radians(28)
->>> volume = Volume((fan * (200 - k)).astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
->>> start = proposed_start(volume)
->>> bool(start.pose.rotation[2, 2] > 0.99), round(1e3 * start.position[2])
-(True, 5)
 """
 
 from __future__ import annotations

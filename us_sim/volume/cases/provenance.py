@@ -3,19 +3,6 @@
 A step says what was done, by which version of us_sim, with which settings, and what there was to
 count. Of a file that went in it keeps its kind and checksum, and never its name or path, which
 carry patients' names.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.volume.cases.provenance import Step, add_step, read_steps
->>> with tempfile.TemporaryDirectory() as folder:
-...     add_step(Path(folder), Step("reconstructed", {"spacing": 0.0005}, {"frames": 140}))
-...     (step,) = read_steps(Path(folder))
->>> step.what, step.settings["spacing"], step.counts
-('reconstructed', 0.0005, {'frames': 140})
->>> Step("reconstructed", {"sweep": "/home/doe_jane/sweep.mha"})
-Traceback (most recent call last):
-...
-us_sim.errors.CaseError: provenance: settings.sweep: '/home/doe_jane/sweep.mha' may say whose...
 """
 
 from __future__ import annotations

@@ -1,13 +1,4 @@
-"""What ``case.yaml`` says: what the case is of, its structures, and how to scan it.
-
->>> from us_sim.settings.reading import Reader
->>> from us_sim.volume.cases.settings import CaseSettings
->>> case = Reader("case.yaml").read(CaseSettings, {
-...     "name": "liver", "region": "abdomen", "structures": {"portal vein": {"label": 1}},
-...     "start": {"position": ["49 mm", "92 mm", "127 mm"], "orientation": [0, 1, 0, 0]}})
->>> case.material_of("portal vein").lumen_pressure
-1000.0
-"""
+"""What ``case.yaml`` says: what the case is of, its structures, and how to scan it."""
 
 from __future__ import annotations
 
@@ -23,7 +14,7 @@ from us_sim.settings.spelling import shown, unknown
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
 from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 AROUND = "tissue"
 """Name of what is in no structure: label 0, or all of a volume without labels."""

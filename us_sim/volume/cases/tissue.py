@@ -1,19 +1,6 @@
 """The tissue of a case: ``tissue.npz``, its mesh and how much of each label is in each tetrahedron.
 
 It says what it was made from, and is made anew when that has changed.
-
->>> import tempfile
->>> from pathlib import Path
->>> import numpy as np
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
->>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.02])
->>> made = CaseTissue(mesh, np.array([0], np.uint8), np.ones((5, 1)), {"nodes": 8})
->>> with tempfile.TemporaryDirectory() as folder:
-...     write_tissue(Path(folder, "tissue.npz"), made)
-...     again = read_tissue(Path(folder, "tissue.npz"))
->>> again.made_from, len(again.mesh.tetrahedra)
-({'nodes': 8}, 5)
 """
 
 from __future__ import annotations

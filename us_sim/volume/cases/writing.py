@@ -3,24 +3,17 @@
 A case is written into a folder beside its place, checked, and renamed; on any error that folder is
 removed. What a program that was killed left behind is removed by the next that writes there.
 
->>> import tempfile
->>> from us_sim.volume.cases.settings import CaseSettings
->>> from us_sim.volume.cases.writing import new_case, write_case_settings
->>> with tempfile.TemporaryDirectory() as root:
-...     with new_case(f"{root}/arm") as folder:
-...         write_case_settings(folder, CaseSettings(name="arm"))
-Traceback (most recent call last):
-...
-us_sim.errors.CaseError: ...arm: is no case, as it has no volume.nrrd; ...
+Young's moduli that were found for a case, written into its ``case.yaml``.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -28,9 +21,11 @@ import yaml
 
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.reading import document_of
+from us_sim.settings.spelling import unknown
 from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
-from us_sim.volume.cases.settings import CaseSettings, check_name
+from us_sim.volume.cases.provenance import Step, add_step
+from us_sim.volume.cases.settings import AROUND, CaseSettings, check_name
 
 
 @contextmanager
@@ -187,3 +182,37 @@ def _held(folder: Path) -> int | None:
     except OSError:
         pass  # a file system without locks, such as some of networks
     return number
+
+
+def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSettings:
+    """A case with these moduli (Pa) by structure, `AROUND` for what is in none.
+
+    Raises:
+        CaseError: there is no such structure.
+        MaterialError: a modulus is out of range.
+    """
+    structures = dict(settings.structures)
+    around = settings.around
+    for name, modulus in moduli.items():
+        if name not in (AROUND, *structures):
+            raise CaseError(f"{settings.name}: structure {unknown(name, (AROUND, *structures))}")
+        material = dataclasses.replace(settings.material_of(name), young_modulus=modulus)
+        if name == AROUND:
+            around = material
+        else:
+            structures[name] = dataclasses.replace(structures[name], material=material)
+    return dataclasses.replace(settings, around=around, structures=structures)
+
+
+def write_moduli_into(
+    folder: str | os.PathLike[str], moduli: Mapping[str, float], step: Step
+) -> None:
+    """Write moduli (Pa) by structure into a case, and what was done for that.
+
+    Raises:
+        CaseError: there is no such case or structure, or it cannot be written.
+    """
+    settings = with_moduli(read_case(folder).settings, moduli)
+    with changed_case(folder) as partial:
+        write_case_settings(partial, settings)
+        add_step(partial, step)

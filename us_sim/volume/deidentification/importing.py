@@ -1,21 +1,18 @@
-"""Files of scanners and other programs into a volume, a case or a sequence of images.
+"""What an import made, and what it left out: the facts of its report.
+
+Writing what goes on: a volume's file, a case, or a sequence of images.
+
+Files of scanners and other programs into a volume, a case or a sequence of images.
 
 Only voxels, where and when they lie, and the values of `kept_values` go on. The source is read,
 what is not kept is blanked, and the result is written anew: nothing is copied.
-
->>> import pydicom.data
->>> from us_sim.volume.deidentification.importing import look_at
->>> from us_sim.volume.deidentification.settings import ImportSettings
->>> file = pydicom.data.get_testdata_file("examples_ybr_color.dcm")
->>> look_at([file], None, ImportSettings(crop="80,30,240,210")).imported.what
-'30 images of 161 × 181 pixels'
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,18 +20,156 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
-from us_sim.volume.deidentification.file_source import file_source
-from us_sim.volume.deidentification.imported import Imported
-from us_sim.volume.deidentification.kept_part import Regions
 from us_sim.volume.deidentification.kept_values import sorted_out
-from us_sim.volume.deidentification.output import is_images, refuse_taken, write_grid, write_images
-from us_sim.volume.deidentification.proposal import proposed_part
-from us_sim.volume.deidentification.rectangle import Rectangle
-from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.deidentification.source import Progress, Source
-from us_sim.volume.deidentification.text_detection import find_text
+from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
+from us_sim.volume.deidentification.source import Progress, Regions, Source, file_source
+from us_sim.volume.deidentification.text_detection import find_text, proposed_part
 from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.readers import ENDINGS
+from us_sim.volume.files.writing import write_image_sequence, write_volume
+from us_sim.volume.volume import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """An import, before or after it is written."""
+
+    kind: str  # what the files hold: "Enhanced US Volume Storage", "NRRD volume"
+    files: int
+    what: str  # what is made of them, with its size, for a person
+    kept: Mapping[str, str]  # values that go on, by their fields
+    used: Mapping[str, int]  # elements of which only the effect goes on, and how many of each
+    dropped: Mapping[str, int]  # all others
+    conversions: tuple[str, ...]
+    blanked: str  # what of the images is not kept, for a person
+    first: NDArray[np.uint8]  # (rows, columns) the first image as it was: it may show a name
+    regions: tuple[Rectangle, ...]  # what of it is kept
+    text: tuple[Rectangle, ...]  # where text may be, in `first`
+    remaining: tuple[Rectangle, ...]  # of these, what is kept: partly or wholly
+    undecided: str = ""  # why nothing can be written before a person has decided
+    blanking_settles: bool = False  # that --blank-text would be a decision
+    proposal: Rectangle | None = None  # what to keep, by what moves and shines
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
+
+
+def is_images(out: Path) -> bool:
+    """Whether a name is one of those that 2D images may have."""
+    return out.name.lower().endswith(".mha")
+
+
+def refuse_taken(out: Path) -> None:
+    """Refuse a place where something is already, or a name that is none.
+
+    Raises:
+        VolumeError: it is taken.
+    """
+    if os.path.lexists(out):
+        raise VolumeError(f"{out}: exists already; choose another name, or remove it")
+    if out.suffix and not out.name.lower().endswith(_VOLUMES) and len(out.suffix) <= 5:
+        raise VolumeError(
+            f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
+            f"2D images, or a folder's name without an ending for a case"
+        )
+
+
+def write_images(
+    out: Path,
+    source: Source,
+    keep: NDArray[np.bool_] | None,
+    part: Rectangle | None,
+    progress: Progress | None,
+) -> None:
+    """Images without a place, one after another in time.
+
+    Raises:
+        VolumeError: they cannot be read or written.
+    """
+    assert source.images is not None
+    columns, rows, count = source.shape
+    cut = part.slices if part else (slice(None), slice(None))
+    columns, rows = part.size if part else (columns, rows)
+
+    def told() -> Iterator[NDArray[np.uint8]]:
+        assert source.images is not None
+        for number, image in enumerate(source.images(keep), start=1):
+            yield image[cut]
+            if progress:
+                progress(number / count, f"{number} of {count} images")
+
+    write_image_sequence(
+        out, told(), (count, rows, columns), source.times, source.pixel_mm, source.kept
+    )
+
+
+def write_grid(
+    out: Path,
+    source: Source,
+    keep: NDArray[np.bool_] | None,
+    imported: Imported,
+    settings: ImportSettings,
+    progress: Progress | None,
+) -> None:
+    """A volume as a file, or as a new case where the name has no ending.
+
+    Raises:
+        VolumeError: it cannot be read or written.
+        CaseError: the case cannot be made.
+    """
+    assert source.voxels is not None
+    assert source.placement is not None
+    volume = _cropped(source.voxels(keep, progress), source.placement, settings.part)
+    if out.name.lower().endswith(_VOLUMES):
+        fields = {} if out.name.lower().endswith((".nii", ".nii.gz")) else dict(source.kept)
+        write_volume(out, volume, fields)
+        return
+    from us_sim.volume.cases.provenance import Step, add_step
+    from us_sim.volume.cases.settings import CaseSettings
+    from us_sim.volume.cases.writing import new_case, write_case_settings
+
+    with new_case(out) as folder:
+        write_volume(folder / "volume.nrrd", volume, source.kept)
+        del volume  # it is read again at the end, to propose where to start
+        write_case_settings(folder, CaseSettings(name=settings.name or out.name))
+        add_step(folder, Step("imported", _said(imported, settings), _counted(imported)))
+
+
+def _said(imported: Imported, settings: ImportSettings) -> dict[str, object]:
+    """For provenance: what was done, by nothing that the source's header says."""
+    said: dict[str, object] = {"kind": imported.kind, "values kept": sorted(imported.kept)}
+    if settings.crop:
+        said["crop"] = settings.crop
+    if settings.keep_whole_image:
+        said["whole image"] = True
+    if imported.conversions:
+        said["converted"] = list(imported.conversions)
+    return said
+
+
+def _counted(imported: Imported) -> dict[str, int]:
+    return {
+        "files": imported.files,
+        "elements dropped": sum(imported.dropped.values()),
+        "regions kept": len(imported.regions),
+        "places that may be text": len(imported.remaining),
+    }
+
+
+def _cropped(
+    voxels: NDArray[np.uint8], placement: NDArray[np.float64], part: Rectangle | None
+) -> Volume:
+    """The part of every image, where it was."""
+    if part is None:
+        return Volume(voxels, placement)
+    if min(part.size) < 2:
+        raise VolumeError(f"--crop {part}: a volume needs two columns and rows or more")
+    rows, columns = part.slices
+    moved = placement.copy()
+    moved[:, 3] = placement @ [part.left, part.top, 0.0, 1.0]
+    return Volume(voxels[columns, rows], moved)
+
 
 _MARGIN = 3
 """Pixels around text that are blanked with it: shadows and blurred edges."""
@@ -138,7 +273,7 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
             f"or NIfTI volume"
         )
     # Imported where it is needed: DICOM is an extra.
-    from us_sim.volume.deidentification.dicom_source import dicom_source
+    from us_sim.volume.deidentification.source import dicom_source
 
     return dicom_source(paths, settings.volume, spacing, needs_volume=needs_volume)
 

@@ -2,15 +2,6 @@
 
 The picture shows the first image as it was, so that a person sees what is burned in. It belongs
 where the original is kept, and not to the case.
-
->>> import pydicom.data
->>> from us_sim.volume.deidentification.importing import look_at
->>> from us_sim.volume.deidentification.report import report_text
->>> from us_sim.volume.deidentification.settings import ImportSettings
->>> file = pydicom.data.get_testdata_file("examples_ybr_color.dcm")
->>> text = report_text(look_at([file], None, ImportSettings(keep_whole_image=True)).imported)
->>> "- PatientName" in text and "Example" not in text
-True
 """
 
 from __future__ import annotations
@@ -26,9 +17,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
-from us_sim.volume.deidentification.imported import Imported
+from us_sim.volume.deidentification.importing import Imported
 from us_sim.volume.deidentification.kept_values import NUMBERS
-from us_sim.volume.deidentification.rectangle import Rectangle
+from us_sim.volume.deidentification.settings import Rectangle
 
 _GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (0, 220, 255)  # of OpenCV: blue, green, red
 _REPORT, _PICTURE = "report.md", "first_image.png"

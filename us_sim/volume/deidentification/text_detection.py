@@ -5,14 +5,7 @@ around them, the same in every image, of about one brightness, and beside one an
 Speckle has the strokes, but neither the one brightness nor the line. It is a help for a person who
 looks at the picture, and no proof: it misses letters across bright tissue, handwriting, and faces.
 
->>> import cv2, numpy as np
->>> from us_sim.volume.deidentification.text_detection import find_text
->>> image = np.full((120, 320), 60, np.uint8)
->>> image[:30] = 0
->>> _ = cv2.putText(image, "DOE JANE 1971", (20, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 230)
->>> (line,) = find_text([image])
->>> line.top >= 5 and line.bottom <= 24 and line.left <= 24 and line.right > 120
-True
+Which part of images to keep, proposed to a person: where the echoes seem to be.
 """
 
 from __future__ import annotations
@@ -24,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.volume.deidentification.rectangle import Rectangle
+from us_sim.volume.deidentification.settings import Rectangle
 
 _STILL = 12  # grey levels by which the same letter differs between images; JPEG makes about ten
 _STROKE = 11  # px, wider than the strokes of the largest letters
@@ -157,3 +150,34 @@ def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
         for edge in (glyphs.bottom[members], glyphs.top[members])
     )
     return bool(aligned >= 0.7 and width > 1.5 * height)
+
+
+_MOVES = 16  # grey levels between images
+_SHINES = 8  # grey levels above black
+_CLOSE = 15  # px, gaps that are bridged
+
+
+def proposed_part(
+    images: Sequence[NDArray[np.uint8]], text: Sequence[Rectangle]
+) -> Rectangle | None:
+    """The largest connected part that moves, or of one image that is not black; no text.
+
+    Args:
+        images: (rows, columns) of equal size.
+        text: what may be text.
+    """
+    stack = np.stack(images)
+    moving = np.ptp(stack, axis=0) > _MOVES
+    seen = moving if moving.mean() > 0.01 else stack.max(axis=0) > _SHINES
+    seen = seen.astype(np.uint8)
+    for line in text:
+        seen[line.slices] = 0
+    opened = cv2.morphologyEx(seen, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((_CLOSE, _CLOSE), np.uint8))
+    count, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    if count < 2:
+        return None
+    left, top, width, height, _ = (
+        int(each) for each in stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
+    )
+    return Rectangle(left, top, left + width - 1, top + height - 1)

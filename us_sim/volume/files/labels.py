@@ -1,44 +1,193 @@
-"""Labels from files of other programs, on the grid of the volume that they belong to.
+"""Labels of one grid on another: moved where their voxels are the same, resampled where asked.
+
+Tables of labels: numbers, names and colours, as 3D Slicer, ITK-SNAP and spreadsheets write them.
+
+Labels from files of other programs, on the grid of the volume that they belong to.
 
 Any MHA, NRRD or NIfTI file will do, whose values are then labels; 3D Slicer's ``.seg.nrrd`` and
 DICOM segmentations with the names and colours of their segments; and a table of labels beside
 either.
-
->>> import pathlib, tempfile
->>> import numpy as np
->>> from us_sim.volume.files.labels import read_labels
->>> from us_sim.volume.files.writing import write_labels
->>> from us_sim.volume.volume import Volume
->>> labels = np.zeros((6, 5, 4), np.uint8)
->>> labels[2:4, 2:4, 1:3] = 5
->>> volume = Volume(np.zeros_like(labels), np.diag([1e-3, 1e-3, 1e-3, 1.0]), labels, {5: "artery"})
->>> with tempfile.TemporaryDirectory() as folder:
-...     write_labels(pathlib.Path(folder, "labels.seg.nrrd"), volume)
-...     read = read_labels(pathlib.Path(folder, "labels.seg.nrrd"), volume)
->>> read.names, read.voxels
-({5: 'artery'}, {'artery': 8})
 """
 
 from __future__ import annotations
 
+import csv
 import os
+import re
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.volume.anatomical_colours import Colour
+from us_sim.settings.spelling import shown
+from us_sim.settings.text_files import read_text
 from us_sim.volume.files.dicom.header import is_dicom, open_dicom
-from us_sim.volume.files.label_grid import on_grid
-from us_sim.volume.files.label_table import read_label_table
 from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.segments import Segment, check_representation, segments_of
 from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.label_map import LabelMap
-from us_sim.volume.structure_terms import coded_name, is_anatomical, readable
-from us_sim.volume.volume import Volume
+from us_sim.volume.structure_names import Colour, coded_name, is_anatomical, readable
+from us_sim.volume.volume import LabelMap, Volume
+
+_SAME = 0.02
+"""Voxels by which two grids may differ and still be one; single precision, which NIfTI has, makes
+them differ by less."""
+
+
+def on_grid(
+    labels: NDArray[np.uint8],
+    placement: NDArray[np.float64],
+    shape: tuple[int, int, int],
+    wanted: NDArray[np.float64],
+    *,
+    resample: bool = False,
+) -> tuple[NDArray[np.uint8], list[str]]:
+    """The labels on a grid of that shape, and what a person should know of that.
+
+    A file may hold only the part of a volume that is labelled, or its axes in another order or
+    direction; its voxels are then those of the volume, and nothing is resampled.
+
+    Args:
+        labels: (i, j, k) of the file.
+        placement: (4, 4) m, from the file's indices.
+        shape: of the grid that they shall be on.
+        wanted: (4, 4) m, from its indices.
+        resample: take the nearest voxel where the grids differ.
+
+    Raises:
+        VolumeError: the grids differ and ``resample`` is not given, or nothing of the labels lies
+            within the grid; the sentence does not say of which file.
+    """
+    to_grid = np.linalg.inv(wanted) @ placement
+    turn = np.rint(to_grid[:3, :3])
+    shift = np.rint(to_grid[:3, 3])
+    corners = np.stack(np.meshgrid(*[[0, n - 1] for n in labels.shape], indexing="ij"), axis=-1)
+    corners = corners.reshape(-1, 3)
+    apart = corners @ (to_grid[:3, :3] - turn).T + to_grid[:3, 3] - shift
+    is_turn = np.array_equal(np.abs(turn).sum(axis=0), np.ones(3)) and np.array_equal(
+        np.abs(turn).sum(axis=1), np.ones(3)
+    )
+    before = np.count_nonzero(labels)
+    remarks = []
+    if is_turn and np.abs(apart).max() <= _SAME:
+        made = _placed(labels, turn.astype(int), shift.astype(int), shape)
+    elif resample:
+        to_file = np.linalg.inv(to_grid)
+        made = ndimage.affine_transform(
+            labels, to_file[:3, :3], to_file[:3, 3], output_shape=shape, order=0, mode="constant"
+        )
+        remarks.append(
+            f"labels of {_words(labels.shape, placement)} were resampled to {_words(shape, wanted)}"
+            f" by the nearest voxel"
+        )
+    else:
+        raise VolumeError(
+            f"its labels are on another grid ({_words(labels.shape, placement)}) than the volume "
+            f"({_words(shape, wanted)}): segment this volume, or have them resampled with "
+            f"--resample"
+        )
+    if before and not made.any():
+        raise VolumeError(
+            "its labels lie wholly outside the volume: they belong to another one, or their axes "
+            "were taken for others (left-posterior-superior is meant)"
+        )
+    if not remarks and (lost := before - np.count_nonzero(made)):
+        remarks.append(
+            f"{lost} of {before} labelled voxels lie outside the volume and are left out"
+        )
+    return made, remarks
+
+
+def _placed(
+    labels: NDArray[np.uint8],
+    turn: NDArray[np.int64],
+    shift: NDArray[np.int64],
+    shape: tuple[int, int, int],
+) -> NDArray[np.uint8]:
+    """Labels whose index n is turn @ n + shift in an array of that shape."""
+    order = np.argmax(np.abs(turn), axis=1)  # the file's axis along each of the grid's
+    turned = labels.transpose(order)
+    signs = turn[np.arange(3), order]
+    turned = turned[tuple(slice(None, None, int(sign)) for sign in signs)]
+    first = np.where(signs > 0, shift, shift - np.array(turned.shape) + 1)
+    last = np.minimum(first + turned.shape, shape)
+    start = np.maximum(first, 0)
+    made = np.zeros(shape, np.uint8)
+    if (last > start).all():
+        there = tuple(slice(a, b) for a, b in zip(start, last, strict=True))
+        here = tuple(slice(a, b) for a, b in zip(start - first, last - first, strict=True))
+        made[there] = turned[here]
+    return made
+
+
+def _words(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:
+    sides = np.linalg.norm(placement[:3, :3], axis=0) * 1e3
+    return (
+        f"{' × '.join(map(str, shape))} voxels of {' × '.join(f'{side:.3g}' for side in sides)} mm"
+    )
+
+
+_SLICER = re.compile(r"(\d{1,9})\s+(\S+)\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})")
+_SNAP = re.compile(r"(\d{1,9})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})(?:\s+[\d.]{1,9}){3}\s+\"(.*)\"")
+_LONGEST = 1 << 20
+
+
+def read_label_table(path: Path) -> dict[int, tuple[str, Colour | None]]:
+    """Names and colours by label.
+
+    Three forms are read: Slicer's colour tables (``.ctbl``: label, name, red, green, blue, alpha),
+    ITK-SNAP's label descriptions (label, red, green, blue, three more numbers, the name in quotes),
+    and comma-separated ones (label, name). Lines that begin with # are remarks, a first line of
+    words a heading.
+
+    Raises:
+        VolumeError: the file cannot be read, or a line is none of these.
+    """
+    try:
+        text = read_text(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise VolumeError(f"{path}: cannot be read as a table of labels: {error}") from error
+    if len(text) > _LONGEST:
+        raise VolumeError(f"{path}: has {len(text)} characters, too many for a table of labels")
+    table: dict[int, tuple[str, Colour | None]] = {}
+    lines = [line.strip() for line in text.lstrip("\ufeff").splitlines()]
+    for number, line in enumerate(lines, start=1):
+        if not line or line.startswith("#") or (not table and not line[0].isdigit()):
+            continue
+        entry = _entry(line)
+        if entry is None:
+            raise VolumeError(
+                f"{path}: line {number}: {shown(line[:80])} is no label: write `6 vein 0 0 255 "
+                f"255`, or `6,vein`"
+            )
+        label, name, colour = entry
+        if label in table:
+            raise VolumeError(f"{path}: line {number}: label {label} is there twice: keep one")
+        table[label] = (name, colour)
+    if not table:
+        raise VolumeError(f"{path}: holds no labels; write a line such as `6 vein 0 0 255 255`")
+    return table
+
+
+def _entry(line: str) -> tuple[int, str, Colour | None] | None:
+    if match := _SLICER.fullmatch(line):
+        label, name, *colour = match.groups()
+        return int(label), name, _colour(colour[:3])
+    if match := _SNAP.fullmatch(line):
+        label, *colour, name = match.groups()
+        return int(label), name.strip(), _colour(colour)
+    cells = next(csv.reader([line], skipinitialspace=True), [])
+    if len(cells) >= 2 and re.fullmatch(r"\d{1,9}", cells[0].strip()) and cells[1].strip():
+        return int(cells[0]), cells[1].strip(), None
+    return None
+
+
+def _colour(texts: list[str]) -> Colour | None:
+    red, green, blue = (int(text) / 255 for text in texts)
+    return (red, green, blue) if max(red, green, blue) <= 1.0 else None
+
 
 _MOST = 255
 

@@ -1,15 +1,4 @@
-"""Headers of MetaImage files: their fields, and what they say of the image.
-
->>> import pathlib, tempfile
->>> from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
->>> header = "ObjectType = Image\\nNDims = 3\\nDimSize = 4 5 6\\nElementType = MET_SHORT\\n"
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "volume.mha")
-...     _ = path.write_bytes(f"{header}ElementDataFile = LOCAL\\n".encode() + bytes(240))
-...     voxels = metaimage_voxels(path, *metaimage_header(path))
->>> voxels.size, voxels.type, voxels.start
-((4, 5, 6), dtype('int16'), 93)
-"""
+"""Headers of MetaImage files: their fields, and what they say of the image."""
 
 from __future__ import annotations
 
@@ -25,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
-from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
+from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
 
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""

@@ -1,14 +1,4 @@
-"""Headers of NIfTI files of both versions, in one file or in two (nifti.nimh.nih.gov).
-
->>> import pathlib, tempfile, SimpleITK
->>> from us_sim.volume.files.nifti import nifti_image
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "volume.nii.gz")
-...     SimpleITK.WriteImage(SimpleITK.Image([4, 5, 6], SimpleITK.sitkInt16), str(path))
-...     image = nifti_image(path)
->>> image.voxels.size, image.voxels.skip, image.voxels.encoding, image.placement().diagonal()
-((4, 5, 6), 352, 'packed', array([0.001, 0.001, 0.001, 1.   ]))
-"""
+"""Headers of NIfTI files of both versions, in one file or in two (nifti.nimh.nih.gov)."""
 
 from __future__ import annotations
 
@@ -24,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement
-from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.files.stored_voxels import StoredVoxels
+from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
 
 _TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4"}
 _TYPES |= {1024: "i8", 1280: "u8"}

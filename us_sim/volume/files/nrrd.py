@@ -1,15 +1,5 @@
 """Headers of NRRD files: their fields, and what they say of the image
 (teem.sourceforge.net/nrrd/format.html).
-
->>> import pathlib, tempfile
->>> from us_sim.volume.files.nrrd import nrrd_voxels
->>> header = b"NRRD0004\\ntype: short\\ndimension: 3\\nsizes: 4 5 6\\nencoding: raw\\n\\n"
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "volume.nrrd")
-...     _ = path.write_bytes(header + bytes(240))
-...     voxels = nrrd_voxels(path)
->>> voxels.size, voxels.type, voxels.start
-((4, 5, 6), dtype('int16'), 62)
 """
 
 from __future__ import annotations
@@ -25,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
-from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.files.stored_voxels import Encoding, StoredVoxels
+from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
 
 _LARGEST_HEADER = 1 << 26
 """Bytes; an hour of tracked frames takes less."""

@@ -1,12 +1,6 @@
 """Where the voxels of an image file lie, checked: spacing, axes and origin that a body may have.
 
 Every reader hands its header's numbers over in millimetres, whatever unit they are written in.
-
->>> import numpy as np
->>> from us_sim.volume.files.placement import checked_placement
->>> placement = checked_placement("a.nrrd", (0.5, 0.5, 1.0), np.eye(3), (10.0, 0.0, -20.0))
->>> placement @ [2, 0, 5, 1]
-array([ 0.011,  0.   , -0.015,  1.   ])
 """
 
 from __future__ import annotations

@@ -3,10 +3,6 @@
 Several segments share a layer as long as they do not overlap; in a layer each has a number. Files
 of Slicer before 5 have a layer for each segment, in which it is 1
 (slicer.readthedocs.io, "Segmentations", "Segmentation file (.seg.nrrd) file format").
-
->>> from us_sim.volume.files.segments import segments_of
->>> segments_of({"Segment0_Name": "artery", "Segment0_Color": "1 0 0", "Segment0_LabelValue": "5"})
-[Segment(name='artery', value=5, layer=0, colour=(1.0, 0.0, 0.0), extent=None, codes=())]
 """
 
 from __future__ import annotations
@@ -19,7 +15,7 @@ from pathlib import Path
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
-from us_sim.volume.anatomical_colours import Colour
+from us_sim.volume.structure_names import Colour
 
 _FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
 

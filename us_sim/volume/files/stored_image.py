@@ -1,25 +1,243 @@
-"""An image in a MetaImage, NRRD or NIfTI file: how its numbers are stored, and where they lie.
+"""Numbers of an image in a file: how many its header says there are, how they are stored, reading
+them piece by piece.
 
->>> import numpy as np
->>> from pathlib import Path
->>> from us_sim.volume.files.stored_image import StoredImage
->>> from us_sim.volume.files.stored_voxels import StoredVoxels
->>> voxels = StoredVoxels((2, 4, 5, 6), np.dtype("u1"), Path("a.nrrd"), Path("a.nrrd"))
->>> StoredImage(voxels, 2, lambda: np.eye(4)).shape
-(4, 5, 6)
+A header is a stranger's claim: memory is taken only for what can be, and where a file holds less
+or more than its header says it is refused.
+
+An image in a MetaImage, NRRD or NIfTI file: how its numbers are stored, and where they lie.
+
+Numbers of any kind as grey values from 0 to 255, image by image.
+
+Whole numbers of 8 bits are taken as they are. All others are spread, so that the least finite one
+becomes 0 and the greatest 255; what is no number becomes 0, and infinities the end on their side.
+
+Between the order of axes in memory, where the last index is fastest, and in image files.
+
+A volume in memory is (i, j, k), and a file has its slices one after another: (k, j, i). NumPy turns
+one into the other element by element across memory; OpenCV, plane by plane and in blocks that fit
+the cache, takes a tenth of the time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import bz2
+import io
+import math
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.stored_voxels import StoredVoxels, check_claim
+
+LARGEST_VOLUME = 1 << 29
+"""Numbers in the largest image that is read: 1024 × 1024 × 512."""
+
+_STEP = 1 << 20
+_ZLIB_OR_GZIP = 32 + zlib.MAX_WBITS
+
+Encoding = Literal["raw", "packed", "bzip2", "text"]
+"""As they are; by zlib or gzip; by bzip2; as words."""
+
+
+class _Stream(Protocol):
+    def read(self, count: int, /) -> bytes: ...
+
+
+@dataclass(frozen=True)
+class StoredVoxels:
+    """Numbers as a header says that they are stored."""
+
+    size: tuple[int, ...]  # numbers along each axis, those of one voxel included, fastest first
+    type: np.dtype[Any]  # of a number, in the file's byte order
+    file: Path
+    header: Path  # the file with the header, which errors name
+    start: int = 0  # byte of the file at which they, or what is packed, begin
+    skip: int = 0  # bytes before them, after unpacking
+    encoding: Encoding = "raw"
+
+    @property
+    def expected(self) -> int:
+        """Bytes that the header says there are."""
+        return math.prod(self.size) * self.type.itemsize
+
+    def check(self) -> None:
+        """Compare the bytes with what the header says, packed ones by unpacking them in steps.
+
+        Raises:
+            VolumeError: there are more or fewer, the compression is broken, or an image of that
+                size is not read.
+        """
+        check_claim(self.header, self.size, self.type.itemsize)
+        self.check_bytes()
+
+    def check_bytes(self) -> None:
+        """The same for an image of any size.
+
+        Raises:
+            VolumeError: there are more or fewer, or the compression is broken.
+        """
+        there, enough = 0, self.skip + self.expected
+        if self.encoding == "raw":
+            there = self.file.stat().st_size - self.start
+        else:
+            with self._stream() as stream:
+                while there <= enough and (data := stream.read(_STEP)):
+                    there += len(data)
+        if there != enough:
+            raise self._other(there - self.skip)
+
+    def pieces(self, size: int, wanted: Iterable[int] | None = None) -> Iterator[NDArray[Any]]:
+        """Arrays of ``size`` numbers each, such as the slices of a volume.
+
+        Args:
+            size: numbers of a piece.
+            wanted: which pieces, ascending from 0; all without it, and then there must be no more.
+
+        Raises:
+            VolumeError: there are fewer or more than the header says, or they are damaged.
+        """
+        if self.encoding == "raw":
+            self.check_bytes()
+        step, at = size * self.type.itemsize, -self.skip
+        with self._stream() as stream:
+            for number in range(self.expected // step) if wanted is None else wanted:
+                at += _pass(stream, number * step - at)
+                data = stream.read(step) if at == number * step else b""
+                at += len(data)
+                if len(data) != step:
+                    raise self._other(at)
+                yield np.frombuffer(data, self.type)
+            if wanted is None and (more := stream.read(1)):
+                raise self._other(at + len(more))
+
+    @contextmanager
+    def _stream(self) -> Iterator[_Stream]:
+        """The bytes after unpacking, from those on that are skipped."""
+        try:
+            with self.file.open("rb") as file:
+                file.seek(self.start)
+                if self.encoding == "text":
+                    yield io.BytesIO(self._said(file))
+                elif self.encoding == "bzip2":
+                    with bz2.BZ2File(file) as unpacked:
+                        yield unpacked
+                else:
+                    yield _Inflated(file) if self.encoding == "packed" else file
+        except (zlib.error, EOFError, OSError) as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise  # the file cannot be read at all
+            raise VolumeError(
+                f"{self.header}: its compression is broken or cut short; copy it again"
+            ) from error
+
+    def _said(self, file: BinaryIO) -> bytes:
+        """Numbers that are written as words."""
+        most = 32 * math.prod(self.size) + _STEP
+        text = file.read(most + 1)
+        try:
+            words = np.array(text.replace(b",", b" ").split(), np.float64)
+        except ValueError:
+            words = np.array([math.nan])
+        # Only numbers with a fraction may be something else than finite.
+        whole = self.type.kind != "f"
+        limits = np.iinfo(self.type) if whole else None
+        if len(text) > most or (
+            limits and not ((words >= limits.min) & (words <= limits.max) & (words % 1 == 0)).all()
+        ):
+            raise VolumeError(
+                f"{self.header}: its image data are not the {self.type} numbers that its header "
+                f"says; copy or export it again"
+            )
+        return words.astype(self.type).tobytes()
+
+    def _other(self, there: int) -> VolumeError:
+        """More or fewer bytes than there should be."""
+        more = " or more" if self.encoding != "raw" and there > self.expected else ""
+        return VolumeError(
+            f"{self.header}: holds {max(there, 0)}{more} bytes of image data where its header says "
+            f"{self.expected}; copy or export it again"
+        )
+
+
+def _pass(stream: _Stream, count: int) -> int:
+    """Bytes that were passed over: ``count``, or fewer at the end."""
+    if isinstance(stream, io.BufferedReader):
+        stream.seek(count, io.SEEK_CUR)
+        return count
+    passed = 0
+    while passed < count and (data := stream.read(min(count - passed, _STEP))):
+        passed += len(data)
+    return passed
+
+
+class _Inflated:
+    """The plain bytes of a zlib or gzip stream in a file, a piece at a time."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._inflate = zlib.decompressobj(_ZLIB_OR_GZIP)
+
+    def read(self, count: int, /) -> bytes:
+        """The next ``count`` bytes; fewer at the end.
+
+        Raises:
+            EOFError: the stream breaks off.
+            zlib.error: it is damaged.
+        """
+        pieces = []
+        while count:
+            if self._inflate.eof:  # gzip may come in members
+                packed = self._inflate.unused_data or self._file.read(_STEP)
+                if not packed:
+                    break
+                self._inflate = zlib.decompressobj(_ZLIB_OR_GZIP)
+            else:
+                packed = self._inflate.unconsumed_tail or self._file.read(_STEP)
+            piece = self._inflate.decompress(packed, count)
+            if not packed and not piece and not self._inflate.eof:
+                raise EOFError
+            pieces.append(piece)
+            count -= len(piece)
+        return b"".join(pieces)
+
+
+def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
+    """Refuse an image that is larger than `LARGEST_VOLUME` or than the memory that is free.
+
+    Raises:
+        VolumeError: it is.
+    """
+    numbers = math.prod(size)
+    shown = " × ".join(map(str, size))
+    if numbers > LARGEST_VOLUME:
+        raise VolumeError(
+            f"{path}: says it holds {shown} numbers; {LARGEST_VOLUME} are read at most: cut out "
+            f"the part that is needed, or resample it"
+        )
+    # As they are stored, and as grey values.
+    needed, free = numbers * (value + 1), free_memory()
+    if needed > free:
+        raise VolumeError(
+            f"{path}: says it holds {shown} numbers, which take {needed / 1e9:.1f} GB of memory "
+            f"where {free / 1e9:.1f} GB are free: end other programs, or resample it"
+        )
+
+
+def free_memory() -> float:
+    """Bytes of memory that programs may still take, as Linux estimates it; elsewhere no limit."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        (available,) = (line for line in lines if line.startswith("MemAvailable:"))
+        return float(available.split()[1]) * 1024
+    except (OSError, ValueError):
+        return math.inf
 
 
 @dataclass(frozen=True)
@@ -91,3 +309,92 @@ class StoredImage:
         for numbers in self.voxels.pieces(i * j * self.components, wanted):
             image = numbers.reshape(form)
             yield image if self.scaling == (1.0, 0.0) else image * slope + offset
+
+
+@dataclass(frozen=True)
+class GreyLevels:
+    """What becomes black and what becomes white."""
+
+    low: float = 0.0
+    high: float = 255.0
+    missing: int = 0  # how many are no numbers
+    infinite: int = 0  # how many are +Inf or -Inf
+
+    @classmethod
+    def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
+        """The levels of images, read once; errors name the path.
+
+        Raises:
+            VolumeError: there is no finite value.
+        """
+        low, high, missing, infinite = math.inf, -math.inf, 0, 0
+        for image in images:
+            values = image
+            if image.dtype.kind == "f":
+                missing += int(np.count_nonzero(np.isnan(image)))
+                infinite += int(np.count_nonzero(np.isinf(image)))
+                values = image[np.isfinite(image)]
+            if values.size:
+                low, high = min(low, float(values.min())), max(high, float(values.max()))
+        if low > high:
+            raise VolumeError(f"{path}: holds no finite value")
+        return cls(low, high, missing, infinite)
+
+    def __call__(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+        """An image as grey values."""
+        if image.dtype == np.uint8 and (self.low, self.high) == (0.0, 255.0):
+            return np.array(image, dtype=np.uint8)
+        # Halves, since the whole range of a float64 image may exceed what float64 can hold.
+        height = image.astype(np.float64) / 2 - self.low / 2
+        level = height / ((self.high / 2 - self.low / 2) or 1.0)
+        level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+        return np.asarray(np.floor(level * 255.0 + 0.5).astype(np.uint8))
+
+    def said(self, bits: int) -> list[str]:
+        """What is made of the numbers, for a person."""
+        said = [f"{bits}-bit values spread over 0 to 255"]
+        if self.missing:
+            said.append(f"{self.missing} values that are no number are black")
+        if self.infinite:
+            said.append(f"{self.infinite} infinite values are white (+Inf) or black (-Inf)")
+        return said
+
+
+_SLAB = 1 << 23  # bytes that are turned at a time
+
+
+def file_order(voxels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(k, j, i) C-contiguous, of a part (i, j, k) of a volume."""
+    made = np.empty(voxels.shape[::-1], np.uint8)
+    for j in range(voxels.shape[1]):
+        made[:, j, :] = cv2.transpose(voxels[:, j, :])
+    return made
+
+
+def volume_of_slices(
+    slices: Iterable[NDArray[np.uint8]],
+    count: int,
+    progress: Callable[[float, str], None] | None = None,
+) -> NDArray[np.uint8]:
+    """A volume (i, j, k) of ``count`` slices (j, i), of which a few are in memory at a time.
+
+    Args:
+        slices: in order; the first is read before memory is taken for all.
+        count: how many come.
+        progress: told the fraction that is there.
+    """
+    voxels: NDArray[np.uint8] | None = None
+    slab: list[NDArray[np.uint8]] = []
+    for k, image in enumerate(slices, start=1):
+        if voxels is None:
+            voxels = np.empty((*image.shape[::-1], count), np.uint8)
+        slab.append(image)
+        if len(slab) * image.size >= _SLAB or k == count:
+            stack = np.stack(slab)
+            for j in range(stack.shape[1]):
+                voxels[:, j, k - len(slab) : k] = cv2.transpose(stack[:, j, :])
+            slab.clear()
+            if progress:
+                progress(k / count, f"{k} of {count} images")
+    assert voxels is not None
+    return voxels

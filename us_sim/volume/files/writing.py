@@ -1,25 +1,22 @@
-"""Volumes and labels into files: NRRD, MetaImage and NIfTI, through SimpleITK.
+"""Voxels into NRRD and MetaImage files as they are, a slab at a time.
+
+SimpleITK would need the whole image a second time, turned to the files' order of axes. A file is
+written beside its place under another name and renamed, so it is whole or absent.
+
+Volumes and labels into files: NRRD, MetaImage and NIfTI, through SimpleITK.
 
 A file is written beside its place under another name and renamed, so it is whole or absent.
 
->>> import pathlib, tempfile
->>> import numpy as np
->>> from us_sim.volume.files.readers import read_volume
->>> from us_sim.volume.files.writing import write_volume
->>> from us_sim.volume.volume import Volume
->>> grid = np.diag([0.5e-3, 0.5e-3, 1e-3, 1.0])
->>> volume = Volume(np.arange(60, dtype=np.uint8).reshape(3, 4, 5), grid)
->>> with tempfile.TemporaryDirectory() as folder:
-...     write_volume(pathlib.Path(folder, "volume.nrrd"), volume)
-...     again = read_volume(pathlib.Path(folder, "volume.nrrd"))
->>> bool((again.intensities == volume.intensities).all()), again.index_to_patient[2].tolist()
-(True, [0.0, 0.0, 0.001, 0.0])
+Writing images and their times as a sequence file, without poses: a MetaImage as Plus writes it.
 """
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,18 +24,155 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.anatomical_colours import Colour, anatomical_colour
-from us_sim.volume.files.axis_order import file_order
-from us_sim.volume.files.plain_writing import (
-    check_fields,
-    grid_in_mm,
-    partial_file,
-    write_plain,
-)
+from us_sim.volume.files.stored_image import file_order
+from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
+_MILLIMETRES = 1e3  # these formats hold millimetres
+_ORTHONORMAL = 1e-6  # of a direction matrix's columns; the readers' own limit is wider
+_SLAB = 1 << 23  # bytes that are turned at a time
+
+
+def write_plain(
+    path: Path,
+    voxels: NDArray[np.uint8],
+    index_to_patient: NDArray[np.float64],
+    fields: Mapping[str, str],
+) -> None:
+    """Voxels (i, j, k) as .nrrd or .mha, not compressed; a file of that name is replaced.
+
+    Raises:
+        VolumeError: as `us_sim.volume.files.writing.write_volume`.
+    """
+    grid = grid_in_mm(path, voxels.shape, index_to_patient)
+    check_fields(path, fields)
+    header = _nrrd if path.name.lower().endswith(".nrrd") else _metaimage
+    text = header(voxels.shape, *grid, fields)
+    step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
+    with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
+        file.write(text.encode("utf-8"))
+        for k in range(0, voxels.shape[2], step):
+            file.write(file_order(voxels[:, :, k : k + step]).data)
+
+
+def grid_in_mm(
+    path: Path, shape: tuple[int, ...], index_to_patient: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Spacing (3,) mm, direction (3, 3) and origin (3,) mm of a grid.
+
+    Raises:
+        VolumeError: it has no right angles, or one voxel only along an axis.
+    """
+    matrix = index_to_patient[:3, :3] * _MILLIMETRES
+    spacing = np.linalg.norm(matrix, axis=0)
+    direction = matrix / spacing
+    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
+        raise VolumeError(
+            f"{path}: the volume's axes are not at right angles, which image files cannot hold; "
+            f"resample it on a grid with right angles"
+        )
+    if min(shape) < 2:
+        raise VolumeError(
+            f"{path}: the volume has {' × '.join(map(str, shape))} voxels; two or more along each "
+            f"axis can be written"
+        )
+    return spacing, direction, index_to_patient[:3, 3] * _MILLIMETRES
+
+
+def check_fields(path: Path, fields: Mapping[str, str]) -> None:
+    """Refuse fields that would be read as something else.
+
+    Raises:
+        VolumeError: a field cannot stand in a header.
+    """
+    for key, value in fields.items():
+        if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
+            raise VolumeError(
+                f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
+                f"without blanks, colons and equals signs, and one line of text"
+            )
+
+
+@contextmanager
+def partial_file(path: Path, name: str) -> Iterator[Path]:
+    """The path of a file to write; at the end it takes the place of another.
+
+    Raises:
+        VolumeError: it cannot be written there.
+    """
+    try:
+        folder = tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.parent)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
+    partial = Path(folder, name)
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+        os.rmdir(folder)
+
+
+def _nrrd(
+    shape: tuple[int, ...],
+    spacing: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    fields: Mapping[str, str],
+) -> str:
+    """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
+    steps = " ".join(f"({_joined(axis, ',')})" for axis in (direction * spacing).T)
+    lines = [
+        "NRRD0004",
+        "type: unsigned char",
+        "dimension: 3",
+        "space: left-posterior-superior",
+        f"sizes: {' '.join(map(str, shape))}",
+        f"space directions: {steps}",
+        "kinds: domain domain domain",
+        "endian: little",
+        "encoding: raw",
+        f"space origin: ({_joined(origin, ',')})",
+        *(f"{key}:={value}" for key, value in fields.items()),
+    ]
+    return "\n".join([*lines, "", ""])
+
+
+def _metaimage(
+    shape: tuple[int, ...],
+    spacing: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    fields: Mapping[str, str],
+) -> str:
+    """itk.org/Wiki/MetaIO/Documentation, with further fields in between."""
+    said = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": _joined(direction.T.ravel(), " "),
+        "Offset": _joined(origin, " "),
+        "CenterOfRotation": "0 0 0",
+        "ElementSpacing": _joined(spacing, " "),
+        "DimSize": " ".join(map(str, shape)),
+        **fields,
+        "ElementType": "MET_UCHAR",
+        "ElementDataFile": "LOCAL",
+    }
+    return "".join(f"{key} = {value}\n" for key, value in said.items())
+
+
+def _joined(numbers: NDArray[np.float64], between: str) -> str:
+    """Numbers to their last digit; without -0, which says nothing."""
+    return between.join(f"{number + 0.0:.17g}" for number in numbers)
+
+
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
-_SLAB = 1 << 24  # voxels that are turned at a time
+_SLAB_VOXELS = 1 << 24  # voxels that are turned at a time
 _FASTEST = 1  # zlib's level; speckle hardly becomes smaller with any other
 
 
@@ -127,7 +261,7 @@ def _image(path: Path, voxels: NDArray[np.uint8], volume: Volume) -> sitk.Image:
     """The voxels (i, j, k) where the volume places them; a slab is turned at a time."""
     spacing, direction, origin = grid_in_mm(path, voxels.shape, volume.index_to_patient)
     image = sitk.Image(list(voxels.shape), sitk.sitkUInt8)
-    step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
+    step = max(1, _SLAB_VOXELS // (voxels.shape[0] * voxels.shape[1]))
     for k in range(0, voxels.shape[2], step):
         slab = sitk.GetImageFromArray(file_order(voxels[:, :, k : k + step]))
         image[:, :, k : k + step] = slab
@@ -149,3 +283,75 @@ def _write(path: Path, image: sitk.Image, fields: Mapping[str, str], *, packed: 
             sitk.WriteImage(image, str(partial), packed, _FASTEST)
         except RuntimeError as error:
             raise VolumeError(f"{path}: cannot be written: the disk may be full") from error
+
+
+def write_image_sequence(
+    path: Path,
+    images: Iterator[NDArray[np.uint8]],
+    shape: tuple[int, int, int],
+    times: Sequence[float],
+    pixel_mm: tuple[float, float] = (1.0, 1.0),
+    header: Mapping[str, str] | None = None,
+) -> None:
+    """Images (rows, columns), one after another, into a new file.
+
+    Args:
+        path: ends in .mha.
+        images: in order.
+        shape: number of images, rows, columns.
+        times: s, of each image.
+        pixel_mm: width and height of a pixel.
+        header: further fields of one line each.
+
+    Raises:
+        VolumeError: the name ends otherwise, or the file cannot be written.
+    """
+    if not path.name.lower().endswith(".mha"):
+        raise VolumeError(f"{path}: a sequence of images is written as .igs.mha or .mha")
+    assert len(times) == shape[0]
+    assert all(map(math.isfinite, times))
+    try:
+        number, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
+    try:
+        with os.fdopen(number, "wb") as file:
+            file.write(_header(shape, times, pixel_mm, header or {}).encode("ascii"))
+            for image in images:
+                file.write(np.ascontiguousarray(image).tobytes())
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)  # as any file; mkstemp's are the owner's alone
+        os.replace(name, path)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def _header(
+    shape: tuple[int, int, int],
+    times: Sequence[float],
+    pixel_mm: tuple[float, float],
+    more: Mapping[str, str],
+) -> str:
+    count, rows, columns = shape
+    fields = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "DimSize": f"{columns} {rows} {count}",
+        "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
+        "ElementType": "MET_UCHAR",
+        "Kinds": "domain domain list",
+        "UltrasoundImageOrientation": "MFA",
+        "UltrasoundImageType": "BRIGHTNESS",
+        **more,
+    }
+    for number, time in enumerate(times):
+        fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
+        fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
+    fields["ElementDataFile"] = "LOCAL"
+    return "".join(f"{key} = {value}\n" for key, value in fields.items())

@@ -4,15 +4,6 @@ Each voxel holds a complex, normally distributed echo: the sum of many scatterer
 A Gaussian point spread correlates neighbours, and the envelope of the sum is Rayleigh distributed
 wherever the mean echo is even (Wagner, Smith, Sandrik, Lopez 1983). Interfaces that are smooth on
 the scale of a wavelength add an echo of one phase, which does not speckle.
-
->>> import numpy as np
->>> from us_sim.volume.phantom.speckle import PointSpread, echo_envelope
->>> even = np.ones((40, 40, 80), np.float32)
->>> depth = np.arange(80) * 0.3e-3
->>> random = np.random.Generator(np.random.PCG64(1))
->>> envelope = echo_envelope(even, 0 * even, 0.3e-3, depth, PointSpread(), random)
->>> round(float(np.mean(envelope**2)), 1)  # the power put in
-1.0
 """
 
 from __future__ import annotations

@@ -1,4 +1,11 @@
-"""The anatomy of a virtual upper arm: its structures, and how they scatter.
+"""An elliptical tube along y that swings gently: a vessel, a nerve or the shaft of a bone.
+
+Random textures of tissue: smooth noise, and the thin sheets where it is zero.
+
+The noise is fixed by its seed and its lengths alone, so the same tissue comes out of every voxel
+size.
+
+The anatomy of a virtual upper arm: its structures, and how they scatter.
 
 A block of the inner side of the arm, the skin at z = 0, vessels and humerus along y. Proportions
 follow what ultrasound shows at mid-arm: the brachial artery between a vein and the median nerve,
@@ -7,14 +14,6 @@ in a sheath under the fascia, biceps above and brachialis below, the humerus to 
 What depends on where the probe is has no place in it: loss, shadows, the borders of structures and
 the noise of a scanner, see `us_sim.slicing.acoustics`. Sheets of connective tissue within fat and
 muscle lie along the skin for the most part, so those that do are the stronger ones.
-
->>> import numpy as np
->>> from us_sim.volume.phantom.upper_arm import UPPER_ARM_LABELS, UpperArm
->>> arm = UpperArm(seed=1)
->>> x, z = np.linspace(-0.036, 0.036, 90), np.linspace(0.0, 0.054, 70)
->>> section = arm.section(x, 0.0, z)
->>> bool((section.labels == UPPER_ARM_LABELS["vein"]).any())
-True
 """
 
 from __future__ import annotations
@@ -26,8 +25,118 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from us_sim.volume.phantom.texture import SmoothNoise, sheets
-from us_sim.volume.phantom.tube import Tube
+_WAVELENGTH = 70e-3
+
+
+@dataclass(frozen=True)
+class Tube:
+    """Centre line and cross-section, m, in a frame whose y runs along the tube."""
+
+    centre: tuple[float, float]  # m, x and z
+    radii: tuple[float, float]  # m, along x and z
+    swing: tuple[float, float] = (0.0, 0.0)  # m, amplitude along x and z
+    phase: float = 0.0  # rad, of the swing at y = 0
+
+    def middle(self, y: float) -> tuple[float, float]:
+        """(x, z) m of the centre line at y."""
+        angle = 2 * np.pi * y / _WAVELENGTH + self.phase
+        return (
+            self.centre[0] + self.swing[0] * float(np.sin(angle)),
+            self.centre[1] + self.swing[1] * float(np.sin(0.7 * angle + 1.0)),
+        )
+
+    def distance(
+        self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Distance (X, Z) m from the wall, negative inside.
+
+        The distance is exact on the wall and right to first order beside it.
+        """
+        middle_x, middle_z = self.middle(y)
+        across = (x[:, None] - middle_x) / self.radii[0]
+        down = (z[None, :] - middle_z) / self.radii[1]
+        # A square root is several times faster than hypot, and nothing here over- or underflows.
+        radius = np.sqrt(np.maximum(across**2 + down**2, 1e-12))
+        slope = np.sqrt((across / self.radii[0]) ** 2 + (down / self.radii[1]) ** 2)
+        slope = np.maximum(slope, 1e-6 / max(self.radii))
+        return np.asarray((radius - 1.0) * radius / slope)
+
+
+_SPLINE_VARIANCE = 151.0 / 315.0
+"""The mean over a cell of the sum of squared cubic B-spline weights: the variance that
+interpolation leaves along an axis."""
+
+
+class SmoothNoise:
+    """Stationary noise of mean 0 and variance 1, twice continuously differentiable.
+
+    A tensor product cubic B-spline with normally distributed coefficients.
+
+    Args:
+        random: source of the coefficients.
+        block: (2, 3) m, lower and upper corner of the block to be sampled; the outermost
+            coefficients continue beyond it.
+        lengths: (x, y, z) m, between coefficients: features are about twice as long.
+    """
+
+    def __init__(
+        self,
+        random: np.random.Generator,
+        block: NDArray[np.float64],
+        lengths: tuple[float, float, float],
+    ) -> None:
+        self._lower = block[0]
+        self._lengths = np.array(lengths)
+        counts = np.ceil((block[1] - block[0]) / self._lengths - 1e-9).astype(int) + 3
+        self._coefficients = random.standard_normal(counts) / _SPLINE_VARIANCE**1.5
+
+    def plane(
+        self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(X, Z) values at the coordinates x (X,), y and z (Z,), in m."""
+        here = np.tensordot(self._weights(np.array([y]), 1)[0], self._coefficients, axes=(0, 1))
+        return self._weights(x, 0) @ here @ self._weights(z, 2).T
+
+    def line(self, x: NDArray[np.float64], y: float) -> NDArray[np.float64]:
+        """(X,) values along x at y, m, in the lower face of the block."""
+        return self.plane(x, y, self._lower[2:])[:, 0]
+
+    def _weights(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        """(V, coefficients) cubic B-spline weights of positions along an axis."""
+        count = self._coefficients.shape[axis]
+        position = (values - self._lower[axis]) / self._lengths[axis]
+        position = np.clip(position, 0.0, count - 3 - 1e-9)
+        cell = np.floor(position).astype(int)
+        t = position - cell
+        weights = np.zeros((len(values), count))
+        rows = np.arange(len(values))
+        weights[rows, cell] = (1 - t) ** 3 / 6
+        weights[rows, cell + 1] = (3 * t**3 - 6 * t**2 + 4) / 6
+        weights[rows, cell + 2] = (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6
+        weights[rows, cell + 3] = t**3 / 6
+        return weights
+
+
+def sheets(
+    noise: NDArray[np.float64], steps: tuple[float, float], thickness: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Thin sheets of one thickness where a noise is zero: septa of fat, perimysium of muscle.
+
+    Args:
+        noise: (X, Z) a plane of smooth noise.
+        steps: m, between its samples along x and z.
+        thickness: m, the standard deviation of a sheet's profile.
+
+    Returns:
+        The profile (X, Z), 1 in a sheet's middle, and how squarely (X, Z) the sheet faces the
+        beam along z: the squared cosine of the angle between its normal and z.
+    """
+    slope_x, slope_z = np.gradient(noise, *steps)
+    # Where the noise is flat at zero the sheet would be a blot: bound the slope from below.
+    square = slope_x**2 + slope_z**2
+    square = np.maximum(square, 0.05 * square.mean())
+    return np.exp(-(noise**2) / square / (2 * thickness**2)), slope_z**2 / square
+
 
 UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
 """Lower and upper corner of the block in frame ``patient``, m."""

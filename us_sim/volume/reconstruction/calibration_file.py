@@ -2,20 +2,6 @@
 
 Plus' XML may hold several transforms (``<Transform From="Image" To="Probe" Matrix=.../>``, mm),
 and which part of an image is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
-
->>> import pathlib, tempfile
->>> from us_sim.volume.reconstruction.calibration_file import read_calibration
->>> text = '''<PlusConfiguration><CoordinateDefinitions>
-... <Transform From="Image" To="Probe" Matrix="0.1 0 0 5  0 0.1 0 0  0 0 0.1 0  0 0 0 1"/>
-... </CoordinateDefinitions>
-... <VolumeReconstruction ClipRectangleOrigin="10 20" ClipRectangleSize="300 200"/>
-... </PlusConfiguration>'''
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "plus.xml")
-...     _ = path.write_text(text)
-...     calibration = read_calibration(path, "Probe")
->>> calibration.transforms["ImageToProbe"][0].tolist(), calibration.part.clip
-([0.0001, 0.0, 0.0, 0.005], (10.0, 20.0, 300.0, 200.0))
 """
 
 from __future__ import annotations
@@ -31,8 +17,7 @@ from numpy.typing import NDArray
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.settings.text_files import YamlError, load_yaml, read_bytes
 from us_sim.volume.reconstruction.settings import ImagePart
-from us_sim.volume.sequences.frame_transforms import in_metres
-from us_sim.volume.sequences.sequence_header import frame_matrix
+from us_sim.volume.sequences.transforms import frame_matrix, in_metres
 
 _PART = {
     "ClipRectangleOrigin": 2,

@@ -1,42 +1,34 @@
 """A volume from a tracked sweep: its grid, its images inserted, its holes filled.
 
->>> import pathlib, tempfile
->>> from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
->>> from us_sim.volume.reconstruction.settings import Compounding
->>> from us_sim.volume.sequences.sweep import read_sweep
->>> header = ["ObjectType = Image", "NDims = 3", "DimSize = 4 3 5", "ElementType = MET_UCHAR"]
->>> for k in range(5):
-...     pose = f"1 0 0 9 0 1 0 0 0 0 1 {k} 0 0 0 1"
-...     header.append(f"Seq_Frame000{k}_ImageToReferenceTransform = {pose}")
-...     header.append(f"Seq_Frame000{k}_Timestamp = 0.{k}")
->>> text = "\\n".join([*header, "ElementDataFile = LOCAL", ""])
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "sweep.igs.mha")
-...     _ = path.write_bytes(text.encode() + bytes(range(60)))
-...     made = reconstruct(plan(read_sweep(path), Compounding(spacing=0.001)))
->>> made.volume.shape, made.volume.intensities[3, 2].tolist()
-((4, 3, 5), [11, 23, 35, 47, 59])
+How well a reconstruction predicts images that it has not seen.
+
+The honest test of the whole chain of calibration, tracking and compounding: frames that are left
+out are cut from the volume of the others and compared with what the probe saw there.
+
+A volume that grows while a probe scans: images inserted at poses, in a box that is fixed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.grid import (
     Grid,
     axes_of_smallest_box,
     grid_around,
+    image_mask,
+    outline,
     proposed_spacing,
 )
-from us_sim.volume.reconstruction.hole_filling import fill_holes
-from us_sim.volume.reconstruction.image_mask import image_mask, outline
-from us_sim.volume.reconstruction.insertion import Collection, Insertion
-from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
+from us_sim.volume.reconstruction.settings import Compounding, ImagePart, LiveBox
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
@@ -184,3 +176,147 @@ def _medians(
         tell(_FILLING * done / len(frames), "inserting images")
         pixels.insert(image, sweep.image_to_reference[k], used)
     return pixels.result()
+
+
+APART = 8
+"""Frames from one that is left out to the next: the seven between are enough to predict it."""
+_LEAST = 100  # pixels for a correlation
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """How like the frames left out and their predictions are."""
+
+    frames: NDArray[np.int64]  # (N,) numbers of the frames in the file
+    correlations: NDArray[np.float64]  # (N,) normalised cross-correlation; nan where not covered
+    covered: NDArray[np.float64]  # (N,) fraction of the used pixels that the others predict
+
+    @property
+    def median(self) -> float:
+        """The median correlation."""
+        return float(np.nanmedian(self.correlations))
+
+    @property
+    def worst(self) -> float:
+        """The lowest correlation."""
+        return float(np.nanmin(self.correlations))
+
+
+def leave_one_out(planned: Plan, count: int, progress: Progress | None = None) -> Prediction:
+    """Predict some frames of a sweep from all others.
+
+    The frames are spread over the sweep, with seven others between two of them or more, so that
+    each is predicted as if it alone were left out; one reconstruction does for all of them.
+
+    Args:
+        planned: what is inserted where.
+        count: how many frames, fewer where the sweep is short.
+        progress: is told how far it is.
+
+    Raises:
+        VolumeError: the sweep has fewer than three frames, or the others predict nothing of those.
+    """
+    total = len(planned.sweep.numbers)
+    if total < 3:
+        raise VolumeError(
+            f"{planned.sweep.path}: has {total} usable frames; leaving one out needs 3 or more"
+        )
+    count = max(1, min(count, total // APART))
+    chosen = np.unique(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1])
+    others = np.setdiff1d(np.arange(total), chosen)
+    made = reconstruct(planned, [int(k) for k in others], progress)
+    correlations, covered = [], []
+    for k, image in zip(chosen, planned.sweep.images(chosen.tolist()), strict=True):
+        seen, predicted, fraction = _pair(planned, made, int(k), image)
+        covered.append(fraction)
+        correlations.append(correlation(seen, predicted) if len(seen) >= _LEAST else math.nan)
+    if np.isnan(correlations).all():
+        raise VolumeError(
+            f"{planned.sweep.path}: the other frames predict nothing of the {len(chosen)} left "
+            f"out: the frames are too far apart; give a larger --hole-radius or --spacing"
+        )
+    return Prediction(planned.sweep.numbers[chosen], np.array(correlations), np.array(covered))
+
+
+def correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
+    """Pearson's correlation; nan where one is constant."""
+    first, second = first - first.mean(), second - second.mean()
+    scale = math.sqrt(float(first @ first) * float(second @ second))
+    return float(first @ second) / scale if scale else math.nan
+
+
+def _pair(
+    planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
+    rows, columns = np.nonzero(planned.used)
+    matrix = planned.sweep.image_to_reference[k]
+    points = columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
+    if planned.rest is not None:
+        points = planned.rest(k, points)
+    to_index = planned.grid.reference_to_index
+    index = (points @ to_index[:3, :3].T + to_index[:3, 3]).T
+    size = np.array(planned.grid.shape)[:, None]
+    inside = (np.isfinite(index) & (index >= -0.5) & (index < size - 0.5)).all(axis=0)
+    index = np.where(inside, index, 0.0)
+    covered = made.covered.view(np.uint8)
+    whole = ndimage.map_coordinates(covered, index, np.float32, order=1, mode="nearest")
+    used = inside & (whole > 1.0 - 1e-5)
+    predicted = ndimage.map_coordinates(
+        made.volume.intensities, index[:, used], np.float64, order=1, mode="nearest"
+    )
+    seen = image[rows[used], columns[used]].astype(np.float64)
+    return seen, predicted, float(used.mean())
+
+
+class LiveReconstruction:
+    """Inserts one image after the other.
+
+    Args:
+        box: where, and how.
+
+    Raises:
+        VolumeError: it has too many voxels, or more than the free memory holds.
+    """
+
+    def __init__(self, box: LiveBox) -> None:
+        self.box = box
+        corners = np.array([box.lower, box.upper])
+        self._insertion = Insertion(
+            grid_around(corners, box.spacing), method=box.method, compounding=box.compounding
+        )
+        self._used = np.ones((0, 0), dtype=np.bool_)
+        self.frames = 0
+
+    def insert(self, image: NDArray[np.uint8], image_to_patient: NDArray[np.float64]) -> None:
+        """Insert an image; pixels that were black in all images so far lie beside the beams.
+
+        Args:
+            image: (rows, columns) grey values.
+            image_to_patient: (4, 4) m, from (column, row, 0, 1).
+        """
+        if self._used.shape != image.shape:
+            self._used = np.zeros(image.shape, dtype=np.bool_)
+        self._used |= image > 0
+        self._insertion.insert(np.ascontiguousarray(image), image_to_patient, self._used)
+        self.frames += 1
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._insertion.clear()
+        self.frames = 0
+
+    def volume(self) -> Volume:
+        """What has been inserted so far, its holes filled.
+
+        Raises:
+            VolumeError: nothing has, within the box.
+        """
+        grey, covered = self._insertion.result()
+        if not covered.any():
+            raise VolumeError(
+                f"nothing of the {self.frames} images lies in the box from "
+                f"{list(self.box.lower)} to {list(self.box.upper)} m; set lower and upper"
+            )
+        fill_holes(grey, covered, self.box.hole_radius / self.box.spacing)
+        return Volume(grey, self._insertion.grid.index_to_reference)

@@ -1,4 +1,9 @@
-"""The probe that made a sweep and where it was, as far as the sweep's images tell."""
+"""The shape of what a probe scans, found in its images: the fan or the rectangle that is not black.
+
+Only what its edges prove is said: a shape that does not fit them well is none.
+
+The probe that made a sweep and where it was, as far as the sweep's images tell.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +13,260 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
+from scipy.ndimage import label as connected_parts
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import theilslopes
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.placement import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import PROBES
-from us_sim.volume.reconstruction.scanned_part import (
-    Fan,
-    Rectangle,
-    box_around,
-    fitted_part,
-    seen_pixels,
-)
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
+
+_LOOKED_AT = 32  # frames
+_OFTEN = 0.7
+"""Of these frames, in how many a pixel is not black where it was scanned: lossy compression spills
+a few grey levels beyond the border, other ones in every frame."""
+_OVERLAP = 0.95  # intersection over union of what was seen with the shape
+_OFF = 0.01  # of the depth, that edges may be off, and this many pixels more
+_OFF_PIXELS = 1.5
+_COUNTED = 80.0  # percent of an edge's points that may not be farther off
+_LEAST_POINTS = 16  # of an edge
+_LEAST_SIDE = 0.25  # of the height, that is not cut off by the image's border
+_SMALL = np.ones((3, 3))  # pixels of specks and threads
+_CORNER = 0.1  # of the opening angle, beside which a fan's top is its side rather than its face
+_NARROW = math.radians(4.0)  # opening angle below which it is no fan
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Beams from an arc; m from the centre of pixel (0, 0), x along rows, z along columns."""
+
+    apex: tuple[float, float]
+    radius: tuple[float, float]  # where beams begin and end
+    angles: tuple[float, float]  # of the first and last beam, from +z towards +x
+
+    @property
+    def opening_angle(self) -> float:
+        """Between the outermost beams."""
+        return self.angles[1] - self.angles[0]
+
+    def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points are in it."""
+        across, down = x - self.apex[0], z - self.apex[1]
+        radius, angle = np.hypot(across, down), np.arctan2(across, down)
+        held = (radius >= self.radius[0]) & (radius <= self.radius[1])
+        return np.asarray(held & (angle >= self.angles[0]) & (angle <= self.angles[1]))
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Parallel beams; m from the centre of pixel (0, 0), x along rows, z along columns."""
+
+    x: tuple[float, float]
+    z: tuple[float, float]
+
+    def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points are in it."""
+        held = (x >= self.x[0]) & (x <= self.x[1]) & (z >= self.z[0]) & (z <= self.z[1])
+        return np.asarray(held)
+
+
+def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
+    """(rows, columns) whether a pixel is not black in most of some frames all over a sweep.
+
+    Raises:
+        VolumeError: the images are damaged.
+    """
+    count = len(sweep.numbers)
+    picked = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int))
+    often = np.zeros((sweep.rows, sweep.columns), dtype=np.int32)
+    for image in sweep.images(picked.tolist()):
+        often += image > 0
+    return np.asarray(often >= _OFTEN * len(picked))
+
+
+def fitted_part(
+    seen: NDArray[np.bool_],
+    pixel: NDArray[np.float64],
+    used: NDArray[np.bool_] | None = None,
+) -> Fan | Rectangle | None:
+    """The fan or the rectangle that was scanned; None where neither fits.
+
+    Args:
+        seen: (rows, columns) pixels that are not black.
+        pixel: (2,) m, from one column to the next, and from one row to the next.
+        used: pixels that count; edges on their border are not the probe's where they cut a fan.
+    """
+    within = np.ones_like(seen) if used is None else used
+    body = _body(seen & within)
+    if body is None:
+        return None
+    edges = _Edges(body, within, pixel)
+    rows, columns = np.indices(body.shape)
+    x, z = columns * pixel[0], rows * pixel[1]
+    best: Fan | Rectangle | None = None
+    least = _OVERLAP
+    for part in (_rectangle(edges), _fan(edges)):
+        if part is None:
+            continue
+        inside = part.holds(x, z) & within
+        overlap = float((inside & body).sum() / max(1, (inside | body).sum()))
+        if overlap > least:
+            best, least = part, overlap
+    return best
+
+
+def box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
+    """The smallest rectangle of pixels around the largest part of those seen (rows, columns).
+
+    Args:
+        seen: some of them.
+        pixel: as in `fitted_part`.
+    """
+    body = _body(seen)
+    rows, columns = np.nonzero(seen if body is None else body)
+    x, z = (
+        (float((each.min() - 0.5) * side), float((each.max() + 0.5) * side))
+        for each, side in ((columns, pixel[0]), (rows, pixel[1]))
+    )
+    return Rectangle(x, z)
+
+
+def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """The largest connected part, without its holes; letters and scales beside it are others."""
+    around = np.pad(seen, 1)
+    smooth = binary_opening(binary_fill_holes(binary_closing(around, _SMALL)), _SMALL)
+    parts, count = connected_parts(smooth[1:-1, 1:-1])
+    if not count:
+        return None
+    return np.asarray(parts == int(np.argmax(np.bincount(parts.reshape(-1))[1:])) + 1)
+
+
+class _Edges:
+    """Points (N, 2) m, x and z, on the border of a part; those that the image cuts are left out."""
+
+    def __init__(
+        self, body: NDArray[np.bool_], within: NDArray[np.bool_], pixel: NDArray[np.float64]
+    ) -> None:
+        around = np.pad(within, 1)
+        rows = np.flatnonzero(body.any(axis=1))
+        columns = np.flatnonzero(body.any(axis=0))
+        first = body[rows].argmax(axis=1)
+        last = body.shape[1] - 1 - body[rows, ::-1].argmax(axis=1)
+        top = body[:, columns].argmax(axis=0)
+        bottom = body.shape[0] - 1 - body[::-1, columns].argmax(axis=0)
+        self.pixel = pixel
+        self.height = len(rows) * float(pixel[1])
+        self.all = [
+            _placed(first - 0.5, rows, pixel),
+            _placed(last + 0.5, rows, pixel),
+            _placed(columns, top - 0.5, pixel),
+            _placed(columns, bottom + 0.5, pixel),
+        ]
+        left = around[rows + 1, first] & (np.arange(len(rows)) <= np.argmin(first))
+        right = around[rows + 1, last + 2] & (np.arange(len(rows)) <= np.argmax(last))
+        over = around[top, columns + 1]
+        under = around[bottom + 2, columns + 1]
+        free = (left, right, over, under)
+        self.free = [points[kept] for points, kept in zip(self.all, free, strict=True)]
+
+
+def _placed(
+    columns: NDArray[np.generic], rows: NDArray[np.generic], pixel: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(np.column_stack([columns, rows]) * pixel)
+
+
+def _allowed(edges: _Edges, depth: float) -> float:
+    """m, by which most points of an edge may be off at most."""
+    return _OFF * depth + _OFF_PIXELS * float(edges.pixel.max())
+
+
+def _rectangle(edges: _Edges) -> Rectangle | None:
+    places = [float(np.median(edges.all[k][:, k // 2])) for k in range(4)]
+    left, right, top, bottom = places
+    off = [np.percentile(np.abs(edges.all[k][:, k // 2] - places[k]), _COUNTED) for k in range(4)]
+    if max(off) > _allowed(edges, bottom - top):
+        return None
+    return Rectangle((left, right), (top, bottom))
+
+
+def _fan(edges: _Edges) -> Fan | None:
+    """By its four edges together, with little weight on points that are far off."""
+    lines = _lines(edges)
+    if lines is None:
+        return None
+    left, right, over, under = _on_fan(edges.free, *lines)
+    apex, _, _ = lines
+    if len(over) < _LEAST_POINTS:
+        if len(_on_fan(edges.all, *lines)[2]) >= _LEAST_POINTS:
+            return None  # the image cuts off the face
+        over = edges.all[2][edges.all[2][:, 1].argmin()][None, :]  # the beams' common start
+    if len(under) < _LEAST_POINTS:
+        under = edges.all[3][edges.all[3][:, 1].argmax()][None, :]  # it cuts off the bottom
+    if min(len(left), len(right)) < _LEAST_POINTS:
+        return None
+    begins, ends = (float(np.median(np.hypot(*(each - apex).T))) for each in (over, under))
+    start = [*apex, *lines[1:], begins, ends]
+
+    def off(shape: NDArray[np.float64] | list[float]) -> list[NDArray[np.float64]]:
+        x, z, first, last, begins, ends = shape
+        return [
+            (left - [x, z]) @ [math.cos(first), -math.sin(first)],
+            (right - [x, z]) @ [math.cos(last), -math.sin(last)],
+            np.hypot(*(over - [x, z]).T) - begins,
+            np.hypot(*(under - [x, z]).T) - ends,
+        ]
+
+    fitted = least_squares(
+        lambda shape: np.concatenate(off(shape)),
+        start,
+        loss="soft_l1",
+        f_scale=float(edges.pixel.max()),
+        x_scale=[1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3],
+    )
+    x, z, first, last, begins, ends = map(float, fitted.x)
+    depth = ends - begins
+    if not (0.0 <= begins < ends and last - first > _NARROW):
+        return None
+    worst = [np.percentile(np.abs(each), _COUNTED) for each in off(fitted.x) if len(each)]
+    if max(worst) > _allowed(edges, depth):
+        return None
+    return Fan((x, z), (begins, ends), (first, last))
+
+
+def _on_fan(
+    edges: list[NDArray[np.float64]], apex: NDArray[np.float64], first: float, last: float
+) -> list[NDArray[np.float64]]:
+    """Of the points of four edges, those that lie where a fan's edges do."""
+    angles = [np.arctan2(*(points - apex).T) for points in edges]
+    middle, corner = 0.5 * (first + last), _CORNER * (last - first)
+    left, right, over, under = edges
+    across = (angles[2] > first + corner) & (angles[2] < last - corner)
+    below = (angles[3] > first) & (angles[3] < last)
+    return [left[angles[0] < middle], right[angles[1] > middle], over[across], under[below]]
+
+
+def _lines(edges: _Edges) -> tuple[NDArray[np.float64], float, float] | None:
+    """A fan's apex (2,) m and the angles of its sides, at first."""
+    least = _LEAST_SIDE * edges.height
+    for side in edges.free[:2]:
+        if len(side) < _LEAST_POINTS or np.ptp(side[:, 1]) < least:
+            return None
+    (slope, base), (other, further) = (
+        theilslopes(side[:: 1 + len(side) // 200, 0], side[:: 1 + len(side) // 200, 1])[:2]
+        for side in edges.free[:2]
+    )
+    if math.atan(other) - math.atan(slope) < _NARROW:
+        return None
+    z = (base - further) / (other - slope)
+    return np.array([slope * z + base, z]), math.atan(slope), math.atan(other)
+
 
 _POSES = 33
 _SKEWED = 0.05  # cosine between columns and rows, more than a calibration is inexact

@@ -21,21 +21,22 @@ from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
-from us_sim.volume.reconstruction.leave_one_out import APART, Prediction, leave_one_out
 from us_sim.volume.reconstruction.picture import draw_slices
 from us_sim.volume.reconstruction.reconstruction import (
+    APART,
     Plan,
+    Prediction,
     Progress,
     Reconstruction,
     Rest,
+    leave_one_out,
     plan,
     reconstruct,
 )
 from us_sim.volume.reconstruction.scanning_probe import ScanningProbe, scanning_probe
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.sweep import Sweep, sweep_of
-from us_sim.volume.sequences.time_shift import shifted
+from us_sim.volume.sequences.sweep import Sweep, shifted, sweep_of
 
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 _FRAME = "frame"

@@ -1,4 +1,8 @@
-"""Segmentation of a case, or of a volume file into a folder: labels, surfaces, picture.
+"""A folder that is there whole at the end, or not at all.
+
+What a segmentation came to, in lines for a person and as a page.
+
+Segmentation of a case, or of a volume file into a folder: labels, surfaces, picture.
 
 All of it is there at the end, or nothing is changed.
 """
@@ -7,7 +11,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +22,6 @@ from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.choice import Chosen
 from us_sim.settings.reading import document_of
 from us_sim.share import shared_roots
-from us_sim.volume.anatomical_colours import anatomical_colour
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, is_case, read_case
 from us_sim.volume.cases.provenance import Source, Step, add_step
 from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
@@ -23,16 +29,95 @@ from us_sim.volume.cases.writing import changed_case, write_case_settings
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_labels
-from us_sim.volume.label_map import LabelMap
-from us_sim.volume.segmentation.new_folder import new_folder
-from us_sim.volume.segmentation.request import SegmentRequest
-from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds, read_seeds
+from us_sim.volume.segmentation.settings import (
+    SegmentationSettings,
+    SegmentRequest,
+    StructureSeeds,
+    read_seeds,
+)
 from us_sim.volume.segmentation.structures import segment
-from us_sim.volume.segmentation.summary import summary, write_report
+from us_sim.volume.structure_names import anatomical_colour
 from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
 from us_sim.volume.surfaces.surface_files import write_surface
-from us_sim.volume.volume import Volume
+from us_sim.volume.volume import LabelMap, Volume
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write to, which gets its name at the end.
+
+    Raises:
+        VolumeError: there is something of that name, or it cannot be made.
+    """
+    if os.path.lexists(folder):
+        raise VolumeError(f"{folder}: exists already; choose another name, or remove it")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    except OSError as error:
+        raise VolumeError(f"{folder}: cannot be made: {error.strerror}") from error
+    try:
+        mask = os.umask(0)
+        os.umask(mask)
+        partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
+        yield partial
+        try:
+            os.rename(partial, folder)
+        except OSError as error:
+            raise VolumeError(f"{folder}: cannot be made: {error.strerror}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+_HEADING = ("structure", "volume", "triangles", "area", "parts", "handles", "volume kept", "moved")
+
+
+def summary(where: Path, made: Sequence[StructureSurface], remarks: Sequence[str]) -> str:
+    """A line for each structure, and what should be known."""
+    rows = [_HEADING, *(_cells(one) for one in made)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADING))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if not column else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
+    return "\n".join([*lines, *(f"note: {remark}" for remark in remarks), f"written to {where}"])
+
+
+def write_report(
+    file: Path, picture: str, made: Sequence[StructureSurface], remarks: Sequence[str]
+) -> None:
+    """The same as Markdown, with the picture."""
+    lines = ["# Segmentation", "", f"![slices with outlines, and surfaces]({picture})", ""]
+    lines += [f"| {' | '.join(_HEADING)} |", "|" + " --- |" * len(_HEADING)]
+    lines += [f"| {' | '.join(_cells(one))} |" for one in made]
+    lines += [
+        "",
+        "Volume is that of the labelled voxels; volume kept is what the surface encloses of it. "
+        "Handles count how often a surface has a hole right through. Moved is the largest distance "
+        "by which fewer triangles moved the surface.",
+        "",
+        *(f"- {remark}" for remark in remarks),
+    ]
+    file.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def _cells(one: StructureSurface) -> tuple[str, ...]:
+    surface = one.surface
+    return (
+        one.name,
+        f"{one.voxels_volume * 1e6:.3f} ml",
+        str(len(surface.triangles)),
+        f"{surface.area * 1e4:.2f} cm²",
+        str(surface.parts),
+        str(surface.genus),
+        f"{100 * one.volume_kept:.2f} %",
+        f"{one.moved * 1e3:.3f} mm",
+    )
+
 
 PICTURE = "segmentation.png"
 REPORT = "segmentation.md"

@@ -19,14 +19,15 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.volume.segmentation.covered import covered_part
-from us_sim.volume.segmentation.morphology import (
+from us_sim.volume.segmentation.methods import covered_part, tube_scales, tubeness
+from us_sim.volume.segmentation.region import (
+    Region,
+    array_of,
     ball_eroded,
     ball_opened,
+    image_of,
     parts_at_least,
 )
-from us_sim.volume.segmentation.region import Region, array_of, image_of
-from us_sim.volume.segmentation.vesselness import tube_scales, tubeness
 
 _DIAMETER = Quantity("length", 5e-4, 0.05)
 _PART = Quantity("number", 0.0, 1.0)

@@ -13,10 +13,9 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
-from us_sim.volume.label_map import LabelMap
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.voxel_surface import voxel_surface
-from us_sim.volume.volume import Volume
+from us_sim.volume.surfaces.label_surface import voxel_surface
+from us_sim.volume.volume import LabelMap, Volume
 
 _AXES = ("i", "j", "k")
 _SLICES = 3  # along each axis

@@ -1,18 +1,6 @@
-"""Structures of a volume, each found as its seeds say, put together into labels.
+"""Which voxels a person's points are in, and the part of a volume that is looked at around them.
 
->>> import numpy as np
->>> from us_sim.settings.choice import Chosen
->>> from us_sim.volume.segmentation.growing import SeededGrowing
->>> from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
->>> from us_sim.volume.segmentation.structures import segment
->>> from us_sim.volume.volume import Volume
->>> grey = np.full((20, 20, 20), 90, np.uint8)
->>> grey[5:15, 8:12, 8:12] = 10
->>> volume = Volume(grey, np.diag([1e-3, 1e-3, 1e-3, 1.0]))
->>> dark = Chosen("growing", SeededGrowing(upper=30))
->>> vein = StructureSeeds(method=dark, seeds_mm=[[10, 10, 10]])
->>> segment(volume, SegmentationSettings({"vein": vein})).voxels
-{'vein': 160}
+Structures of a volume, each found as its seeds say, put together into labels.
 """
 
 from __future__ import annotations
@@ -27,19 +15,101 @@ from scipy import ndimage
 
 from us_sim.errors import VolumeError
 from us_sim.settings.registry import SEGMENTATIONS
-from us_sim.volume.files.stored_voxels import free_memory
-from us_sim.volume.label_map import LabelMap
-from us_sim.volume.segmentation.morphology import (
+from us_sim.volume.files.stored_image import free_memory
+from us_sim.volume.segmentation.region import (
+    Index,
+    Region,
+    array_of,
     ball_closed,
     ball_opened,
     largest_part,
     parts_at_least,
     parts_with,
 )
-from us_sim.volume.segmentation.region import Index, Region, array_of
-from us_sim.volume.segmentation.seed_points import box_of, outside_of, seeds_of
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
-from us_sim.volume.volume import Volume
+from us_sim.volume.volume import LabelMap, Volume
+
+
+def seeds_of(volume: Volume, name: str, asked: StructureSeeds) -> list[Index]:
+    """Indices of the voxels that a structure's seeds lie in.
+
+    Raises:
+        VolumeError: one is outside the volume.
+    """
+    placed = _indices(volume, name, "seeds_mm", asked.seeds_mm)
+    for number, index in enumerate(asked.seeds_voxel):
+        if not all(n < size for n, size in zip(index, volume.shape, strict=True)):
+            size = " × ".join(map(str, volume.shape))
+            raise VolumeError(
+                f"structures.{name}.seeds_voxel[{number}]: {list(index)} is outside the volume of "
+                f"{size} voxels"
+            )
+        placed.append(index)
+    return placed
+
+
+def outside_of(volume: Volume, name: str, asked: StructureSeeds) -> list[Index]:
+    """Indices of the voxels that are known not to be in a structure.
+
+    Raises:
+        VolumeError: one is outside the volume.
+    """
+    return _indices(volume, name, "outside_mm", asked.outside_mm)
+
+
+def _indices(
+    volume: Volume, name: str, key: str, points: tuple[tuple[float, float, float], ...]
+) -> list[Index]:
+    """Indices of the voxels that points in mm lie in."""
+    found: list[Index] = []
+    for number, point in enumerate(points):
+        at = volume.patient_to_index @ [*(1e-3 * np.array(point)), 1.0]
+        i, j, k = (int(n) for n in np.floor(at[:3] + 0.5))
+        if not all(0 <= n < size for n, size in zip((i, j, k), volume.shape, strict=True)):
+            low, high = volume.extent * 1e3
+            spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
+            raise VolumeError(
+                f"structures.{name}.{key}[{number}]: {list(point)} mm is outside the volume, which "
+                f"spans {spans} mm; points of a program that shows right-anterior-superior axes "
+                f"have their first two signs turned"
+            )
+        found.append((i, j, k))
+    return found
+
+
+def box_of(
+    volume: Volume,
+    name: str,
+    asked: StructureSeeds,
+    seeds: list[Index],
+    spacing: NDArray[np.float64],
+) -> tuple[slice, ...]:
+    """The part of the volume that is looked at, around all seeds.
+
+    Raises:
+        VolumeError: the volume is not in it, or a seed is not.
+    """
+    first, last = np.zeros(3, dtype=int), np.array(volume.shape)
+    if asked.reach is not None:
+        away = np.ceil(asked.reach / spacing).astype(int) + 1
+        first = np.maximum(first, np.min(seeds, axis=0) - away)
+        last = np.minimum(last, np.max(seeds, axis=0) + away + 1)
+    if asked.within_mm is not None:
+        low, high = 1e-3 * np.array(asked.within_mm)
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1)
+        corners = np.c_[corners.reshape(-1, 3), np.ones(8)] @ volume.patient_to_index.T
+        first = np.maximum(first, np.floor(corners[:, :3].min(axis=0)).astype(int))
+        last = np.minimum(last, np.ceil(corners[:, :3].max(axis=0)).astype(int) + 1)
+    if (first >= last).any():
+        raise VolumeError(f"structures.{name}.within_mm: the volume is nowhere in this box")
+    for number, seed in enumerate(seeds):
+        if not ((np.array(seed) >= first) & (np.array(seed) < last)).all():
+            raise VolumeError(
+                f"structures.{name}.within_mm: seed {number + 1} is outside this box: make it "
+                f"larger"
+            )
+    return tuple(slice(int(a), int(b)) for a, b in zip(first, last, strict=True))
+
 
 _BYTES = 40
 """Memory of a voxel that is looked at: some images in single precision, and parts as numbers."""

@@ -1,47 +1,249 @@
-"""Tracked sequences of Plus and 3D Slicer: frames with times and transforms, and maybe images.
+"""How ultrasound images lie in a file: Plus' orientation codes, and turning images to ``MF``.
+
+A code's first letter says where columns go as they are counted up, its second where rows go: to
+the probe's marked (M) or unmarked side (U), far from it (F) or near (N). A third letter says how
+slices follow in a volume (A ascending, D descending) and means nothing for a flat image. The
+transforms of a sequence hold for images in ``MF``, to which Plus turns them as it reads them
+(plustoolkit.org, "Ultrasound image orientation").
+
+What the file of a tracked sequence says of its frames: MetaImage and NRRD alike.
+
+The images of a sequence where they are: in its file, raw or packed, one after another.
+
+Tracked sequences of Plus and 3D Slicer: frames with times and transforms, and maybe images.
 
 ``.igs.mha``, ``.mha``, ``.igs.nrrd`` and ``.seq.nrrd``: an image file whose last axis is time, and
 whose header gives every frame its transforms (4×4, millimetres, row by row), their status and a
 time stamp (plustoolkit.org, "Sequence file"). Images stay in the file until they are asked for.
-
->>> import pathlib, tempfile
->>> from us_sim.volume.sequences.sequence import read_sequence
->>> header = '''ObjectType = Image
-... NDims = 3
-... DimSize = 4 3 1
-... ElementType = MET_UCHAR
-... UltrasoundImageOrientation = UFA
-... Seq_Frame0000_ToolTipToTrackerTransform = 1 0 0 10 0 1 0 20 0 0 1 30 0 0 0 1
-... Seq_Frame0000_Timestamp = 0.5
-... ElementDataFile = LOCAL
-... '''
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "sweep.igs.mha")
-...     _ = path.write_bytes(header.encode() + bytes(range(12)))
-...     sequence = read_sequence(path)
-...     (image,) = sequence.images()
->>> image[0], sequence.transforms["ToolTipToTracker"].matrices[0, :3, 3]
-(array([3, 2, 1, 0], dtype=uint8), array([0.01, 0.02, 0.03]))
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sequences.frame_transforms import FrameTransforms, read_transforms
-from us_sim.volume.sequences.orientation import is_orientation, is_transposed
-from us_sim.volume.sequences.sequence_file import SequenceFile, read_sequence_file
-from us_sim.volume.sequences.sequence_header import frame_time
-from us_sim.volume.sequences.stored_images import StoredImages
+from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
+from us_sim.volume.files.nrrd import nrrd_header, nrrd_voxels
+from us_sim.volume.files.readers import is_sequence
+from us_sim.volume.files.stored_image import GreyLevels, StoredVoxels
+from us_sim.volume.sequences.transforms import (
+    FrameTransforms,
+    frame_fields,
+    frame_time,
+    read_transforms,
+)
+
+_CODE = re.compile(r"([UM][FN]|[FN][UM])[AD]?")
+
+
+def is_orientation(code: str) -> bool:
+    """Whether a code says how flat images lie."""
+    return _CODE.fullmatch(code) is not None
+
+
+def is_transposed(code: str) -> bool:
+    """Whether the image's columns go along the depth."""
+    return code[0] in "FN"
+
+
+def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
+    """A view of an image (rows, columns) that was stored in an orientation, as it is in ``MF``."""
+    across, down = code[0], code[1]
+    if is_transposed(code):
+        image, across, down = image.T, down, across
+    if across == "U":
+        image = image[:, ::-1]
+    return image[::-1] if down == "N" else image
+
+
+SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
+
+_GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"
+_MOST_FRAMES = 1 << 20  # four hours at 60 Hz
+_NUMBER = re.compile(r"-?[0-9]{1,18}")
+_COLOURS = {"vector", "rgb-color", "3-color", "list"}
+
+
+@dataclass(frozen=True)
+class SequenceFile:
+    """A header; the images are as they are stored."""
+
+    path: Path
+    columns: int  # along the file's first axis of an image; 0 where there are no images
+    rows: int
+    channels: int  # numbers a pixel
+    count: int  # frames
+    orientation: str
+    frames: Mapping[int, Mapping[str, str]]  # fields by the frame's number
+    voxels: Callable[[], StoredVoxels]  # where the images are; raises VolumeError
+
+
+def read_sequence_file(path: Path) -> SequenceFile:
+    """The header of a sequence.
+
+    Raises:
+        VolumeError: the file is missing, is of another format, a volume, or cut within its
+            header, or says no usable size.
+    """
+    if not os.path.isfile(path):
+        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
+    with path.open("rb") as file:
+        start = file.read(256)
+    # The first bytes tell, so that a vast file of another kind is not read as a header.
+    if start.startswith(b"NRRD"):
+        return _nrrd(path)
+    if b"=" not in start:
+        raise VolumeError(f"{path}: is neither MetaImage nor NRRD; {_GIVE}")
+    return _metaimage(path)
+
+
+def _metaimage(path: Path) -> SequenceFile:
+    header, header_bytes = metaimage_header(path)
+    if "ElementDataFile" not in header:
+        raise VolumeError(
+            f"{path}: ends within its header, so it is cut; copy it again, or {_GIVE}"
+        )
+    said = header.get("DimSize", "")
+    sizes = _whole_numbers(path, "DimSize", said)
+    # Newer versions of Plus write a depth of 1 before the number of frames.
+    if len(sizes) not in (3, 4):
+        raise _no_size(path, "DimSize", said)
+    columns, rows, *between, count = sizes
+    (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
+    return SequenceFile(
+        path,
+        *_size(path, columns, rows, between, channels, count),
+        _orientation(header),
+        _frames(path, header.get("Kinds", ""), header),
+        lambda: metaimage_voxels(path, header, header_bytes),
+    )
+
+
+def _nrrd(path: Path) -> SequenceFile:
+    fields, pairs, _ = nrrd_header(path)
+    kinds = fields.get("kinds", "").lower().split()
+    if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
+        raise VolumeError(
+            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
+            f"export it as Plus does: domain domain domain list"
+        )
+    frames = _frames(path, " ".join(kinds), pairs)
+    said = fields.get("sizes", "")
+    sizes = _whole_numbers(path, "sizes", said)
+    if not kinds:
+        kinds = ["domain"] * (len(sizes) - 1) + ["list"]
+    channels = 1
+    if kinds[0] in _COLOURS:
+        channels, kinds, sizes = sizes[0], kinds[1:], sizes[1:]
+    if len(sizes) != len(kinds) or len(sizes) not in (3, 4):
+        raise _no_size(path, "sizes", said)
+    columns, rows, *between, count = sizes
+    return SequenceFile(
+        path,
+        *_size(path, columns, rows, between, channels, count),
+        _orientation(pairs),
+        frames,
+        lambda: nrrd_voxels(path),
+    )
+
+
+def _orientation(keys: Mapping[str, str]) -> str:
+    """How images lie; older versions of Plus write the key in small letters with blanks."""
+    return keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
+
+
+def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:
+    """The fields of the frames, of what is a sequence."""
+    frames = frame_fields(keys)
+    if kinds and not is_sequence(kinds, keys):
+        raise VolumeError(
+            f"{path}: is a volume, as its axes are {kinds}, and holds no tracked frames; {_GIVE}"
+        )
+    if not frames:
+        raise VolumeError(f"{path}: holds no tracked frames (Seq_Frame0000_...); {_GIVE}")
+    return frames
+
+
+def _size(
+    path: Path, columns: int, rows: int, between: Sequence[int], channels: int, count: int
+) -> tuple[int, int, int, int]:
+    """Columns, rows, channels and frames that can be."""
+    if any(depth > 1 for depth in between):
+        raise VolumeError(f"{path}: is a sequence of volumes; give one of flat images")
+    if not 1 <= count <= _MOST_FRAMES:
+        raise VolumeError(
+            f"{path}: says it holds {count} frames; 1 to {_MOST_FRAMES} can be read: export it "
+            f"again, or a part of it"
+        )
+    if min(columns, rows) < 1 or not all(between):
+        columns = rows = 0  # poses alone
+    return columns, rows, channels, count
+
+
+def _whole_numbers(path: Path, key: str, said: str) -> list[int]:
+    words = said.split()
+    # int() would also take 1_000 and the digits of other scripts.
+    if not words or not all(map(_NUMBER.fullmatch, words)):
+        raise _no_size(path, key, said)
+    return list(map(int, words))
+
+
+def _no_size(path: Path, key: str, said: str) -> VolumeError:
+    return VolumeError(
+        f"{path}: its {key} is {said[:80]!r} where a sequence has columns, rows and frames; export "
+        f"it again"
+    )
+
+
+@dataclass(frozen=True)
+class StoredImages:
+    """Images, grey or red, green and blue; other numbers than bytes are spread over all frames."""
+
+    voxels: StoredVoxels
+    columns: int  # as they are stored
+    rows: int
+    channels: int  # 1 or 3
+    orientation: str
+
+    def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
+        """Grey images (rows, columns) turned to ``MF``, one in memory at a time.
+
+        Args:
+            wanted: numbers of frames, ascending.
+
+        Raises:
+            VolumeError: there are fewer than promised, or they are damaged.
+        """
+        levels = self._levels
+        for numbers in self.voxels.pieces(self._size, wanted):
+            image = levels(numbers)
+            if self.channels > 1:
+                colours = image.reshape(self.rows, self.columns, self.channels)
+                image = np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            image = image.reshape(self.rows, self.columns)
+            yield np.ascontiguousarray(turned(image, self.orientation))
+
+    @property
+    def _size(self) -> int:
+        return self.columns * self.rows * self.channels
+
+    @cached_property
+    def _levels(self) -> GreyLevels:
+        if self.voxels.type == np.uint8:
+            return GreyLevels()
+        return GreyLevels.over(self.voxels.header, self.voxels.pieces(self._size))
+
 
 _LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
 NO_TIME = "no Timestamp"

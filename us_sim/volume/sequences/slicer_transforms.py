@@ -4,16 +4,6 @@ Slicer writes transforms through ITK, which stores the way from the parent to th
 millimetres. What is returned is the matrix that Slicer itself shows: to the parent, in RAS.
 
 A sequence of transforms is a bundle (`.mrb`); its times are in the scene (`.mrml`) that names it.
-
->>> import pathlib, tempfile
->>> from us_sim.volume.sequences.slicer_transforms import read_slicer_transform
->>> with tempfile.TemporaryDirectory() as folder:
-...     file = pathlib.Path(folder, "ToolToReference.tfm")
-...     _ = file.write_text("#Insight Transform File V1.0\\n#Transform 0\\n"
-...         "Transform: AffineTransform_double_3_3\\nParameters: 1 0 0 0 1 0 0 0 1 10 20 30\\n"
-...         "FixedParameters: 0 0 0\\n")
-...     read_slicer_transform(file)[:3, 3]
-array([ 0.01,  0.02, -0.03])
 """
 
 from __future__ import annotations
@@ -34,8 +24,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.sequences import itk_reader
-from us_sim.volume.sequences.frame_transforms import FrameTransforms, in_metres
-from us_sim.volume.sequences.transform_name import split_transform_name
+from us_sim.volume.sequences.transforms import FrameTransforms, in_metres, split_transform_name
 
 SLICER_SCENES = (".mrb", ".mrml")
 SLICER_TRANSFORMS = (".h5", ".hdf5", ".tfm")

@@ -1,15 +1,4 @@
-"""A closed surface of triangles, and what geometry says of it: volume, area, parts and genus.
-
->>> import numpy as np
->>> from us_sim.volume.surfaces.closed_surface import ClosedSurface
->>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
->>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
->>> tetrahedron = ClosedSurface(corners, faces)
->>> tetrahedron.volume, tetrahedron.parts, tetrahedron.genus, tetrahedron.fault
-(4.5, 1, 0, '')
->>> ClosedSurface(corners, faces[:3]).fault
-'3 of its 6 edges have a triangle on one side only'
-"""
+"""A closed surface of triangles, and what geometry says of it: volume, area, parts and genus."""
 
 from __future__ import annotations
 

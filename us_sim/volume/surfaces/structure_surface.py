@@ -1,14 +1,18 @@
-"""The surface of a labelled structure: drawn, smoothed with its volume kept, and decimated.
+"""Distances from points to a surface of triangles.
 
->>> import numpy as np
->>> from us_sim.volume.surfaces.structure_surface import structure_surface
->>> from us_sim.volume.volume import Volume
->>> i, j, k = np.indices((40, 40, 40)) - 20.3
->>> labels = (i**2 + j**2 + k**2 < 15**2).astype(np.uint8)
->>> ball = Volume(np.zeros_like(labels), np.diag([1e-3, 1e-3, 1e-3, 1.0]), labels, {1: "cyst"})
->>> made = structure_surface(ball, 1)
->>> round(made.volume_kept, 4), made.surface.genus
-(1.0, 0)
+Smoothing of closed surfaces by a low-pass filter that does not shrink them.
+
+The filter is the windowed sinc of G. Taubin, T. Zhang and G. Golub, "Optimal surface smoothing as
+filter design", ECCV 1996: a polynomial of the surface's umbrella operator in Chebyshev's form. What
+volume it still loses is given back by moving every vertex a little along its normal.
+
+Fewer triangles for a closed surface, within a distance from it that is measured.
+
+Edges are collapsed by the quadric error of M. Garland and P. Heckbert, "Surface simplification
+using quadric error metrics", SIGGRAPH 1997, in the library fast-simplification. That knows no
+distance, so the fewest triangles whose distance is allowed are searched for.
+
+The surface of a labelled structure: drawn, smoothed with its volume kept, and decimated.
 """
 
 from __future__ import annotations
@@ -16,14 +20,343 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
-from us_sim.errors import VolumeError
+from us_sim.errors import UsSimError, VolumeError
+from us_sim.geometry.normals import vertex_normals
+from us_sim.kernels import njit
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.decimation import decimated
+from us_sim.volume.surfaces.label_surface import structure_name, voxel_surface
 from us_sim.volume.surfaces.settings import SurfaceSettings
-from us_sim.volume.surfaces.smoothing import smoothed, with_volume
-from us_sim.volume.surfaces.voxel_surface import structure_name, voxel_surface
 from us_sim.volume.volume import Volume
+
+_NEAREST = 6
+"""Samples of the surface whose triangles are looked at."""
+
+_FINEST = 48
+"""Parts into which an edge of a triangle is divided at most."""
+
+
+def distances_to(
+    points: NDArray[np.float64],
+    vertices: NDArray[np.float64],
+    triangles: NDArray[np.integer],
+    spacing: float | None = None,
+) -> NDArray[np.float64]:
+    """(P,) m, from each point to the nearest of the triangles whose samples are nearest to it.
+
+    Where another triangle is nearer still, a distance is too large, by less than the square of the
+    spacing over the distance.
+
+    Args:
+        points: (P, 3) m.
+        vertices: (V, 3) m.
+        triangles: (T, 3) indices into vertices.
+        spacing: m, between samples of the surface; the mean edge of its triangles where not given.
+    """
+    corners = vertices[triangles]  # (T, 3, 3)
+    edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    samples, owners = _samples(corners, edges.max(axis=1) / (spacing or float(edges.mean())))
+    _, near = cKDTree(samples).query(points, k=min(_NEAREST, len(samples)))
+    around = owners[near].reshape(len(points), -1)
+    found = np.empty(len(points))
+    _measure(np.ascontiguousarray(points, dtype=np.float64), corners, around, found)
+    return found
+
+
+def _samples(
+    corners: NDArray[np.float64], lengths: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points (S, 3) in triangles (T, 3, 3), and whose they are (S,).
+
+    Args:
+        corners: of the triangles.
+        lengths: (T,) of their longest edges, in units of the points' spacing.
+    """
+    parts = np.clip(np.ceil(lengths), 1, _FINEST).astype(np.int64)
+    points, owners = [], []
+    for count in np.unique(parts):
+        which = np.flatnonzero(parts == count)
+        i, j = (grid.ravel() for grid in np.indices((count, count)))
+        inside = i + j < count
+        one, other = (i[inside] + 1 / 3) / count, (j[inside] + 1 / 3) / count
+        weights = np.stack([1.0 - one - other, one, other])  # (3, samples)
+        points.append(np.einsum("tvx,vs->tsx", corners[which], weights).reshape(-1, 3))
+        owners.append(np.repeat(which, inside.sum()))
+    return np.concatenate(points), np.concatenate(owners)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure(points, corners, around, found):
+    """Fills found (P,) with distances to the triangles around (P, K) of corners (T, 3, 3)."""
+    for p in range(len(points)):
+        least = np.inf
+        for n in range(around.shape[1]):
+            least = min(least, _squared_distance(points[p], corners[around[p, n]]))
+        found[p] = np.sqrt(least)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _squared_distance(point, corners):
+    """m², from a point (3,) to a triangle (3, 3): Ericson, Real-Time Collision Detection, 5.1.5."""
+    a = corners[0]
+    b = corners[1]
+    c = corners[2]
+    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
+    for x in range(3):
+        d1 += (b[x] - a[x]) * (point[x] - a[x])
+        d2 += (c[x] - a[x]) * (point[x] - a[x])
+        d3 += (b[x] - a[x]) * (point[x] - b[x])
+        d4 += (c[x] - a[x]) * (point[x] - b[x])
+        d5 += (b[x] - a[x]) * (point[x] - c[x])
+        d6 += (c[x] - a[x]) * (point[x] - c[x])
+    va = d3 * d6 - d5 * d4
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    along_b = along_c = 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        pass  # nearest is corner a
+    elif d3 >= 0.0 and d4 <= d3:
+        along_b = 1.0
+    elif d6 >= 0.0 and d5 <= d6:
+        along_c = 1.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        along_b = d1 / (d1 - d3)
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        along_c = d2 / (d2 - d6)
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        along_c = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        along_b = 1.0 - along_c
+    else:
+        along_b = vb / (va + vb + vc)
+        along_c = vc / (va + vb + vc)
+    squared = 0.0
+    for x in range(3):
+        away = a[x] + along_b * (b[x] - a[x]) + along_c * (c[x] - a[x]) - point[x]
+        squared += away * away
+    return squared
+
+
+_CORRECTIONS = 4
+"""Newton steps to the wanted volume; each leaves the square of the error before."""
+
+_EXACT = 1e-6  # of the volume
+
+_WIDEST_BAND = 1.5
+
+_SHARPNESS = 10.0
+"""Degree of the filter times the square root of its pass band: with it, bumps twice as long as the
+limit keep 0.98 of their height, and those half as long 0.01."""
+
+_DEGREES = (8, 80)
+
+
+def smoothed(surface: ClosedSurface, wavelength: float, spacing: float) -> ClosedSurface:
+    """Take away bumps that are shorter than a wavelength; of those as long half is left.
+
+    Args:
+        surface: closed.
+        wavelength: m.
+        spacing: m, mean side of the voxels that the surface was made of.
+    """
+    pass_band = pass_band_for(wavelength, spacing)
+    degree = int(np.clip(_SHARPNESS / np.sqrt(pass_band), *_DEGREES))
+    coefficients = filter_coefficients(pass_band, degree)
+    average = _averaging(surface)
+    # With the operator 1 - average, whose eigenvalues k are 0 to 2, Chebyshev's argument is
+    # 1 - k / 2 = (1 + average) / 2.
+    middle = surface.vertices.mean(axis=0)
+    before = surface.vertices - middle
+    now = 0.5 * (before + average @ before)
+    result = coefficients[0] * before + coefficients[1] * now
+    for coefficient in coefficients[2:]:
+        before, now = now, now + average @ now - before
+        result += coefficient * now
+    return surface.moved_to(result + middle)
+
+
+def with_volume(surface: ClosedSurface, volume: float, farthest: float) -> ClosedSurface:
+    """Move all vertices alike along their normals until the surface encloses a volume.
+
+    Args:
+        surface: closed, facing outwards.
+        volume: m³.
+        farthest: m; no vertex is moved farther, so a surface may stop short of the volume.
+    """
+    normals = vertex_normals(surface.vertices, surface.triangles)
+    moved, distance = surface, 0.0
+    for _ in range(_CORRECTIONS):
+        missing = volume - moved.volume
+        if abs(missing) <= _EXACT * volume:
+            break
+        distance += missing / moved.area
+        distance = float(np.clip(distance, -farthest, farthest))
+        moved = surface.moved_to(surface.vertices + distance * normals)
+    return moved
+
+
+def pass_band_for(wavelength: float, spacing: float) -> float:
+    """The eigenvalue of the umbrella operator that a wavelength has on a mesh of voxels.
+
+    On a regular mesh with edges h the operator is -h²/4 times Laplace's, so that a wavelength L has
+    the eigenvalue (π h / L)². Marching cubes makes edges of 0.85 voxels on average.
+    """
+    return float(min((np.pi * 0.85 * spacing / wavelength) ** 2, _WIDEST_BAND))
+
+
+def filter_coefficients(pass_band: float, degree: int) -> NDArray[np.float64]:
+    """(degree + 1,) coefficients of Chebyshev polynomials in 1 - k / 2 (Taubin 1996, section 4).
+
+    They are those of an ideal low-pass filter, times a Hamming window, and made to sum to one so
+    that what does not vary stays.
+
+    Args:
+        pass_band: the eigenvalue k, 0 to 2, at which the filter lets half through.
+        degree: of the polynomial.
+    """
+    angle = np.arccos(1.0 - pass_band / 2.0)
+    n = np.arange(1, degree + 1)
+    window = 0.54 + 0.46 * np.cos(n * np.pi / (degree + 1))
+    ideal = 2.0 * np.sin(n * angle) / (n * np.pi)
+    coefficients = np.concatenate([[angle / np.pi], window * ideal])
+    return np.asarray(coefficients / coefficients.sum())
+
+
+def response(
+    coefficients: NDArray[np.float64], eigenvalues: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How much of a bump with that eigenvalue of the umbrella operator the filter leaves."""
+    return np.asarray(np.polynomial.chebyshev.chebval(1.0 - eigenvalues / 2.0, coefficients))
+
+
+def _averaging(surface: ClosedSurface) -> csr_array:
+    """(V, V) whose product with vertices is the mean of each one's neighbours.
+
+    In a closed surface every edge has two triangles that run along it in opposite directions, so
+    the triangles' directed edges name every neighbour once.
+    """
+    starts = surface.triangles.T.ravel()
+    ends = np.roll(surface.triangles, -1, axis=1).T.ravel()
+    count = len(surface.vertices)
+    weights = 1.0 / np.maximum(np.bincount(starts, minlength=count), 1)
+    return csr_array((weights[starts], (starts, ends)), shape=(count, count))
+
+
+_FEWEST = 0.02  # of the triangles
+_TRIALS = 6
+"""Each halves the logarithm of the range in which the answer lies."""
+
+_SAMPLING = 2.0
+"""Spacing of samples in sides of the smaller triangles."""
+
+_CAREFUL = 3
+"""How boldly fast-simplification collapses edges, 0 to 10; at 7, its
+default, errors are ten times as large."""
+
+_SAME_VOLUME = 0.01
+"""Part of a surface's volume up to which one of fewer triangles may enclose more or less."""
+
+_NO_GAIN = 0.9  # of the triangles; a surface that keeps more stays as it is
+
+
+def decimated(surface: ClosedSurface, farthest: float) -> tuple[ClosedSurface, float]:
+    """The same shape in fewer triangles: closed, with the same volume, parts and genus.
+
+    Args:
+        surface: closed.
+        farthest: m, between the two surfaces.
+
+    Returns:
+        The surface, the one given where hardly a triangle can go; and the distance in m between the
+        two, see `surface_distance`.
+
+    Raises:
+        VolumeError: fast-simplification is not installed.
+    """
+    best, distance = surface, 0.0
+    low, high = np.log(_FEWEST), 0.0
+    for _ in range(_TRIALS):
+        middle = (low + high) / 2.0
+        tried = _with_fraction(surface, float(np.exp(middle)))
+        if tried is not None:
+            tried = with_volume(tried, surface.volume, farthest)
+        away = np.inf if tried is None else surface_distance(surface, tried)
+        if tried is None or away > farthest:
+            low = middle
+            continue
+        high = middle
+        if len(tried.triangles) < len(best.triangles):
+            best, distance = tried, away
+    if len(best.triangles) > _NO_GAIN * len(surface.triangles):
+        return surface, 0.0
+    return best, distance
+
+
+def coarsened(surface: ClosedSurface, triangles: int) -> ClosedSurface:
+    """The same shape in about so many triangles: closed, with the same volume, parts and genus.
+
+    It keeps more where fewer would change that.
+
+    Args:
+        surface: closed.
+        triangles: that it should have.
+
+    Raises:
+        VolumeError: fast-simplification is not installed.
+    """
+    fraction = triangles / len(surface.triangles)
+    while fraction < _NO_GAIN:
+        tried = _with_fraction(surface, fraction)
+        if tried is not None:
+            farthest = float(np.sqrt(tried.area / len(tried.triangles)))
+            tried = with_volume(tried, surface.volume, farthest)
+            if not tried.fault and abs(tried.volume / surface.volume - 1.0) < _SAME_VOLUME:
+                return tried
+        fraction *= 2.0
+    return surface
+
+
+def surface_distance(one: ClosedSurface, other: ClosedSurface) -> float:
+    """m, the largest distance from one to the other at their vertices and triangles' centres."""
+    spacing = float(np.sqrt(min(s.area / len(s.triangles) for s in (one, other)))) * _SAMPLING
+    return max(
+        float(distances_to(_own_points(a), b.vertices, b.triangles, spacing).max())
+        for a, b in ((one, other), (other, one))
+    )
+
+
+def _own_points(surface: ClosedSurface) -> NDArray[np.float64]:
+    centres = surface.vertices[surface.triangles].mean(axis=1)
+    return np.concatenate([surface.vertices, centres])
+
+
+def _with_fraction(surface: ClosedSurface, fraction: float) -> ClosedSurface | None:
+    """The surface with that fraction of its triangles; None where its topology would change."""
+    try:
+        from fast_simplification import simplify
+    except ImportError as error:
+        raise VolumeError(
+            "fewer triangles need the library fast-simplification; install it with `pip install "
+            "'us_sim[surfaces]'`, or ask for no decimation"
+        ) from error
+    # In units of its size, since the library works in single precision.
+    middle = surface.vertices.mean(axis=0)
+    size = float(np.ptp(surface.vertices, axis=0).max())
+    points = ((surface.vertices - middle) / size).astype(np.float32)
+    vertices, triangles = simplify(points, surface.triangles, 1.0 - fraction, agg=_CAREFUL)
+    used, triangles = np.unique(triangles, return_inverse=True)
+    try:
+        made = ClosedSurface(
+            vertices[used].astype(np.float64) * size + middle,
+            triangles.reshape(-1, 3).astype(np.int32),
+        )
+    except UsSimError:
+        return None
+    alike = not made.fault and (made.parts, made.genus) == (surface.parts, surface.genus)
+    return made if alike else None
+
 
 _WAVELENGTH = 6.0
 """Voxels; the stairs of a surface that lies aslant are at most so long nearly everywhere."""

@@ -2,18 +2,6 @@
 
 Each says in its header that its axes are left, posterior and superior (``SPACE=LPS``), which
 3D Slicer looks for and other programs skip.
-
->>> import pathlib, tempfile
->>> import numpy as np
->>> from us_sim.volume.surfaces.closed_surface import ClosedSurface
->>> from us_sim.volume.surfaces.surface_files import write_surface
->>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]]) * 1e-3
->>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "vein.obj")
-...     write_surface(path, ClosedSurface(corners, faces))
-...     print(path.read_text().splitlines()[2])
-v 3 0 0
 """
 
 from __future__ import annotations

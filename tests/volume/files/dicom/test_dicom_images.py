@@ -12,12 +12,11 @@ from pydicom.pixels import apply_color_lut, pixel_array
 from pydicom.uid import ExplicitVRBigEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files import stored_voxels
-from us_sim.volume.files.dicom import decoding
-from us_sim.volume.files.dicom.frame_times import frame_times
-from us_sim.volume.files.dicom.grey import GreyImages, stored_frames
+from us_sim.volume.files import stored_image
+from us_sim.volume.files.dicom import pixels
 from us_sim.volume.files.dicom.header import open_dicom
-from us_sim.volume.files.dicom.image_format import image_format
+from us_sim.volume.files.dicom.pixels import GreyImages, image_format, stored_frames
+from us_sim.volume.files.dicom.planes import frame_times
 
 CINE = np.random.default_rng(3).integers(0, 256, (4, 12, 10), dtype=np.uint8)
 
@@ -157,7 +156,7 @@ def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
 
 def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
-    monkeypatch.setattr(stored_voxels, "free_memory", lambda: 500.0)
+    monkeypatch.setattr(stored_image, "free_memory", lambda: 500.0)
     with pytest.raises(VolumeError, match="of memory where"):
         images(path)
 
@@ -166,7 +165,7 @@ def test_a_small_compressed_file_that_claims_gigabytes_is_refused_at_once(tmp_pa
     def never(*_):
         raise AssertionError("it was to be refused before anything is decoded")
 
-    monkeypatch.setattr(decoding.subprocess, "Popen", never)
+    monkeypatch.setattr(pixels.subprocess, "Popen", never)
     made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
     for values in ({"NumberOfFrames": 5000}, {"Rows": 60000, "Columns": 60000}):
         lying = made.copy()

@@ -9,9 +9,8 @@ from pydicom.data import get_testdata_file
 from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.importing import look_at
 from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.files.dicom.grey import stored_frames
 from us_sim.volume.files.dicom.header import open_dicom
-from us_sim.volume.files.dicom.image_format import image_format
+from us_sim.volume.files.dicom.pixels import image_format, stored_frames
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.volume import Volume
 

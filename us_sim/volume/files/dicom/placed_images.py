@@ -1,13 +1,4 @@
-"""Which images of DICOM files make a volume, in which order, and where they lie.
-
->>> import pydicom.data
->>> from us_sim.volume.files.dicom.placed_images import placed_images
->>> file = pydicom.data.get_testdata_file("examples_ybr_color.dcm")
->>> placed_images([file])  # doctest: +ELLIPSIS
-Traceback (most recent call last):
-...
-us_sim.errors.VolumeError: ...: is a 2D cine of 30 images, ... not a volume: ...
-"""
+"""Which images of DICOM files make a volume, in which order, and where they lie."""
 
 from __future__ import annotations
 
@@ -21,18 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.axis_order import volume_of_slices
-from us_sim.volume.files.dicom.grey import GreyImages
-from us_sim.volume.files.dicom.header import DicomFile, open_dicom
-from us_sim.volume.files.dicom.planes import Plane, grid_of
-from us_sim.volume.files.dicom.stated_planes import image_kinds, image_times, stated_planes
-from us_sim.volume.files.dicom.values import number, text
-from us_sim.volume.files.dicom.vendors import (
+from us_sim.volume.files.dicom.header import DicomFile, number, open_dicom, text
+from us_sim.volume.files.dicom.pixels import GreyImages
+from us_sim.volume.files.dicom.planes import (
+    Plane,
+    grid_of,
     hidden_volume,
+    image_kinds,
+    image_times,
     one_image_after_another,
+    stated_planes,
     vendor_planes,
 )
 from us_sim.volume.files.segments import no_grey_values
+from us_sim.volume.files.stored_image import volume_of_slices
 
 SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 """Classes of files that hold labels: masks of segments, and label maps."""

@@ -4,27 +4,57 @@ DICOM says of every image where its first pixel is, which way its rows and colum
 apart pixels are (PS3.3, C.7.6.2). A volume is a set of such images at even distances along their
 common normal, in any order.
 
->>> import numpy as np
->>> from us_sim.volume.files.dicom.planes import Plane, grid_of
->>> rows_and_columns = (1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
->>> planes = [Plane((0.0, y, 30.0), rows_and_columns, (0.5, 0.25)) for y in (4.0, 2.0, 0.0)]
->>> order, placement = grid_of("a.dcm", planes)
->>> order
-[2, 1, 0]
->>> placement @ [4, 2, 1, 1]  # the fifth column, third row and second image
-array([0.001, 0.002, 0.029, 1.   ])
+Where the images of a DICOM file are, as far as its header states it.
+
+- Enhanced US Volume and other enhanced objects: groups of values for each image or shared by all
+  (PS3.3, C.7.6.16; C.8.24.6 for ultrasound, in the volume's own frame of reference).
+- One image a file, with its position in the patient.
+- Several images with one position, and the distance of each (`GridFrameOffsetVector`) or of all
+  (`SpacingBetweenSlices`).
+
+Volumes that makers of scanners keep in ways of their own, and how to get at those.
+
+Three are read, as 3D Slicer's SlicerHeart and ITK-SNAP read them:
+
+- Philips' Cartesian export from QLAB (a storage class of its own): the number of slices and their
+  distance in the private elements (3001,1001) and (3001,1003), the other distances in cm in the
+  standard's;
+- Philips Affiniti: the distances in mm in a private element of "Philips US Imaging DD 036";
+- Eigen Artemis: voxels whose edge in mm is a thousandth of the pixels' aspect ratio.
+
+All others are refused with what a person can do. None of the three says where the patient is: the
+axes are those of the grid.
+
+When the images of a cine were made, from its first one on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+import math
+import re
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.files.dicom.header import (
+    DicomFile,
+    items,
+    number,
+    numbers,
+    private,
+    text,
+    value,
+    whole,
+)
 from us_sim.volume.files.placement import checked_placement
 
 _PARALLEL = 1e-4  # difference of the components of directions that are the same
@@ -142,3 +172,265 @@ def _check_even(path: Path | str, gaps: NDArray[np.float64], distance: float) ->
             f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, which is not even: "
             f"one may be missing"
         )
+
+
+_ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+_CINE = (0x00181063, 0x00181065)  # FrameTime, FrameTimeVector
+_POSITIONS = (
+    ("PlanePositionVolumeSequence", "ImagePositionVolume"),
+    ("PlanePositionSequence", "ImagePositionPatient"),
+)
+_DIRECTIONS = (
+    ("PlaneOrientationVolumeSequence", "ImageOrientationVolume"),
+    ("PlaneOrientationSequence", "ImageOrientationPatient"),
+)
+_SIZES = (("PixelMeasuresSequence", "PixelSpacing"),)
+
+
+def stated_planes(file: DicomFile, frames: int) -> list[Plane] | None:
+    """The place of each of the images; None where the header does not state it."""
+    header = file.header
+    if groups := _groups(header, frames):
+        return _of_groups(groups)
+    position = numbers(header, "ImagePositionPatient", 3)
+    orientation = numbers(header, "ImageOrientationPatient", 6)
+    spacing = numbers(header, "PixelSpacing", 2)
+    if position and orientation and spacing and frames == 1:
+        return [Plane(position, orientation, spacing)]
+    if not spacing or frames == 1 or is_cine(header):
+        return None
+    offsets = numbers(header, "GridFrameOffsetVector", frames)
+    between = number(header, "SpacingBetweenSlices")
+    if offsets is None and between:
+        offsets = tuple(n * between for n in range(frames))
+    if offsets is None:
+        return None
+    orientation = orientation or _ALONG_AXES
+    normal = image_axes(file.path, orientation)[:, 2]
+    first = position or (0.0, 0.0, 0.0)
+    return [
+        Plane(
+            tuple(a + offset * b for a, b in zip(first, normal, strict=True)), orientation, spacing
+        )
+        for offset in offsets
+    ]
+
+
+def is_cine(header: Any) -> bool:
+    """Whether a file says that its images follow each other in time."""
+    pointer = value(header, "FrameIncrementPointer")
+    listed = [pointer] if isinstance(pointer, int) else list(pointer or ())
+    return any(each in _CINE for each in listed)
+
+
+def image_times(file: DicomFile, frames: int) -> list[float]:
+    """For each image the time of its volume, s, where there are several; else 0."""
+    times = []
+    for group in _groups(file.header, frames) or [()] * frames:
+        found = _found(group, (("TemporalPositionSequence", "TemporalPositionTimeOffset"),), 1)
+        times.append(found[0] if found else 0.0)
+    return times
+
+
+def image_kinds(file: DicomFile, frames: int) -> list[str]:
+    """For each image what its values are, such as TISSUE_INTENSITY; empty where nothing says it."""
+    kinds = []
+    for group in _groups(file.header, frames) or [()] * frames:
+        described = [each for part in group for each in items(part, "ImageDataTypeSequence")]
+        kinds.append(text(described[0], "DataType") if described else "")
+    return kinds
+
+
+def _groups(header: Any, frames: int) -> list[tuple[Any, ...]]:
+    """For each image its own group of values, then that shared by all."""
+    shared = items(header, "SharedFunctionalGroupsSequence")[:1]
+    own = items(header, "PerFrameFunctionalGroupsSequence")
+    return [(group, *shared) for group in own] if len(own) == frames else []
+
+
+def _of_groups(groups: list[tuple[Any, ...]]) -> list[Plane] | None:
+    planes = []
+    for group in groups:
+        position = _found(group, _POSITIONS, 3)
+        orientation = _found(group, _DIRECTIONS, 6)
+        spacing = _found(group, _SIZES, 2)
+        if not (position and orientation and spacing):
+            return None
+        planes.append(Plane(position, orientation, spacing))
+    return planes
+
+
+def _found(
+    groups: tuple[Any, ...], where: tuple[tuple[str, str], ...], count: int
+) -> tuple[float, ...] | None:
+    """The numbers of the first group that has them."""
+    for group in groups:
+        for sequence, key in where:
+            for item in items(group, sequence)[:1]:
+                found = numbers(item, key, count)
+                if found is not None:
+                    return found
+    return None
+
+
+_CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
+_CENTIMETRES = 10.0  # mm
+
+_SAVE = "and save the volume as .nrrd"
+_QLAB = "export it as Cartesian DICOM (3DDCM) from QLAB or Ultrasound Workspace"
+_IMAGE3D = f"export an Enhanced US Volume, or open it in 3D Slicer with the maker's loader {_SAVE}"
+_HIDDEN = (
+    (0x7FE1, "KRETZ_US", "GE (Kretz)", f"open it in 3D Slicer with SlicerHeart {_SAVE}"),
+    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _IMAGE3D),
+    (0x200D, "Philips US Imaging DD", "Philips", _QLAB),
+    (0x200D, "Philips US Private 3D", "Philips", _QLAB),
+    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _IMAGE3D),
+    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _IMAGE3D),
+)
+"""Group, beginning of the creator's name as in DCMTK's and pydicom's dictionaries, whose it is,
+and what to do."""
+
+
+def is_cartesian(file: DicomFile) -> bool:
+    """Whether it is Philips' Cartesian export."""
+    return text(file.header, "SOPClassUID") == _CARTESIAN
+
+
+def one_image_after_another(file: DicomFile) -> DicomFile:
+    """The file as if its header counted images; Philips' Cartesian export counts volumes.
+
+    Raises:
+        VolumeError: its number of slices is missing.
+    """
+    if not is_cartesian(file):
+        return file
+    slices, volumes = _private_number(file.header, 0x30011001), _volumes(file)
+    if slices is None or slices != int(slices) or slices < 2:
+        raise VolumeError(
+            f"{file.path}: is a Cartesian export of Philips that does not say how many slices it "
+            f"has; {_QLAB} again"
+        )
+    header = copy.copy(file.header)
+    header.NumberOfFrames = int(min(volumes * slices, 1 << 30))
+    return DicomFile(file.path, header, file.syntax, file.little_endian, file.pixels, file.inflated)
+
+
+def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float]] | None:
+    """The places of images that a maker states in a way of its own, and their times in s.
+
+    Args:
+        file: as `one_image_after_another` returns it.
+        frames: how many images it has.
+    """
+    header = file.header
+    if is_cartesian(file):
+        x, y = number(header, "PhysicalDeltaX"), number(header, "PhysicalDeltaY")
+        z = _private_number(header, 0x30011003)
+        slices = _private_number(header, 0x30011001)
+        if not (x and y and z and slices):
+            return None
+        step = (number(header, "FrameTime") or 1000.0) * 1e-3  # s
+        grid = _stack(
+            (x * _CENTIMETRES, y * _CENTIMETRES, z * _CENTIMETRES), int(slices), centred=0
+        )
+        return grid * (frames // int(slices)), [step * (n // int(slices)) for n in range(frames)]
+    tag = private(header, 0x200D, "Philips US Imaging DD 036", 0x03)
+    spacing = numbers(header, tag, 3) if tag is not None else None
+    if spacing and frames > 1:
+        return _stack(spacing, frames, centred=0), [0.0] * frames
+    if text(header, "Manufacturer") == "Eigen" and (
+        text(header, "ManufacturerModelName") == "Artemis" and frames > 1
+    ):
+        edge = (number(header, "PixelAspectRatio") or 0.0) / 1000
+        size = (whole(header, "Columns") or 0, whole(header, "Rows") or 0)
+        return _stack((edge, edge, edge), frames, centred=1, size=size), [0.0] * frames
+    return None
+
+
+def hidden_volume(file: DicomFile) -> str:
+    """What to do about a volume that is there, but in a form only its maker knows; or nothing."""
+    for group, creator, maker, remedy in _HIDDEN:
+        for block in range(0x10, 0x100):
+            if text(file.header, (group << 16) | block).startswith(creator):
+                return f"it has private data of {maker}, where a volume may be: {remedy}"
+    return ""
+
+
+def _stack(
+    spacing: Sequence[float], count: int, *, centred: int, size: tuple[int, int] = (1, 1)
+) -> list[Plane]:
+    """Images one behind the other along the grid's own axes, from 0 or about it; spacing x y z."""
+    x, y, z = spacing
+    corner = [-centred * (n - 1) / 2 * s for n, s in zip((*size, count), spacing, strict=True)]
+    return [
+        Plane((corner[0], corner[1], corner[2] + n * z), _ALONG_AXES, (y, x)) for n in range(count)
+    ]
+
+
+def _volumes(file: DicomFile) -> int:
+    return max(whole(file.header, "NumberOfFrames") or 1, 1)
+
+
+def _private_number(header: Any, tag: int) -> float | None:
+    """A number whose type the file does not say: as text, whole, or in double precision."""
+    found = value(header, tag)
+    if isinstance(found, bytes):
+        try:
+            form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found))
+            made = float(struct.unpack(form, found)[0] if form else found.decode("ascii"))
+        except (ValueError, struct.error):
+            return None
+        return made if math.isfinite(made) else None
+    return number(header, tag)
+
+
+_MILLISECONDS = 1e-3
+_STAMP = re.compile(r"(\d{14})(\.\d{1,6})?([+-]\d{4})?")  # value representation DT, PS3.5, 6.2
+
+
+def frame_times(file: DicomFile, frames: int) -> list[float] | None:
+    """Times in s from the first image on; None where the header does not state them.
+
+    `FrameTimeVector` says how long after the one before it each image came, `FrameTime` and the
+    rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects state their own
+    times (PS3.3, C.7.6.16.2).
+    """
+    header = file.header
+    steps = numbers(header, "FrameTimeVector", frames)
+    if steps and all(0.0 <= step < 1e7 for step in steps[1:]):
+        return list(accumulate((step * _MILLISECONDS for step in steps[1:]), initial=0.0))
+    step = number(header, "FrameTime")
+    if not step or not 0.0 < step < 1e7:
+        rate = number(header, "CineRate") or number(header, "RecommendedDisplayFrameRate")
+        step = 1.0 / rate / _MILLISECONDS if rate and rate > 1e-3 else math.nan
+    if math.isnan(step):
+        return [0.0] if frames == 1 else _own_times(file, frames)
+    return [frame * step * _MILLISECONDS for frame in range(frames)]
+
+
+def _own_times(file: DicomFile, frames: int) -> list[float] | None:
+    """Of the images' own times those in which each image is later than the one before it."""
+    groups = items(file.header, "PerFrameFunctionalGroupsSequence")
+    contents = [item for group in groups for item in items(group, "FrameContentSequence")[:1]]
+    keys = ("FrameReferenceDateTime", "FrameAcquisitionDateTime")
+    for times in (image_times(file, frames), *(_since_first(contents, key) for key in keys)):
+        if len(times) == frames and all(a < b for a, b in pairwise(times)):
+            return [time - times[0] for time in times]
+    return None
+
+
+def _since_first(contents: list[Any], key: str) -> list[float]:
+    """Times in s of the items that state them."""
+    stamps = list(_stamps(contents, key))
+    return [(stamp - stamps[0]).total_seconds() for stamp in stamps]
+
+
+def _stamps(contents: list[Any], key: str) -> Iterator[datetime]:
+    for item in contents:
+        if found := _STAMP.fullmatch(text(item, key)):
+            day, part, zone = found.groups("")
+            try:
+                stated = f"{day}{part or '.0'}{zone or '+0000'}"
+                yield datetime.strptime(stated, "%Y%m%d%H%M%S.%f%z")
+            except ValueError:  # no such day, hour or zone
+                continue

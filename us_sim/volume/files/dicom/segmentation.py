@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.anatomical_colours import Colour
-from us_sim.volume.files.dicom.grey import stored_frames
-from us_sim.volume.files.dicom.header import DicomFile
-from us_sim.volume.files.dicom.image_format import ImageFormat, image_format
+from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, text, whole
+from us_sim.volume.files.dicom.pixels import ImageFormat, image_format, stored_frames
 from us_sim.volume.files.dicom.placed_images import SEGMENTATIONS
-from us_sim.volume.files.dicom.planes import sparse_grid_of
-from us_sim.volume.files.dicom.stated_planes import stated_planes
-from us_sim.volume.files.dicom.values import items, number, numbers, text, whole
+from us_sim.volume.files.dicom.planes import sparse_grid_of, stated_planes
 from us_sim.volume.files.segments import Segment
+from us_sim.volume.structure_names import Colour
 
 _MOST = 1 << 28  # voxels
 

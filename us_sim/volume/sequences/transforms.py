@@ -1,0 +1,226 @@
+"""Names of transforms as Plus reads them: the frame whose points are taken, ``To``, the frame they
+are given in.
+
+Plus (IGSIO, igsioTransformName::SetTransformName) splits a name at the one ``To`` whose next
+character is no lower-case letter, so that a body may be called ``Tool`` or ``Torso``.
+
+Chains of transforms from one frame to another, each forwards or inverted.
+
+The fields of each frame in the header of a sequence file of Plus: transforms, status, time.
+
+One transform of every frame of a sequence, and chains of them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import VolumeError
+from us_sim.volume.files.readers import FRAME_KEY
+
+_TO = re.compile(r"To(?=[^a-z])")
+
+
+def split_transform_name(name: str) -> tuple[str, str] | None:
+    """The frames that a transform leads from and to; None for what names no transform.
+
+    Frames begin with a capital letter, as Plus makes them.
+    """
+    found = list(_TO.finditer(name))
+    if len(found) != 1 or not found[0].start():
+        return None
+    start, end = name[: found[0].start()], name[found[0].end() :]
+    return start[0].upper() + start[1:], end[0].upper() + end[1:]
+
+
+def is_image_frame(frame: str) -> bool:
+    """Whether a frame is an image's, whose coordinates are pixels and not millimetres."""
+    return frame.startswith("Image") or frame.endswith("Image")
+
+
+@dataclass(frozen=True)
+class TransformChain:
+    """Transforms that lead to a reference frame one after the other, each forwards or inverted."""
+
+    reference: str
+    steps: tuple[tuple[str, bool], ...]
+
+
+def shortest_chain(names: Iterable[str], start: str, goal: str) -> TransformChain | None:
+    """The chain of the fewest transforms from one frame to another; None where there is none."""
+    return _chains(names, start).get(goal)
+
+
+def frames_reached(names: Iterable[str], start: str) -> tuple[str, ...]:
+    """The frames to which chains lead from a frame, the nearest first."""
+    return tuple(_chains(names, start))
+
+
+def _chains(names: Iterable[str], start: str) -> dict[str, TransformChain]:
+    """The shortest chain to each frame that is reached, the nearest first."""
+    steps: dict[str, list[tuple[str, str, bool]]] = {}  # from a frame: where to, by what, forwards
+    for name in names:
+        if ends := split_transform_name(name):
+            steps.setdefault(ends[0], []).append((ends[1], name, True))
+            steps.setdefault(ends[1], []).append((ends[0], name, False))
+    chains = {start: TransformChain(start, ())}
+    waiting = deque([start])
+    while waiting:
+        frame = waiting.popleft()
+        for end, name, forward in steps.get(frame, []):
+            if end not in chains:
+                chains[end] = TransformChain(end, (*chains[frame].steps, (name, forward)))
+                waiting.append(end)
+    del chains[start]
+    return chains
+
+
+_LARGEST = 1e7
+"""mm, of any transform's numbers, so that products of them stay finite."""
+
+
+def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
+    """The fields of each frame by its number, their names without ``Seq_Frame0000_``."""
+    frames: dict[int, dict[str, str]] = {}
+    for key, value in header.items():
+        if match := FRAME_KEY.fullmatch(key):
+            frames.setdefault(int(match[1]), {})[match[2]] = value
+    return frames
+
+
+def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
+    """A frame's transform (4, 4) as the format holds it: to millimetres, and maybe scaled.
+
+    Raises:
+        ValueError: with the reason why it cannot be used: its status is not OK, it is missing, is
+            not 16 finite numbers, or is singular.
+    """
+    if fields.get(f"{key}Status", "OK").upper() != "OK":
+        raise ValueError(f"{key}Status is not OK")
+    if key not in fields:
+        raise ValueError(f"no {key}")
+    try:
+        numbers = [float(number) for number in fields[key].split()]
+        matrix = np.array(numbers).reshape(4, 4)
+    except ValueError:
+        raise ValueError("a transform that is not 16 numbers") from None
+    with np.errstate(all="ignore"):
+        steps = np.linalg.norm(matrix[:3, :3], axis=0)
+        spans = abs(np.linalg.det(matrix[:3, :3] / steps)) > 1e-6
+        spans &= steps.min() > 1.0 / _LARGEST and np.abs(matrix).max() < _LARGEST
+    if not (np.isfinite(matrix).all() and spans and np.array_equal(matrix[3], [0, 0, 0, 1])):
+        raise ValueError("a transform that is singular or not finite")
+    return matrix
+
+
+def frame_time(fields: Mapping[str, str]) -> float:
+    """When the frame was recorded, s of the recorder's clock.
+
+    Raises:
+        ValueError: the time is missing or no finite number.
+    """
+    try:
+        time = float(fields["Timestamp"])
+    except (KeyError, ValueError):
+        time = math.nan
+    if not math.isfinite(time):
+        raise ValueError("no Timestamp")
+    return time
+
+
+_METRES = 1e-3  # the format holds millimetres
+_SUFFIX = "Transform"
+_MOST_NUMBERS = 1 << 27  # 1 GiB; eight transforms a frame for four hours at 60 Hz
+UNSEEN = "an identity among poses that are none"
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTransforms:
+    """A transform over the frames; ``AToB`` takes points of A, m (pixels of an image), to B, m."""
+
+    matrices: NDArray[np.float64]  # (K, 4, 4); nan where not valid
+    faults: tuple[str, ...]  # (K,) why it is not valid; empty where it is
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """(K,) whether the frame's transform can be used."""
+        return np.array([not fault for fault in self.faults], dtype=bool)
+
+
+def read_transforms(path: Path, frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
+    """The transforms of all frames, by name.
+
+    Args:
+        path: which errors name.
+        frames: their fields.
+
+    Raises:
+        VolumeError: the header names more transforms than any recording has.
+    """
+    keys = sorted({key for fields in frames for key in fields if key.endswith(_SUFFIX)})
+    names = [key.removesuffix(_SUFFIX) for key in keys]
+    names = [name for name in names if split_transform_name(name)]
+    if 16 * len(names) * len(frames) > _MOST_NUMBERS:
+        raise VolumeError(
+            f"{path}: names {len(names)} transforms for {len(frames)} frames, more than can be "
+            f"read; export a part of it"
+        )
+    return {name: _read(frames, name) for name in names}
+
+
+def in_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A transform of that name, or (K, 4, 4) of them, from millimetres to metres.
+
+    Coordinates of images stay pixels.
+    """
+    start, end = split_transform_name(name) or ("", "")
+    from_unit = 1.0 if is_image_frame(start) else _METRES
+    to_unit = 1.0 if is_image_frame(end) else _METRES
+    matrix = matrix.copy()
+    matrix[..., :3, :3] *= to_unit / from_unit
+    matrix[..., :3, 3] *= to_unit
+    return matrix
+
+
+def along(transforms: Mapping[str, FrameTransforms], chain: TransformChain) -> FrameTransforms:
+    """The product of a chain's transforms, valid where all of them are."""
+    first = transforms[chain.steps[0][0]]
+    matrices, faults = np.broadcast_to(np.eye(4), first.matrices.shape), [""] * len(first.faults)
+    for name, forward in chain.steps:
+        step = transforms[name]
+        faults = [fault or other for fault, other in zip(faults, step.faults, strict=True)]
+        matrices = (step.matrices if forward else _inverse(step)) @ matrices
+    return FrameTransforms(matrices, tuple(faults))
+
+
+def _inverse(step: FrameTransforms) -> NDArray[np.float64]:
+    inverse = np.full_like(step.matrices, np.nan)
+    inverse[step.valid] = np.linalg.inv(step.matrices[step.valid])
+    inverse[step.valid, 3] = (0.0, 0.0, 0.0, 1.0)
+    return inverse
+
+
+def _read(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransforms:
+    matrices = np.full((len(frames), 4, 4), np.nan)
+    faults = [""] * len(frames)
+    for k, fields in enumerate(frames):
+        try:
+            matrices[k] = frame_matrix(fields, f"{name}{_SUFFIX}")
+        except ValueError as reason:
+            faults[k] = str(reason)
+    identity = (matrices == np.eye(4)).all(axis=(1, 2))
+    if identity.any() and (np.isfinite(matrices[:, 0, 0]) & ~identity).any():
+        # No measurement is exactly that: Plus fills it in for a body it has not seen.
+        matrices[identity] = np.nan
+        for k in np.flatnonzero(identity).tolist():
+            faults[k] = UNSEEN
+    return FrameTransforms(in_metres(name, matrices), tuple(faults))
