@@ -13,6 +13,8 @@ from us_sim.scene.building import (
 )
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.tissue.mesh.node_selection import face_nodes
+from us_sim.scene.structures import colour_of, require_labels, structures_of
+from us_sim.tissue.model import face_nodes
 
 DOCUMENT = {
     "name": "cylinder",

@@ -49,12 +49,10 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(args: argparse.Namespace) -> int:
+    from us_sim.command.stiffness_report import draw_fit, table, write_moduli
     from us_sim.progress import late_progress
     from us_sim.scene.reading import load_scene
-    from us_sim.tissue.identification.landmarks import read_landmarks
-    from us_sim.tissue.identification.report import table, write_moduli
-    from us_sim.tissue.identification.report_picture import draw_fit
-    from us_sim.tissue.identification.stiffness import fit_stiffness
+    from us_sim.tissue.identification.stiffness import fit_stiffness, read_landmarks
     from us_sim.volume.cases.case import is_case
 
     settings = read_settings(args, StiffnessSettings)
@@ -157,9 +155,13 @@ def _record(
     from us_sim.recording.path import read_path
     from us_sim.recording.reader import read_bag
     from us_sim.recording.wrench import read_wrenches
-    from us_sim.tissue.identification.press_record import paired, stamped_alike, without_wrench
-    from us_sim.tissue.identification.pressed_tissue import PressedTissue
-    from us_sim.tissue.identification.wrench_delay import find_delay
+    from us_sim.tissue.identification.press_model import PressedTissue
+    from us_sim.tissue.identification.press_record import (
+        find_delay,
+        paired,
+        stamped_alike,
+        without_wrench,
+    )
 
     bag = read_bag(session)
     path = read_path(session, bag.topic(settings.pose).name)

@@ -24,7 +24,7 @@ from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import Probe
-from us_sim.tissue.elasticity.tissue_kinds import kind_of
+from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.volume.measure import label_area
 

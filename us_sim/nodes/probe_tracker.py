@@ -18,7 +18,7 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.conversions import (
     nanoseconds_of,
     pose_from,

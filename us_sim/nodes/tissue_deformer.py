@@ -37,10 +37,9 @@ from us_sim.progress import late_progress
 from us_sim.scene.building import Structure, materials_of, structures_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.spelling import counted
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.frame_budget import frame_limit, shortest, usable_cores
 from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, PoseError, TrackingError
-from us_sim.geometry.frame_tree import FrameTree
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import FrameTree, Pose
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.storage import NoBagError

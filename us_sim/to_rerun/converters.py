@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from rerun.encodings import AbsoluteTimeRange
 
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
-from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.nodes.conversions import (
     affine_from,
     colour_pixels_from,

@@ -52,12 +52,10 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import springs_of
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 _FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"

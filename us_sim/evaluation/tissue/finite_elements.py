@@ -50,7 +50,7 @@ from scipy.sparse.linalg import LinearOperator, splu
 from us_sim.errors import UsSimError
 from us_sim.evaluation.block import solved
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.materials import volumetric_split
 from us_sim.tissue.model import TissueModel
 
 try:

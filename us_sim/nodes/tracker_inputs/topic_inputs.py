@@ -11,7 +11,7 @@ from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
-from us_sim.geometry.frame_tree import FrameTree
+from us_sim.geometry.pose import FrameTree
 from us_sim.nodes.conversions import transform_from
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.settings.spelling import counted

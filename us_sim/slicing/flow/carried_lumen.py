@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 from us_sim.cache import Form, kept
 from us_sim.kernels import njit
 from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, lumen_of
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 

@@ -5,7 +5,7 @@ Newton's method with a line search (see `us_sim.tissue.solvers.newton`), from wh
 ended. A new pose of the probe is met with the exact linear answer to it first (contact is a
 complementarity problem on the surface compliance). Friction and viscous tissue, where they are
 asked for, remember the frames before (see `us_sim.tissue.contact.penalty_contact` and
-`us_sim.tissue.elasticity.overstress`). What a frame's time does not allow for goes on
+`us_sim.tissue.elasticity.neo_hookean`). What a frame's time does not allow for goes on
 in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
 on but never shown.
 
@@ -45,13 +45,12 @@ from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.elasticity.lumen import require_solid
-from us_sim.tissue.elasticity.overstress import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.newton import Newton, strides
 from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
 

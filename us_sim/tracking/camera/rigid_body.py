@@ -39,8 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import PoseError, TrackingError
-from us_sim.geometry.placement import PLACE
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import PLACE, Pose
 from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
