@@ -43,8 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, ProbeError, SceneError, TrackingError, UsSimError
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene, TissueSettings
 from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
 from us_sim.tracking.measurement import PATIENT

@@ -4,7 +4,7 @@ Frame ``patient`` is the probe's where it touches the skin at the case's start: 
 middle of the probe's face, and +z goes into the body.
 
 >>> import numpy as np
->>> from us_sim.geometry.placement import Placement
+>>> from us_sim.geometry.pose import Placement
 >>> from us_sim.scene.case_tissue import patient_from_volume
 >>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
 >>> pose = patient_from_volume(start).pose
@@ -37,16 +37,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import CaseError
 from us_sim.geometry.collider import Capsule, Collider, Sphere
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.scene import Scene
 from us_sim.settings.reading import document_of
 from us_sim.settings.registry import COLLIDERS, PROBES
+from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.tissue.elasticity.materials import label_fractions
-from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
-from us_sim.tissue.mesh.fitted_planes import fitted_planes, wanted_under_probe
-from us_sim.tissue.mesh.label_thickness import wanted_by_labels
+from us_sim.tissue.mesh.box_planes import fitted_planes, wanted_by_labels, wanted_under_probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.cases.case import LABELS, TISSUE, Case, read_case
 from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings

@@ -33,7 +33,7 @@ from us_sim.recording.path import ProbePath
 from us_sim.scene.building import path_of, probe_of, tissue_model_of, tracker_poses_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.slicing.probe.probe import Probe
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.tracking.measurement import PATIENT

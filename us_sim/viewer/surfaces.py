@@ -323,7 +323,7 @@ class CarriedSurfaces:
         surfaces: Sequence[ColouredSurface],
         triangles: int = WHILE_MOVING,
     ) -> None:
-        from us_sim.tissue.mesh.point_location import locate  # with its kernels
+        from us_sim.tissue.mesh.embedding import locate  # with its kernels
 
         whole = sum(len(surface.triangles) for surface in surfaces)
         firsts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
