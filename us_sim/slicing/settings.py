@@ -1,42 +1,4 @@
-"""The settings of image formation: what a sonographer sets at the console.
-
->>> from us_sim.slicing.settings import Imaging
->>> Imaging(gain=6.0).gain
-6.0
->>> Imaging(grey_map="purple")
-Traceback (most recent call last):
-...
-us_sim.errors.ProbeError: imaging.grey_map: 'purple' is not one of linear, soft, contrast
-
-The settings of strain images.
-
->>> from us_sim.slicing.settings import Strain
->>> Strain(window="4 mm").window
-0.004
->>> Strain(since="yesterday")
-Traceback (most recent call last):
-...
-us_sim.errors.ProbeError: strain.since: 'yesterday' is not one of rest, image
-
-The settings of M-mode.
-
-The settings of a vessel's flow: what a scene says of the blood in a structure.
-
->>> from us_sim.slicing.settings import FlowSettings
->>> FlowSettings("arterial", (0, 1, 0), peak_velocity="80 cm/s", mean_velocity="9 cm/s").heart_rate
-1.1
->>> FlowSettings("arterial", (0, 1, 0), peak_velocity=0.1, mean_velocity=0.09)
-Traceback (most recent call last):
-...
-us_sim.errors.SceneError: flow.peak_velocity: 0.1 m/s is less than twice mean_velocity, 0.09 m/s: \
-on the axis of a vessel blood flows twice as fast as in its mean
-
-What colour and pulsed-wave Doppler are set with alike.
-
-The settings of colour Doppler.
-
-The settings of pulsed-wave Doppler.
-"""
+"""Settings of the console: image formation, strain, M-mode, flow and Doppler."""
 
 from __future__ import annotations
 
