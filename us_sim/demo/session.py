@@ -15,7 +15,7 @@ from scipy.ndimage import binary_erosion
 from us_sim.demo.camera_video import PathVideo
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene

@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_message,
     nanoseconds_of,
     pose_from,

@@ -19,7 +19,7 @@ from rerun.encodings import AbsoluteTimeRange
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangles import vertex_normals
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_from,
     colour_pixels_from,
     field_from,

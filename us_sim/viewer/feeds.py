@@ -35,7 +35,8 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
-from us_sim.nodes.conversions import (
+from us_sim.nodes.guarded_node import GuardedNode, decoded
+from us_sim.nodes.messages import (
     affine_from,
     colour_pixels_from,
     line_from,
@@ -49,7 +50,6 @@ from us_sim.nodes.conversions import (
     vectors_from,
     wrench_from,
 )
-from us_sim.nodes.guarded_node import GuardedNode, decoded
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh

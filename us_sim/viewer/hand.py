@@ -22,8 +22,8 @@ from shape_msgs.msg import Mesh
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import mesh_from, pose_from, pose_from_text, pose_message
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_lead import LEAD_TOPIC
 from us_sim.nodes.qos import LATCHED, STREAM, overridable

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from us_sim.errors import SettingsError, UsSimError
-from us_sim.nodes.conversions import colour_image_message, nanoseconds_of
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import colour_image_message, nanoseconds_of
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
-from us_sim.nodes.conversions import colour_image_message, field_message
+from us_sim.nodes.messages import colour_image_message, field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream, SettableStream

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from us_sim.errors import ProbeError
-from us_sim.nodes.conversions import field_message
+from us_sim.nodes.messages import field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream
