@@ -4,10 +4,54 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from us_sim.errors import ProbeError, SceneError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+
+
+class ImageMode(NamedTuple):
+    """A further picture that a page can show: its label, its tooltip, and the topic it is of."""
+
+    label: str
+    title: str
+    topic: str
+
+
+OVERLAYS = {
+    "strain": ImageMode(
+        "Strain",
+        "How much the tissue is shortened along the beams since rest, exactly",
+        "ultrasound/strain",
+    ),
+    "strain_estimate": ImageMode(
+        "Elastography",
+        "Strain between two images, as a scanner estimates it",
+        "ultrasound/strain_estimate",
+    ),
+    "velocity": ImageMode(
+        "Colour",
+        "Velocity of blood along the beams, as colour Doppler shows it",
+        "ultrasound/velocity_estimate",
+    ),
+}
+"""Colours over the annotated image, by the parameter ``overlay``, which may be ``none`` too."""
+
+STRIPS = {
+    "m_mode": ImageMode(
+        "M-mode", "Echoes along one line of the image over time", "ultrasound/m_mode"
+    ),
+    "spectrum": ImageMode(
+        "Spectrum",
+        "Velocities of blood at the gate over time: pulsed-wave Doppler",
+        "ultrasound/spectrum",
+    ),
+}
+"""Pictures that run over time, by the prefix of their parameters."""
+
+TISSUE_PARAMETERS = "acoustics.tissues."
+"""Prefix of the parameters of a label's acoustics."""
 
 ECHO_RANGE = 60.0
 """dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""

@@ -52,6 +52,7 @@ from us_sim.nodes.messages import (
 )
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
+from us_sim.slicing.settings import STRIPS
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Feed, Packet
 from us_sim.viewer.surfaces import (
@@ -227,8 +228,6 @@ class RestMesh:
 
 _QUALITY = 90
 """Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
-_STRIPS = {"m_mode": "ultrasound/m_mode", "spectrum": "ultrasound/spectrum"}
-"""Streams of what runs over time, and their topics."""
 
 Known = Callable[[int], dict[str, Any]]
 
@@ -283,7 +282,7 @@ def image_feeds(
         images("ultrasound/image", "image", telling(_pixels)),
         images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
         images("ultrasound/image_annotated", "annotated", telling(lambda m, n, _: annotated(m, n))),
-        *(images(topic, kind, _colour_jpeg(kind)) for kind, topic in _STRIPS.items()),
+        *(images(strip.topic, kind, _colour_jpeg(kind)) for kind, strip in STRIPS.items()),
     ]
 
 

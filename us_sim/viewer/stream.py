@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from us_sim.slicing.settings import STRIPS
 from us_sim.viewer.parameters import ParameterBoard
 from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
@@ -161,7 +162,7 @@ class Simulator:
 
         overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
         colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
-        return colours or watched("m_mode") or watched("spectrum")
+        return colours or any(map(watched, STRIPS))
 
     def add(self, *feeds: Feed) -> None:
         """Let pages watch these."""

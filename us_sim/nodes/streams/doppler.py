@@ -61,7 +61,6 @@ class ColourStream(SettableStream[ColourDoppler]):
     """``ultrasound/velocity_estimate``, and the colours of the same; parameters ``colour.…``."""
 
     topic = "ultrasound/velocity_estimate"
-    overlay_name = "velocity"
 
     def __init__(self, node: SceneNode, blood: Blood) -> None:
         super().__init__(node, node.scene.colour, "colour.")
