@@ -10,9 +10,21 @@ array([[0., 0., 0.],
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Flag, auto
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Intervention(Flag):
+    """What a solver did in a frame that went wrong; `Deformation.action` says it to a person."""
+
+    NONE = 0
+    FRAME_FAILED = auto()  # what came out was not finite or far away
+    KEPT_STATE = auto()  # the last good state is returned in its place
+    PUT_TO_REST = auto()  # the tissue is undeformed again
+    SHOWED_UPRIGHT = auto()  # tissue is inside out, and its last upright state is returned
+    RESTARTED = auto()  # the next frame begins from rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +38,8 @@ class Deformation:
     residual: float  # unbalanced force over contact force, of the solver's own equations
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
+    interventions: Intervention = Intervention.NONE  # `action` as a code
     is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
-    has_failed: bool = False  # whether it stands in place of a frame that came out wrong
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from us_sim.evaluation.stability.points import damping_factor, spring_settings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.deformation import Intervention, TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
 _AMPLITUDE = 1e-8
@@ -59,7 +59,10 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)
         moved = np.abs(ended.nodes - nodes).max()
-        return bool(ended.has_failed or moved > _SWELLING * np.abs(shape).max())
+        return bool(
+            Intervention.FRAME_FAILED in ended.interventions
+            or moved > _SWELLING * np.abs(shape).max()
+        )
 
     if model.fixed.all():
         return math.inf, math.inf

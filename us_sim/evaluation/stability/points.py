@@ -29,14 +29,11 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.deformation import Deformation, Intervention
 from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.mesh.check import signed_volumes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
-
-_FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"
-"""What a solver says of a frame that failed, and where it kept the last good state after that."""
 
 _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
 """Residuals below the first are the same; above it they agree within the second."""
@@ -205,8 +202,8 @@ def run_trial(
             trial.held.append(float(deformation.residual))
             volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
             trial.held_inverted = int((volumes <= 0).sum())
-        failed = _FAILED in deformation.action
-        kept = _KEPT in deformation.action
+        failed = Intervention.FRAME_FAILED in deformation.interventions
+        kept = Intervention.KEPT_STATE in deformation.interventions
         if failed:
             trial.kept += 1
             residual.forget()

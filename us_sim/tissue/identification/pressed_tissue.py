@@ -89,8 +89,8 @@ class PressedTissue:
         """Put the probe at a pose and the nodes at a displacement (3, N) m."""
         self._pose, self._displacement = pose, displacement
         at = self._points.rest + self._points.moved(displacement)
-        self._contact.aim(pose, at)
-        self._contact.release(at)
+        self._contact.set_pose(pose, at)
+        self._contact.drop_planes(at)
 
     @property
     def _pushes(self) -> NDArray[np.float64]:
@@ -125,7 +125,7 @@ class PressedTissue:
         active, directions, stiffness = contact.springs_after(still)
         springs = points.nodes[active], points.weights[active], directions, stiffness
         at = points.rest + points.moved(self._displacement)
-        turned, turn = contact.turns(at, contact.push)
+        turned, turn = contact.geometric_stiffness(at, contact.normal_force)
         bend = points.nodes[turned], points.weights[turned], -turn
 
         def product(change: NDArray, image: NDArray) -> None:
