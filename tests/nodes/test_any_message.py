@@ -29,7 +29,6 @@ from tf2_msgs.msg import TFMessage
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes import conversions
-from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.health import Health
 from us_sim.nodes.image_writer import ImageWriter
@@ -38,6 +37,7 @@ from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.nodes.tracker_inputs.camera_input import camera_from, grey_from, grey_from_compressed
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.tracking.haptic import ContactModel

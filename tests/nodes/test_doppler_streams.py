@@ -20,7 +20,7 @@ from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.scene.blood import blood_of
 from us_sim.scene.building import probe_of, scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
+from us_sim.slicing.flow.doppler import ColourDoppler
 
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FLOWS = {

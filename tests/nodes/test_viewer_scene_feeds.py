@@ -15,7 +15,7 @@ from std_msgs.msg import Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.nodes.conversions import (
     cloud_message,
     mesh_message,

@@ -7,11 +7,10 @@ from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.cutting.located import BLACK, Located, evaluate
+from us_sim.slicing.cutting.resampling import BLACK, Located, evaluate
 from us_sim.slicing.cutting.slicer import create_slicer
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.probe.fan_probe import SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import LinearProbe, SectorProbe
+from us_sim.slicing.settings import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 

@@ -20,8 +20,7 @@ from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.scene.structures import colour_of
-from us_sim.slicing.drawing.label_border import onto_border
-from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 
 _COLUMNS = 4
 _INCHES = 3.2  # of a picture's side

@@ -7,6 +7,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -14,13 +15,38 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rosbags.interfaces import Nodetype
 
 from us_sim.errors import MessageError, UsSimError, printable
-from us_sim.nodes.conversions.serialized import require_sequences
 from us_sim.nodes.conversions.stamps import require_stamp
+from us_sim.recording.schemas import jazzy_definitions
 
 if TYPE_CHECKING:
     from us_sim.nodes.health import Health
+
+
+def require_sequences(data: bytes, message_type: Any) -> None:
+    """Look at the sequences of a serialized message, where its type is one of Jazzy's with any.
+
+    Raises:
+        Exception: what rosbags raises, where the bytes are no such message.
+    """
+    name = f"{message_type.__module__.partition('.')[0]}/msg/{message_type.__name__}"
+    if _has_sequences(name):
+        jazzy_definitions().deserialize_cdr(data, name)
+
+
+@cache
+def _has_sequences(name: str) -> bool:
+    fields = jazzy_definitions().fielddefs.get(name, ((), ()))[1]
+    return any(_is_sequence(*kind) for _, kind in fields)
+
+
+def _is_sequence(kind: Nodetype, of: Any) -> bool:
+    if kind is Nodetype.ARRAY:
+        return _is_sequence(*of[0])
+    return kind is Nodetype.SEQUENCE or (kind is Nodetype.NAME and _has_sequences(of))
+
 
 CLOCK_S = 5.0
 """For simulated time to begin, before it is said that it does not."""

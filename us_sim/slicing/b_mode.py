@@ -9,6 +9,16 @@
 >>> scanner = BMode(volume_of(scene), probe_of(scene))
 >>> scanner.image(Pose([0, 0, 0.002])).shape
 (30, 40)
+
+How far an image reaches beyond what there is to see.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.b_mode import beyond
+>>> arm = np.array([[-0.036, -0.03, 0.0], [0.036, 0.03, 0.054]])
+>>> round(beyond(LinearProbe(aperture=0.04, depth=0.1), Pose([0.0, 0.0, 0.004]), arm), 6)
+0.05
 """
 
 from __future__ import annotations
@@ -25,16 +35,16 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
-from us_sim.slicing.formation.imaging import Imaging
 from us_sim.slicing.frame import Contact, Frame
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.reach import beyond
+from us_sim.slicing.settings import Imaging
 
 if TYPE_CHECKING:
-    from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
+    from us_sim.slicing.acoustics.beam_acoustics import LiveAcoustics
     from us_sim.slicing.acoustics.settings import Acoustics
     from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.volume.volume import Volume
+
 
 _BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
 """Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward."""
@@ -253,7 +263,7 @@ class BMode:
         prepared, self._prepared = self._prepared, None
         if prepared is not None and prepared[:2] == (probe, acoustics):
             return prepared[2]
-        from us_sim.slicing.acoustics.live_acoustics import LiveAcoustics
+        from us_sim.slicing.acoustics.beam_acoustics import LiveAcoustics
 
         return LiveAcoustics(self._volume, probe, acoustics)
 
@@ -277,3 +287,18 @@ def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     to_patient = volume.index_to_patient
     triangles = [(a, *pair) for a, b, c, d in _BOX_FACES for pair in ((b, c), (c, d))]
     return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
+
+
+def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64]) -> float:
+    """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.
+
+    Args:
+        extent: (2, 3) m, lower and upper corner of the box in the pose's parent frame.
+    """
+    direction = pose.rotation[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = (extent - pose.position) / direction
+    entered, left = np.nanmax(distances.min(axis=0)), np.nanmin(distances.max(axis=0))
+    if not (entered < left and left > 0.0 and entered < probe.depth):
+        return 0.0
+    return max(0.0, float(probe.depth - left))

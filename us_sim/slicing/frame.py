@@ -27,8 +27,13 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting.located import BLACK, Located
-from us_sim.slicing.cutting.resampling import pixel_to_index, sample_labels, sample_plane
+from us_sim.slicing.cutting.resampling import (
+    BLACK,
+    Located,
+    pixel_to_index,
+    sample_labels,
+    sample_plane,
+)
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import Probe
 

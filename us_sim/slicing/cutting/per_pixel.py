@@ -30,9 +30,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.located import BLACK, Located
-from us_sim.slicing.cutting.resampling import label_voxels, pixel_to_index
-from us_sim.slicing.cutting.row_bands import parallel_rows
+from us_sim.slicing.cutting.resampling import (
+    BLACK,
+    Located,
+    label_voxels,
+    parallel_rows,
+    pixel_to_index,
+)
 from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import SLACK

@@ -30,13 +30,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.mesh_faces import face_order
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.clusters import Clusters
-from us_sim.slicing.cutting.cut_polygons import cut_tetrahedra, room_for_cuts
-from us_sim.slicing.cutting.located import BLACK, Located
-from us_sim.slicing.cutting.resampling import full_runs, grey_voxels, pixel_to_index
-from us_sim.slicing.cutting.rest_outline import NO_OUTLINE, Outline, RestSurface
-from us_sim.slicing.cutting.row_bands import parallel_rows
-from us_sim.slicing.cutting.section import RestMesh, finite_nodes
+from us_sim.slicing.cutting.cut_polygons import (
+    NO_OUTLINE,
+    Outline,
+    RestSurface,
+    convert_cuts,
+    cut_tetrahedra,
+    room_for_cuts,
+)
+from us_sim.slicing.cutting.resampling import (
+    BLACK,
+    Located,
+    full_runs,
+    grey_voxels,
+    parallel_rows,
+    pixel_to_index,
+)
+from us_sim.slicing.cutting.section import Clusters, RestMesh, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
     INNER_MARGIN,
@@ -44,7 +54,6 @@ from us_sim.slicing.cutting.span_sampling import (
     fill_some_elements,
     sample_spans,
 )
-from us_sim.slicing.cutting.spans import convert_cuts
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:

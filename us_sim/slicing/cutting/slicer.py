@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.resampling import label_voxels, sample_nearest
-from us_sim.slicing.cutting.row_bands import parallel_rows
+from us_sim.slicing.cutting.resampling import label_voxels, parallel_rows, sample_nearest
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
-    from us_sim.slicing.cutting.located import Located
+    from us_sim.slicing.cutting.resampling import Located
     from us_sim.volume.volume import Volume
 
 

@@ -19,10 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.colour_bar import ColourBar
 from us_sim.slicing.drawing.label_outlines import Settle, label_outlines
-from us_sim.slicing.drawing.lettering import Colour, Label, lettering
-from us_sim.slicing.drawing.overlay import mirrored
+from us_sim.slicing.drawing.overlay import Colour, ColourBar, Label, lettering, mirrored
 
 if TYPE_CHECKING:
     from us_sim.slicing.drawing.overlay import Overlay

@@ -9,7 +9,7 @@ values holds no phases, so speckle finer than the beam becomes smoother, where a
 coarser.
 
 >>> import numpy as np
->>> from us_sim.slicing.formation.imaging import Imaging
+>>> from us_sim.slicing.settings import Imaging
 >>> from us_sim.slicing.probe.probe import LinearProbe
 >>> from us_sim.slicing.formation.resolution import Resolution
 >>> point = np.zeros((41, 41), dtype=np.uint8)
@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.formation.imaging import ECHO_RANGE, Imaging
 from us_sim.slicing.probe.beams import beam_width, focus_of
 from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.settings import ECHO_RANGE, Imaging
 
 _SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
 """Standard deviation of an amplitude over the width at half its power. Power is the square of the

@@ -50,8 +50,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
+from us_sim.geometry.collider_distance import turned, turned_back
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.tissue.contact.complementarity import pivot, solve_active

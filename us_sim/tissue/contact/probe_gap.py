@@ -41,9 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import curved_box_distance
+from us_sim.geometry.collider_distance import curved_box_distance, turned, turned_back
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 
 GAP_TOLERANCE = 1e-5

@@ -1,6 +1,6 @@
 """Points spread over the surface that a probe can touch, and what they share with its nodes.
 
-They are in the middles of the triangles' parts (`us_sim.geometry.triangle_parts`) and at the nodes.
+They are in the middles of the triangles' parts (`us_sim.geometry.triangles`) and at the nodes.
 A node that the probe can touch, but no triangle's, is a point by itself.
 
 >>> import numpy as np
@@ -33,12 +33,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.triangle_parts import TriangleParts, part_size
+from us_sim.geometry.triangles import TriangleParts, part_size
 from us_sim.kernels import njit
 from us_sim.tissue.contact.penalty_contact import PenaltyContact, PenaltyFriction
 from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
-from us_sim.tissue.elasticity.wall import withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import withstood_force
 from us_sim.tissue.model import TissueModel
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}

@@ -17,7 +17,7 @@ drifts on at its initial speed.
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.tissue.elasticity.springs import SpringArrays
->>> from us_sim.tissue.elasticity.volume_term import VolumeTerm
+>>> from us_sim.tissue.elasticity.springs import VolumeTerm
 >>> from us_sim.tissue.solvers.msds import (
 ...     Contact, Particles, ProbeMotion, advance_frame,
 ... )
@@ -42,24 +42,29 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.collider_distance import turned, turned_back
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.probe_gap import only_forward, push_out, pushing_gap
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
 from us_sim.tissue.elasticity.springs import (
     SpringNetwork,
+    VolumeTerm,
+    add_volume_forces,
     fitted_springs,
     spring_forces,
     springs_of,
+    volume_term,
 )
-from us_sim.tissue.elasticity.step_limit import highest_frequency, stabilised, step_limit
-from us_sim.tissue.elasticity.tangling import Tangling
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, add_volume_forces, volume_term
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.elasticity.stability import (
+    ElasticBalance,
+    Tangling,
+    highest_frequency,
+    stabilised,
+    step_limit,
+)
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import COUNT, SolverSettings, TissueSolver
 
 _REST_TIME = 0.2
@@ -123,7 +128,7 @@ def spring_tissue(
     Args:
         model: the tissue.
         settings: of the solver.
-        yielding: as in `us_sim.tissue.elasticity.volume_term.volume_term`.
+        yielding: as in `us_sim.tissue.elasticity.springs.volume_term`.
     """
     mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
     if settings.stiffness == "fitted":
@@ -192,7 +197,7 @@ class Msds(TissueSolver):
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
     so either each mass is raised to what the step set needs or each step is divided. Both follow
     the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
-    turn and stretch (`us_sim.tissue.elasticity.step_limit`).
+    turn and stretch (`us_sim.tissue.elasticity.stability`).
 
     The probe moves from the last pose to the new one over the frame. A node that would enter it
     loses its velocity towards it, which is the measured push, and is put onto its surface.

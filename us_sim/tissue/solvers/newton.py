@@ -26,11 +26,10 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.surface_points import add_springs, add_turns, surface_contact
-from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
-from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
-from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean, Overstress, PronyBranch
+from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
+    CoarseGrid,
     Preconditioner,
     TwoLevel,
     add_blocks,

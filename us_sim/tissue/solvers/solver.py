@@ -37,7 +37,7 @@ from us_sim.settings.setting import Settings
 from us_sim.tissue.deformation import Deformation, Intervention, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""

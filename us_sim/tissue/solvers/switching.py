@@ -48,9 +48,8 @@ from numpy.typing import NDArray
 from us_sim.errors import SolverError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, rehearsal_model
 
 
