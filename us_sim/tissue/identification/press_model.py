@@ -37,8 +37,8 @@ from us_sim.tissue.linear_algebra.two_level import (
     largest_local_eigenvalue,
 )
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.tuning import TUNING
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
+from us_sim.tissue.solvers.tuning import TUNING
 
 _TOLERANCE = 1e-6
 """Unbalanced force of a sensitivity, over the force that a modulus changes."""

@@ -35,18 +35,14 @@ from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, Intervention, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.elasticity.neo_hookean import PronyBranch
 from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.frame_budget import FrameBudget
 from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
-from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.newton import Newton, strides
 from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
 from us_sim.tissue.solvers.tuning import TUNING
 

@@ -34,10 +34,9 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
-from us_sim.tissue.deformation import Deformation, Intervention, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
-from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
