@@ -1,4 +1,4 @@
-"""One picture of several cases: what the probe sees in each where it starts."""
+"""One picture of several cases: the probe's first image of each."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
 
 
 def _draw(axes: Any, scene: Scene, name: str) -> None:
-    """What the probe sees at the start, with the outlines of structures."""
     touching = dataclasses.replace(scene.imaging, contact=False)
     scene = dataclasses.replace(scene, imaging=touching)
     volume = volume_of(scene)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, StampError, UsSimError
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     contact_model_from,
     nanoseconds_of,
     pose_from,

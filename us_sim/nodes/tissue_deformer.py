@@ -20,7 +20,7 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     cloud_message,
     contact_model_message,
     nanoseconds_of,

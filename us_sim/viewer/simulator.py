@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from us_sim.slicing.settings import STRIPS
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.parameter_board import ParameterBoard
 from us_sim.viewer.session import SessionBoard
@@ -36,7 +37,7 @@ class Simulator:
 
         overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
         colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
-        return colours or watched("m_mode") or watched("spectrum")
+        return colours or any(map(watched, STRIPS))
 
     def add(self, *feeds: Feed) -> None:
         """Let pages watch these."""

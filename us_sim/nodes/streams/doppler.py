@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
-from us_sim.nodes.conversions import colour_image_message, field_message
+from us_sim.nodes.messages import colour_image_message, field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream, SettableStream
@@ -61,7 +61,6 @@ class ColourStream(SettableStream[ColourDoppler]):
     """``ultrasound/velocity_estimate``, and the colours of the same; parameters ``colour.…``."""
 
     topic = "ultrasound/velocity_estimate"
-    overlay_name = "velocity"
 
     def __init__(self, node: SceneNode, blood: Blood) -> None:
         super().__init__(node, node.scene.colour, "colour.")

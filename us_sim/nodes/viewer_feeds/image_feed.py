@@ -13,18 +13,17 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import VolumeError
-from us_sim.nodes.conversions import affine_from, colour_pixels_from, nanoseconds_of, pixels_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import affine_from, colour_pixels_from, nanoseconds_of, pixels_from
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.watched_topic import Make, WatchedTopic
+from us_sim.slicing.settings import STRIPS
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
 
 _QUALITY = 90
 """Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
-_STRIPS = {"m_mode": "ultrasound/m_mode", "spectrum": "ultrasound/spectrum"}
-"""Streams of what runs over time, and their topics."""
 
 Known = Callable[[int], dict[str, Any]]
 
@@ -79,7 +78,7 @@ def image_feeds(
         images("ultrasound/image", "image", telling(_pixels)),
         images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
         images("ultrasound/image_annotated", "annotated", telling(lambda m, n, _: annotated(m, n))),
-        *(images(topic, kind, _colour_jpeg(kind)) for kind, topic in _STRIPS.items()),
+        *(images(strip.topic, kind, _colour_jpeg(kind)) for kind, strip in STRIPS.items()),
     ]
 
 
