@@ -25,7 +25,6 @@ from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 from us_sim.slicing.settings import OVERLAYS, TISSUE_PARAMETERS, Imaging
-from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 _AGE = Quantity("time", 0.01, 3600.0)
