@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 
 _CORNERS = {"triangle": 3, "quad": 4}
 

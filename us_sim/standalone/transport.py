@@ -180,7 +180,6 @@ def _what_to_check() -> str:
 
 
 def release_domain(domain_id: int) -> None:
-    """Undo one `acquire_domain`; the last one ends the domain."""
     with _lock:
         domain = _domains[domain_id]
         domain.users -= 1
@@ -223,7 +222,6 @@ class Dispatcher:
         self._handlers.pop(token, None)
 
     def call_soon(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` once."""
         self._soon.append(handler)
         lib.dds_set_guardcondition(self._wake_up, True)
 
@@ -283,8 +281,6 @@ class _IncompatibleQos(ct.Structure):
 
 
 class SampleInfo(NamedTuple):
-    """Where a sample came from."""
-
     source_timestamp: int  # ns since 1970, when it was written, by the writer's clock
     received_timestamp: int  # ns since 1970, when it was taken here
     publication_handle: int  # this process's number for the writer
@@ -321,7 +317,6 @@ class Endpoint:
         self._status_changed()  # what happened before it was attached is not told again
 
     def matched_count(self) -> int:
-        """How many endpoints are connected to this one."""
         return max(0, self._matched(None, 0))
 
     def matched_user_data(self) -> list[dict[str, str]]:
@@ -379,8 +374,6 @@ class Endpoint:
 
 
 class Writer(Endpoint):
-    """Publishes serialized samples."""
-
     _side = "subscription"
     _incompatible = (1 << 3, "offered")
 
@@ -432,8 +425,6 @@ class Writer(Endpoint):
 
 
 class Reader(Endpoint):
-    """Receives serialized samples."""
-
     _side = "publication"
     _incompatible = (1 << 4, "requested")
     _on_data: Callable[[], None] | None = None

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Flag, auto
 from functools import cached_property
 
 import numpy as np
@@ -113,6 +114,17 @@ def nodes_in_label(
     return np.flatnonzero(inside > 0.5 * volume).astype(np.int32)
 
 
+class Intervention(Flag):
+    """A solver's remedies in a frame that went wrong; `Deformation.action` says it to a person."""
+
+    NONE = 0
+    FRAME_FAILED = auto()  # what came out was not finite or far away
+    KEPT_STATE = auto()  # the last good state is returned in its place
+    PUT_TO_REST = auto()  # the tissue is undeformed again
+    SHOWED_UPRIGHT = auto()  # tissue is inside out, and its last upright state is returned
+    RESTARTED = auto()  # the next frame begins from rest
+
+
 @dataclass(frozen=True, eq=False)
 class Deformation:
     """The deformed tissue and what it does to the probe."""
@@ -125,7 +137,7 @@ class Deformation:
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
     is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
-    has_failed: bool = False  # whether it stands in place of a frame that came out wrong
+    interventions: Intervention = Intervention.NONE  # `action` as a code
 
 
 @dataclass(frozen=True, eq=False)

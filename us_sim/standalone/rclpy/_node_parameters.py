@@ -39,7 +39,6 @@ class NodeParameters:
     _parameter_event_publisher: Publisher | None
 
     def get_fully_qualified_name(self) -> str:
-        """This node's absolute name."""
         return f"{self._rcl_namespace.rstrip('/')}/{self._rcl_name}"
 
     def _rcl_keep_parameters(
@@ -161,7 +160,6 @@ class NodeParameters:
         return name, second, descriptor
 
     def undeclare_parameter(self, name: str) -> None:
-        """Forget a parameter."""
         if name not in self._parameters:
             raise ParameterNotDeclaredException(name)
         if self._descriptors[name].read_only:
@@ -170,7 +168,6 @@ class NodeParameters:
         del self._descriptors[name]
 
     def describe_parameter(self, name: str) -> Any:
-        """The `rcl_interfaces/msg/ParameterDescriptor` of a parameter."""
         if name in self._descriptors:
             return self._descriptors[name]
         if self._allow_undeclared_parameters:
@@ -178,15 +175,12 @@ class NodeParameters:
         raise ParameterNotDeclaredException(name)
 
     def describe_parameters(self, names: list[str]) -> list[Any]:
-        """The descriptors of several parameters."""
         return [self.describe_parameter(name) for name in names]
 
     def has_parameter(self, name: str) -> bool:
-        """Whether a parameter is known."""
         return name in self._parameters
 
     def get_parameter_types(self, names: list[str]) -> list[Parameter.Type]:
-        """The types of several parameters."""
         _require_strings(names)
         return [self.get_parameter_type(name) for name in names]
 
@@ -199,7 +193,6 @@ class NodeParameters:
         raise ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
-        """Several parameters."""
         _require_strings(names)
         return [self.get_parameter(name) for name in names]
 
@@ -233,7 +226,6 @@ class NodeParameters:
         }
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
-        """The names of parameters, as a `rcl_interfaces/msg/ListParametersResult`."""
         if not isinstance(prefixes, list):
             raise TypeError("The prefixes argument must be a list")
         if not all(isinstance(prefix, str) for prefix in prefixes):

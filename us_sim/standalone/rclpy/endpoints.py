@@ -36,15 +36,12 @@ class CallbackGroup:
         self.entities: set[weakref.ReferenceType[Any]] = set()
 
     def add_entity(self, entity: Any) -> None:
-        """Make an entity a member of this group."""
         self.entities.add(weakref.ref(entity, self.entities.discard))
 
     def has_entity(self, entity: Any) -> bool:
-        """Whether an entity is a member of this group."""
         return weakref.ref(entity) in self.entities
 
     def can_execute(self, entity: Any) -> bool:  # noqa: ARG002
-        """Whether an entity's callback may start now."""
         raise RuntimeError(
             f"{type(self).__name__} does not say when callbacks may run; use "
             "MutuallyExclusiveCallbackGroup or ReentrantCallbackGroup"
@@ -173,17 +170,14 @@ class Timer(Destroyable):
         self._period = int(value)
 
     def is_ready(self) -> bool:
-        """Whether the callback is due."""
         self._require_existence()
         return self._stirred()
 
     def is_canceled(self) -> bool:
-        """Whether the timer is stopped."""
         self._require_existence()
         return self._canceled
 
     def cancel(self) -> None:
-        """Stop the timer until `reset`."""
         self._require_existence()
         self._canceled = True
 
@@ -195,7 +189,6 @@ class Timer(Destroyable):
         self._context._wake_all()
 
     def time_since_last_call(self) -> int:
-        """Nanoseconds since the callback was called, or since the timer was made."""
         self._require_existence()
         return self._clock._now() - self._last_call
 
@@ -205,7 +198,6 @@ class Timer(Destroyable):
         return None if self._canceled else self._next_call - self._clock._now()
 
     def destroy(self) -> None:
-        """Stop the timer for good."""
         super().destroy()
         self._canceled = True
         self._clock._timers.discard(self)
@@ -247,13 +239,11 @@ class Timer(Destroyable):
 
 
 def serialize_message(message: Any) -> bytes:
-    """The CDR bytes of a message, with their four-byte header."""
     require_message_class(type(message))
     return serialize(message)
 
 
 def deserialize_message(serialized_message: bytes, message_type: Any) -> Any:
-    """The message of a class that CDR bytes hold."""
     require_message_class(message_type)
     return deserialize(serialized_message, message_type)
 
@@ -262,22 +252,6 @@ def require_message_class(cls: Any) -> None:
     """Raise NoTypeSupportImportedException for what is no class of messages."""
     if not isinstance(cls, type) or not hasattr(cls, "__msgtype__") or hasattr(cls, "Request"):
         raise NoTypeSupportImportedException()
-
-
-_KINDS: dict[
-    str, tuple[Callable[..., Any], str]
-] = {  # how the participant makes one, and what is said of one that does not fit
-    "publisher": (
-        Participant.create_writer,
-        "New subscription discovered on topic '{}', requesting incompatible QoS. "
-        "No messages will be sent to it. Last incompatible policy: {}",
-    ),
-    "subscription": (
-        Participant.create_reader,
-        "New publisher discovered on topic '{}', offering incompatible QoS. "
-        "No messages will be received from it. Last incompatible policy: {}",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -292,7 +266,7 @@ class NodeLink:
 def open_endpoint(
     kind: str, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
 ) -> Any:
-    """A DDS writer for a 'publisher', or reader for a 'subscription'.
+    """A DDS writer for a "publisher", or reader for a "subscription".
 
     Args:
         topic: the topic's name as the node wrote it.
@@ -304,7 +278,16 @@ def open_endpoint(
     """
     require_message_class(msg_type)
     package, folder, name = msg_type.__msgtype__.split("/")
-    create, refusal = _KINDS[kind]
+    if kind == "publisher":
+        create: Any = Participant.create_writer
+        other, effect = (
+            "subscription",
+            "requesting incompatible QoS. No messages will be sent to it",
+        )
+    else:
+        create = Participant.create_reader
+        other = "publisher"
+        effect = "offering incompatible QoS. No messages will be received from it"
     logger = get_logger(link.logger_name)
     try:
         return create(
@@ -313,7 +296,10 @@ def open_endpoint(
             f"{package}::{folder}::dds_::{name}_",
             qos,
             f"typehash={type_hash(msg_type.__msgtype__)};",
-            on_incompatible=lambda policy: logger.warning(refusal.format(topic, policy)),
+            on_incompatible=lambda policy: logger.warning(
+                f"New {other} discovered on topic '{topic}', {effect}. "
+                f"Last incompatible policy: {policy}"
+            ),
         )
     except DdsError as error:
         raise RCLError(f"failed to create {kind}: {error}") from None
@@ -445,7 +431,6 @@ class Publisher(Connected):
             )
 
     def get_subscription_count(self) -> int:
-        """How many subscriptions are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
 
@@ -480,7 +465,6 @@ class Subscription(Receiver):
         self.raw = raw
 
     def get_publisher_count(self) -> int:
-        """How many publishers are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
 
@@ -559,7 +543,6 @@ class Client(Receiver):
         return future.result()
 
     def call_async(self, request: Any) -> Future:
-        """Send a request; the future of its response."""
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(f"Expected {self.srv_type.Request}, got {type(request)}")
         self._require_existence()
@@ -586,12 +569,10 @@ class Client(Receiver):
                     break
 
     def service_is_ready(self) -> bool:
-        """Whether a service is connected."""
         self._require_existence()
         return self._endpoint.service_is_ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
-        """Wait until a service is connected; whether it was within the time."""
         return wait_until(self.service_is_ready, self.context, timeout_sec)
 
     def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:

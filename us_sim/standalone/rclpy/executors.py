@@ -32,13 +32,11 @@ class RunningCallbacks:
         self._changed = threading.Condition()
 
     def begin(self) -> None:
-        """This thread runs a callback."""
         me = threading.get_ident()
         with self._changed:
             self._threads[me] = self._threads.get(me, 0) + 1
 
     def end(self) -> None:
-        """This thread has run a callback."""
         me = threading.get_ident()
         with self._changed:
             self._threads[me] -= 1
@@ -88,7 +86,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def add_node(self, node: Node) -> bool:
-        """Run a node's callbacks; False when it was added before."""
         with self._nodes_lock:
             if node in self._nodes:
                 return False
@@ -98,7 +95,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def remove_node(self, node: Node) -> None:
-        """Run a node's callbacks no more."""
         with self._nodes_lock:
             if node in self._nodes:
                 del self._nodes[node]
@@ -109,12 +105,10 @@ class Executor(AbstractContextManager["Executor"]):
         self._wake_up.wake()
 
     def get_nodes(self) -> list[Node]:
-        """The nodes that were added."""
         with self._nodes_lock:
             return list(self._nodes)
 
     def spin(self) -> None:
-        """Run callbacks until the context or this executor is shut down."""
         while self._context.ok() and not self._is_shutdown:
             self.spin_once()
 

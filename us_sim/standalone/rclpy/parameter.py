@@ -77,7 +77,6 @@ class Parameter:
             raise TypeError(f"The given value is not one of the allowed types '{parameter_value}'.")
 
         def check(self, parameter_value: Any) -> bool:
-            """Whether a Python value is of this type."""
             if self.value == 0:
                 return parameter_value is None
             for python_type, scalar, sequence in _PYTHON_TYPES:
@@ -108,19 +107,16 @@ class Parameter:
 
     @classmethod
     def from_parameter_msg(cls, param_msg):
-        """The parameter that a `rcl_interfaces/msg/Parameter` holds."""
         type_ = Parameter.Type(param_msg.value.type)
         return cls(param_msg.name, type_, getattr(param_msg.value, _field(type_), None))
 
     def get_parameter_value(self):
-        """This value as a `rcl_interfaces/msg/ParameterValue`."""
         message: Any = message_class("rcl_interfaces/msg/ParameterValue")(type=self._type.value)
         if self._value is not None:
             setattr(message, _field(self._type), self._value)
         return message
 
     def to_parameter_msg(self):
-        """This parameter as a `rcl_interfaces/msg/Parameter`."""
         cls = message_class("rcl_interfaces/msg/Parameter")
         return cls(name=self._name, value=self.get_parameter_value())
 
@@ -303,7 +299,6 @@ class AsyncParameterClient:
         }
 
     def services_are_ready(self) -> bool:
-        """Whether all six services are connected."""
         return all(client.service_is_ready() for client in self._clients.values())
 
     def wait_for_services(self, timeout_sec: float | None = None) -> bool:
@@ -316,11 +311,9 @@ class AsyncParameterClient:
         depth: int | None = None,
         callback: Callback | None = None,
     ) -> Future:
-        """Ask for names: those that begin with one of the prefixes, of a depth."""
         return self._call("list_parameters", callback, prefixes=prefixes or [], depth=depth or 0)
 
     def get_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
-        """Ask for values."""
         return self._call("get_parameters", callback, names=names)
 
     def set_parameters(self, parameters: Sequence[Any], callback: Callback | None = None) -> Future:
@@ -328,11 +321,9 @@ class AsyncParameterClient:
         return self._call("set_parameters", callback, parameters=_messages(parameters))
 
     def describe_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
-        """Ask for descriptors."""
         return self._call("describe_parameters", callback, names=names)
 
     def get_parameter_types(self, names: list[str], callback: Callback | None = None) -> Future:
-        """Ask for types."""
         return self._call("get_parameter_types", callback, names=names)
 
     def set_parameters_atomically(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import StiffnessError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.tissue.identification.fit import FARTHEST, Fitted, Verdict, fit, judge
 from us_sim.tissue.identification.press_model import (
     Felt,
