@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import probe_of, scanner_of, volume_of
+from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay

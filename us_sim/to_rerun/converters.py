@@ -32,9 +32,8 @@ from us_sim.nodes.messages import (
 )
 from us_sim.recording.reader import Bag
 from us_sim.recording.repair import extract
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import structures_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.to_rerun.conversion import STAMP, RerunFile
 
