@@ -9,8 +9,7 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.session import SessionState
 
 LEAD_TOPIC = "tracker/pose"
-PLAYERS = ("path_player", "session_player")
-"""Nodes that `session_control` starts and ends."""
+PLAYERS = ("path_player", "session_player")  # nodes that `session_control` starts and ends
 VIEWER = "viewer"
 NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
 

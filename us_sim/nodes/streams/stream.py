@@ -33,8 +33,7 @@ class FrameStream(ABC):
         node: that publishes it.
     """
 
-    topic: ClassVar[str]
-    """Its name."""
+    topic: ClassVar[str]  # its name
     overlay_name: ClassVar[str] = ""
     """What chooses it as the colours over the annotated image; empty where it has none."""
 
