@@ -25,8 +25,7 @@ from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.scene.building import collider_of, probe_of
-from us_sim.scene.tracker_building import source_settings, tracking_of
+from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter

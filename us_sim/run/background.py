@@ -26,9 +26,8 @@ from us_sim.recording.metadata import read_metadata
 from us_sim.run.fork_server import end_with_parent, package_on_path
 from us_sim.scene.building import volume_of
 from us_sim.scene.case_tissue import keep_tissue
-from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
+from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
 from us_sim.scene.reading import load_scene
-from us_sim.scene.thumbnail import thumbnail_file
 from us_sim.share import full_path, shared_roots
 
 _MOST_BAGS = 500  # of a folder, the newest

@@ -266,7 +266,8 @@ def main() -> int:
     """
     asked = _serve(socket.socket(fileno=os.dup(0)))
     if asked is not None:
-        runpy.run_module(f"us_sim.nodes.{asked.node}", run_name="__main__", alter_sys=True)
+        module = asked.command[asked.command.index("-m") + 1]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
     return 0
 
 
