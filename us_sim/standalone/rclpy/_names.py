@@ -88,8 +88,10 @@ def error_in_full_topic_name(name: str) -> Fault:
 
 def error_in_topic_name(name: str) -> Fault:
     """The fault of a topic or service name as a person writes it, if any."""
-    return ("topic name must not be empty string", 0) if not name else _first_fault(
-        name, "topic name", _TOPIC_NAME
+    return (
+        ("topic name must not be empty string", 0)
+        if not name
+        else _first_fault(name, "topic name", _TOPIC_NAME)
     )
 
 
